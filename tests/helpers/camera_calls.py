@@ -72,6 +72,12 @@ COMMANDS: dict[str, int] = {
     "reset_settings": Cmd.RESET_CAMERA_SETTINGS,
 }
 """For each call, the command that the camera refuses or does not answer."""
+BLOCK_COMMANDS: dict[str, int] = {
+    "video": Cmd.VIDEO_START_CAPTURE,
+    "zooming": Cmd.SET_CAMERA_ZOOM,
+    "focusing": Cmd.SET_CAMERA_FOCUS,
+}
+"""For each block, the command of its entry that the camera refuses or does not answer."""
 IMPOSSIBLE: dict[str, tuple[Any, ...]] = {
     "start_streaming": (999,),
     "stop_streaming": (999,),
@@ -96,11 +102,11 @@ def call(name: str, *args: Any, number: int = 100, **options: Any) -> Callable[[
     return lambda stage: getattr(stage.vehicle.camera_at(number), name)(*(args or ARGUMENTS.get(name, ())), **options)
 
 
-def camera_block(name: str) -> Callable[[Any], Awaitable[None]]:
+def camera_block(name: str, number: int = 100) -> Callable[[Any], Awaitable[None]]:
     """Enter and leave an ``async with`` block of a camera."""
 
     async def do(stage: Any) -> None:
-        async with getattr(stage.vehicle.camera_at(100), name)(*BLOCKS[name]) as inside:
+        async with getattr(stage.vehicle.camera_at(number), name)(*BLOCKS[name]) as inside:
             if name == "photo_interval":
                 async for _ in inside:
                     pass
@@ -207,6 +213,16 @@ CAMERA: Table = {
     **{
         (f"Camera.{name}", "OperationTimeout"): P(call(name, number=NOWHERE))
         for name in ARGUMENTS
+    },
+    **{
+        (f"Camera.{name}", error): P(camera_block(name), before=trouble(command))
+        for name, command in BLOCK_COMMANDS.items()
+        for error, trouble in (("CommandRejected", _refuses), ("CommandTimeout", _ignores))
+    },
+    **{
+        (f"Camera.{name}", error): P(camera_block(name, number))
+        for name in BLOCK_COMMANDS
+        for error, number in (("NotSupported", UNABLE), ("OperationTimeout", NOWHERE))
     },
     ("Camera.wait_found", "CommandRejected"): P(call("wait_found"), before=_is_unknown, alone=True),
     ("Camera.take_photo", "OperationRejected"): P(_photo_without_card, alone=True),

@@ -46,7 +46,7 @@ from aerokit.vehicle.commanding.setpoints import (
 )
 from aerokit.vehicle.connect import connect as connect_async
 from aerokit.vehicle.devices.winch import ACTION_TIMEOUT_S
-from aerokit.vehicle.files.logs import ERASE_PATIENCE_S
+from aerokit.vehicle.files.logs import ERASE_TIMEOUT_S
 
 if TYPE_CHECKING:
     import os
@@ -1037,7 +1037,7 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
 
 
 class Gimbal(TwinOf["AsyncGimbal"]):
-    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
+    """One gimbal with the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
     reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while
@@ -1276,9 +1276,7 @@ class Gimbals(GimbalsTwin["Gimbal"]):
 
     @cached_property
     def first(self) -> Gimbal:
-        """The first gimbal. A gimbal attached to the autopilot takes precedence over gimbals with their own component
-        id.
-        """
+        """The first gimbal. A gimbal attached to the autopilot comes before gimbals with their own component id."""
         return Gimbal(self._loop, self.aio.first)
 
     @property
@@ -1475,8 +1473,7 @@ class Files(TwinOf["AsyncFiles"]):
         return self._loop.run(self.aio.list, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
     def crc32(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
-        XOR.
+        """Return the CRC-32 of a file, computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final XOR.
 
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
@@ -1693,7 +1690,7 @@ class Logs(TwinOf["AsyncLogs"]):
             on_progress=on_progress,
         )
 
-    def erase(self, *, idle_timeout_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
+    def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
         LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
@@ -1931,7 +1928,7 @@ class Winch(TwinOf["AsyncWinch"]):
 
     ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
     MAVLink components: ``vehicle.winch(component_id=169)``. PX4 itself drives no winch, but forwards the command to
-    such a component. An order is sent only once if a second transmission could pay out more line. A newer order for the
+    these components. An order is sent only once if a second transmission could pay out more line. A newer order for the
     winch ends the call that waits for the previous order. A cancelled call does not stop the winch: call
     ``set_rate(0)``.
     """
@@ -2997,9 +2994,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def mode(self) -> StateCell[str]:
-        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
-        this value.
-        """
+        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), polled every 5 s while you use it."""
         return StateCell(self._loop, self.aio.mode)
 
     @cached_property
@@ -3082,9 +3077,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
     @cached_property
     def tracked_place(self) -> StateCell[TrackedPlace]:
-        """Position of the tracked object on earth, if the camera reports it; requested at the same rate as
-        ``tracking``.
-        """
+        """Position of the tracked object on earth, if the camera reports it; requested like ``tracking``."""
         return StateCell(self._loop, self.aio.tracked_place)
 
     def track_point(self, x: float, y: float, *, radius: float = 0.0, status_hz: float = 5.0) -> None:
@@ -3155,10 +3148,9 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.zoom_to_focal_length, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
-        """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
-        cancellation.
+        """Zoom for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`zoom_step`.
+        The end of the block stops the zoom, also under cancellation. Entering raises as :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -3202,7 +3194,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         The end of the block stops the movement, also under cancellation.
 
-        Entering raises the errors of :meth:`focus_step`.
+        Entering raises as :meth:`focus_step`.
 
         Args:
             speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
@@ -3260,10 +3252,9 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.stop_video, timeout=timeout)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
-        cancellation.
+        """Record for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`start_video`.
+        The end of the block stops recording, also under cancellation. Entering raises as :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
@@ -3271,8 +3262,7 @@ class Camera(TwinOf["AsyncCamera"]):
         return CameraBlock(self._loop, self._loop.call(self.aio.video, status_hz=status_hz))
 
     def load_streams(self) -> tuple[CameraStream, ...]:
-        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if the camera requires
-        that.
+        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if necessary.
 
         Raises:
             NotSupported: the camera has no video streams. Nothing was sent.
@@ -3499,8 +3489,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known values of other settings allow, as a mapping of names to
-        values.
+        """Return the options of a setting, by name, that the known values of other settings allow.
 
         Empty without a definition, and for settings without options.
         """
@@ -4207,10 +4196,10 @@ class Vehicle(VehicleTwin):
     def streams(self, rate_hz: float) -> AbstractContextManager[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot receives
-        REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no message
-        arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit requests
-        common states that are missing, like :meth:`rate`.
+        Use it for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
+        gets REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no
+        message arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit
+        requests only those common states that are missing.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
@@ -4402,9 +4391,9 @@ class Vehicle(VehicleTwin):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
-        position.
+        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
+        without a position.
         """
         return self._loop.call(self.aio.missing_for_flight)
 
@@ -4423,7 +4412,7 @@ class Vehicle(VehicleTwin):
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
         The present mode does not matter: if the vehicle cannot arm in it, :meth:`arm` changes the mode first.
-        :meth:`why_not_armable` reports such a mode.
+        :meth:`why_not_armable` reports a mode that does not allow arming.
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
@@ -4444,12 +4433,12 @@ class Vehicle(VehicleTwin):
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
         ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
-        command is sent again. Otherwise it is sent only once: a repetition might arm a vehicle that a pilot has just
-        disarmed. After a cancellation, or an error other than a refusal, the command may still be executed. aerokit
-        therefore monitors the vehicle for 15 seconds, as long as the connection is open. If this command arms the
-        vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or
-        reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger
-        "aerokit" warns about the outcome.
+        command is sent again. In all other cases the command is sent only once, because a repetition might arm a
+        vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
+        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open. If
+        this command arms the vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle
+        accepts the command, or reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed
+        otherwise stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
@@ -4566,8 +4555,8 @@ class Vehicle(VehicleTwin):
         orders the vehicle to hold.
 
         PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
-        ArduCopter has no such command, and its mode CIRCLE follows the throttle stick; aerokit therefore streams
-        set-points in GUIDED, and the vehicle stops if your program dies.
+        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. aerokit therefore
+        streams set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
@@ -4905,7 +4894,7 @@ class Vehicle(VehicleTwin):
         """Move the home position, and wait until HOME_POSITION reports the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
-        firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
+        firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
@@ -5313,7 +5302,7 @@ def connect(
 ) -> Vehicle:
     """Connect to a vehicle for the duration of the ``with`` block.
 
-    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the
+    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it can fly. Runs inside the
     running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:

@@ -74,7 +74,7 @@ async def connect(
 ) -> AsyncIterator[Vehicle]:
     """Connect to a vehicle for the duration of the ``async with`` block.
 
-    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it could fly. Runs inside the
+    Returns at the vehicle's first heartbeat; ``await vehicle.wait_ready()`` waits until it can fly. Runs inside the
     running asyncio loop: nothing outlives the block, and exceptions raised in the block propagate unchanged.
 
     Args:
@@ -245,7 +245,7 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
         frame = heartbeat.received_frame
         if frame is not None and connection.now() - frame.received_at <= HEARTBEAT_MAX_AGE_S:
             search.on_heartbeat(heartbeat)
-    detachments = [
+    detach_callbacks = [
         connection.bus.attach(Heartbeat, search.on_heartbeat, system_id=system_id or EVERY_SYSTEM),
         connection.on_end(search.abort),
     ]
@@ -253,7 +253,7 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
         with anyio.move_on_after(timeout):
             return await search.result()
     finally:
-        for detach in detachments:
+        for detach in detach_callbacks:
             detach()
         search.close()
     raise ConnectFailed(
@@ -268,8 +268,8 @@ _Found = tuple[VehicleContext, Vehicle, Heartbeat]
 class _Search:
     """Creates the vehicle while its first heartbeat is being delivered, so that no later message is missed.
 
-    Before a waiting task could create it, more messages may be delivered: a recording replayed at full speed delivers
-    many in one iteration of the loop.
+    A task that waits for the heartbeat would create the vehicle too late: a recording replayed at full speed delivers
+    many messages in one iteration of the loop.
     """
 
     def __init__(self, connection: Connection, system_id: int | None) -> None:
@@ -277,6 +277,7 @@ class _Search:
         self._found: _Found | None = None
         self._error: Exception | None = None
         self._ended = asyncio.Event()
+        # Number of heartbeats of each autopilot other than component 1.
         self._lone_heartbeats: dict[tuple[int, int], int] = {}
         self.description = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
 
@@ -326,9 +327,9 @@ class _Search:
         """Close the vehicle if the caller was cancelled before it received the result."""
         self._ended.set()
         if self._found is not None:
-            session = self._found[0].session
-            session.close()
-            self._connection.attached.discard(session.system_id)
+            context, vehicle, _ = self._found
+            context.session.close()
+            self._connection.attached.discard(vehicle.system_id)
 
     def _is_wanted(self, frame: Frame, heartbeat: Heartbeat) -> bool:
         return frame.system_id != 0 and self._system_id in (None, frame.system_id) and is_autopilot(heartbeat)

@@ -1,6 +1,4 @@
-"""``CalibrationControl``: starts the calibrations of a vehicle. ``Calibration``: iterates over the steps of a
-calibration.
-"""
+"""``CalibrationControl`` starts the calibrations of a vehicle; ``Calibration`` iterates over the steps of one."""
 
 from __future__ import annotations
 
@@ -194,7 +192,8 @@ class CalibrationControl:
         procedure = px4 if is_px4 else ardupilot
         params: tuple[float, ...] = ()
         if command_param:
-            params = (*(0,) * (command_param - 1), param_value)
+            params_before = (0,) * (command_param - 1)
+            params = (*params_before, param_value)
         return Calibration(run, procedure(run, *params))
 
 

@@ -30,8 +30,8 @@ CALIBRATE_AT_BOOT = 3
 END_GRACE_S = 3.0
 # Maximum seconds for restoring a parameter, because a cancelled call must end within two seconds.
 RESTORE_TIMEOUT_S = 1.5
-# ArduPilot repeats its request for a pose every second until it receives our confirmation. A request that arrives
-# within this many seconds after the confirmation was sent earlier, so it is ignored.
+# ArduPilot repeats its request for a pose every second until it receives our confirmation. The same request is ignored
+# for this many seconds after the confirmation, because it may have been sent before.
 POSE_REPEAT_S = 2.0
 POSES = {
     AccelcalVehiclePos.LEVEL: CalibrationPose.LEVEL,
@@ -188,7 +188,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             percents[message.compass_id] = message.completion_pct
         has_changed = True
 
-    def has_news() -> bool:
+    def was_reported() -> bool:
         return has_changed
 
     def is_complete() -> bool:
@@ -196,13 +196,15 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         return bool(compasses) and all(number in reports for number in compasses)
 
     with ExitStack() as cleanup:
+        # The mask 0 means all compasses. The other zeros: no retry, no automatic saving, no delay, no reboot.
         await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
-        for kind in (MagCalProgress, MagCalReport):
-            cleanup.callback(run.session.connection.bus.attach(kind, on_message, system_id=run.session.system_id))
-            cleanup.callback(run.session.rates.request(kind, REPORT_HZ, is_optional=True))
+        session = run.session
+        for message_type in (MagCalProgress, MagCalReport):
+            cleanup.callback(session.connection.bus.attach(message_type, on_message, system_id=session.system_id))
+            cleanup.callback(session.rates.request(message_type, REPORT_HZ, is_optional=True))
         yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
         while not is_complete():
-            await run.wait(has_news)
+            await run.wait(was_reported)
             has_changed = False
             progress = min(percents.values(), default=0) / 100
             yield run.step(progress, "turn the vehicle slowly in all directions, about each of its axes")
@@ -263,8 +265,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 yield run.step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed_pose, confirmed_at = request, now()
-                # While ArduPilot had not received the confirmation, it repeated its request. These requests are
-                # obsolete.
+                # ArduPilot has repeated its request until it received the confirmation. The repetitions are obsolete.
                 requests.clear()
 
 

@@ -63,6 +63,7 @@ class CalibrationRun:
         self._cannot_cancel_reason = ""
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None
+        # The arbiter keeps the order to cancel, and its command, until this stack is closed.
         self._cancel_order_stack = ExitStack()
         self._sent_cancel: SentCommand | None = None
         self._has_rebooted = self._is_abandoned = False
@@ -71,9 +72,7 @@ class CalibrationRun:
     # ------------------------------------------------------------------------------- start and end
 
     def check_ready(self) -> None:
-        """Raise OperationRejected unless the vehicle is known to be disarmed, and NotSupported if its firmware is
-        unknown.
-        """
+        """Raise OperationRejected unless the vehicle is known to be disarmed; NotSupported for unknown firmware."""
         autopilot = self.session.autopilot
         if not autopilot.calibration_protocol:
             raise NotSupported(
@@ -181,9 +180,7 @@ class CalibrationRun:
         self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
-        """Send the cancel command unless it was already sent, and repeat it until the vehicle confirms the
-        cancellation.
-        """
+        """Send the cancel command if it was not sent yet; repeat it until the vehicle confirms the cancellation."""
         assert self._cancel_command is not None
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):

@@ -142,7 +142,9 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             max_stored = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
             for index in range(max(0, count - max_stored), count):
                 capture = await self._log.fetch(index)
-                consecutive_missing = consecutive_missing + 1 if capture is None else 0
+                consecutive_missing += 1
+                if capture is not None:
+                    consecutive_missing = 0
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:
                     break
             return self.captures()
@@ -210,9 +212,7 @@ class Cameras:
 
     @property
     def first(self) -> Camera:
-        """The camera that was found first. Low component ids take precedence; cameras attached to the autopilot come
-        last.
-        """
+        """The first camera found. Low component ids take precedence; cameras attached to the autopilot come last."""
         if not self._is_first_in_use and self._first_link.number in self._cameras:
             # `at` has already created an object for this camera.
             return self._cameras[self._first_link.number]
@@ -258,13 +258,13 @@ class Cameras:
             return
         if self._first_link.number is None:
             if not self._early_captures:
-                self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early)
+                self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early_captures)
             del self._early_captures[MAX_EARLY_CAPTURES:]  # If the list is full, a new capture replaces the last one.
             self._early_captures.append((number, message))
         else:
             self.at(number)._log.record(message)
 
-    def _process_early(self) -> None:
+    def _process_early_captures(self) -> None:
         # No camera with its own component id was discovered, so the first camera is attached to the autopilot.
         captures, self._early_captures = self._early_captures, []
         first_number, _ = captures[0]

@@ -162,7 +162,8 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
     w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Rounding may exceed 1, for which asin() would fail.
     if abs(sine) > MAX_PITCH_SINE:  # gimbal lock: the whole turn about the common axis counts as yaw
-        roll, yaw = 0.0, -2 * math.copysign(1, sine) * math.atan2(x, w)
+        roll = 0.0
+        yaw = -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

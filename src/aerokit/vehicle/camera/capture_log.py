@@ -56,7 +56,8 @@ class _Entry:
         else:
             stamp: int = getattr(message, "time_usec", 0)  # UTC, or the time since boot if the sender has no UTC
             is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
-            self.utc_us, self.boot_us = (stamp, 0) if is_utc else (0, stamp)
+            self.utc_us = stamp if is_utc else 0
+            self.boot_us = 0 if is_utc else stamp
 
     def reports_same_picture(self, other: _Entry) -> bool:
         # PX4 reports each picture by two messages of different types, which arrive in quick succession.
@@ -91,10 +92,11 @@ class CaptureLog:
         self._highest: _Entry | None = None  # the entry with the highest plausible index
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
         self._failed: _Entry | None = None  # the last failed picture
-        # Number of pictures, from CAMERA_CAPTURE_STATUS and from indices. `_is_count_used` is False until the camera
-        # has reported a number above 0.
-        self._count, self._is_count_used = 0, False
+        # Number of pictures, from CAMERA_CAPTURE_STATUS and from indices, and the camera's time when it reported the
+        # number. `_is_count_used` is False until the camera has reported a number above 0.
+        self._count = 0
         self._count_boot_ms = 0
+        self._is_count_used = False
         # Time of the event loop at the last reset. Captures from before the reset do not belong to this log.
         self.reset_at: float = -math.inf
         # True if the camera sends CAMERA_IMAGE_CAPTURED; CAMERA_TRIGGER is then ignored.
@@ -132,9 +134,7 @@ class CaptureLog:
         return None if entry is None else entry.capture
 
     async def _request(self, index: int) -> bool:
-        """Request the capture once. Returns True if another request is pointless, because the camera answers that it
-        does not have this capture.
-        """
+        """Request the capture once; return True if the camera answers that it does not have this capture."""
         request = self._link.requests.request
         try:
             if not self._link.is_autopilot_attached:
@@ -216,6 +216,7 @@ class CaptureLog:
         return has_wrapped or entry.was_taken_later(highest)
 
     def _add(self, message: Message, capture: Capture) -> None:
+        """Store a capture and publish it, unless another message about the same picture was better."""
         entry = _Entry(message, capture)
         if capture.success is False:
             self._add_failed(message, entry)
@@ -227,7 +228,7 @@ class CaptureLog:
         is_new = previous is None or previous.capture.success is False  # A failed picture's index may be used again.
         if previous is not None and not is_new:
             is_repeated = previous.kind is entry.kind
-            # CAMERA_TRIGGER contains nothing that CAMERA_IMAGE_CAPTURED of the same picture does not contain.
+            # CAMERA_IMAGE_CAPTURED contains everything that CAMERA_TRIGGER of the same picture contains.
             has_better_message = previous.kind is m.CameraImageCaptured
             if is_repeated or has_better_message:
                 return

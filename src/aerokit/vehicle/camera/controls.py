@@ -80,10 +80,9 @@ class LensMixin(CameraMixin):
         await self._set("zoom_to_focal_length", HAS_ZOOM, ZOOM, CameraZoomType.FOCAL_LENGTH, millimetres)
 
     def zooming(self, speed: float = 1.0) -> CameraBlock:
-        """Zoom for the duration of an ``async with`` block. The end of the block stops the zoom, also under
-        cancellation.
+        """Zoom for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`zoom_step`.
+        The end of the block stops the zoom, also under cancellation. Entering raises as :meth:`zoom_step`.
 
         Args:
             speed: −1 (out) to 1 (in); many cameras support only these two values.
@@ -131,7 +130,7 @@ class LensMixin(CameraMixin):
 
         The end of the block stops the movement, also under cancellation.
 
-        Entering raises the errors of :meth:`focus_step`.
+        Entering raises as :meth:`focus_step`.
 
         Args:
             speed: −1 (nearer) to 1 (farther); many cameras support only these two values.
@@ -147,7 +146,7 @@ class LensMixin(CameraMixin):
     ) -> None:
         await self._link.require_capability(action, capability)
         with self._link.new_order(ORDER_SUBJECTS[command]) as order:
-            await self._link.command(command, kind, value, self._link.device, order=order, attempts=attempts)
+            await self._link.command(command, kind, value, self._link.device_id, order=order, attempts=attempts)
 
     def _continuous(self, action: str, capability: str, command: int, kind: int, speed: float) -> CameraBlock:
         """Return a block that starts a zoom or focus movement and stops the movement at its end."""
@@ -156,8 +155,8 @@ class LensMixin(CameraMixin):
             link,
             ORDER_SUBJECTS[command],
             check=lambda: link.require_capability(action, capability),
-            start=lambda order: link.command(command, kind, speed, link.device, order=order),
-            stop_command=lambda: (command, kind, 0, link.device),
+            start=lambda order: link.command(command, kind, speed, link.device_id, order=order),
+            stop_command=lambda: (command, kind, 0, link.device_id),
         )
 
 
@@ -175,9 +174,7 @@ class TrackingMixin(CameraMixin):
         self.tracked_place: StateCell[TrackedPlace] = link.new_cell(
             "camera.tracked_place", "CAMERA_TRACKING_GEO_STATUS"
         )
-        """Position of the tracked object on earth, if the camera reports it; requested at the same rate as
-        ``tracking``.
-        """
+        """Position of the tracked object on earth, if the camera reports it; requested like ``tracking``."""
         self._status_rates: list[Detach] = []  # functions that end the requests for the status messages
         link.listen(
             m.CameraTrackingImageStatus,
@@ -252,15 +249,14 @@ class TrackingMixin(CameraMixin):
 
     async def _track(self, command: int, *params: float) -> None:
         with self._link.new_order("tracking") as order:
-            await self._link.command(command, *params, self._link.device, order=order)
+            await self._link.command(command, *params, self._link.device_id, order=order)
 
     def _request_status(self, status_hz: float) -> None:
         self._release_status_rates()
         information = self._link.information.latest
-        kinds: list[type[m.CameraTrackingImageStatus | m.CameraTrackingGeoStatus]] = [m.CameraTrackingImageStatus]
+        self._status_rates = [self._link.request_rate(m.CameraTrackingImageStatus, status_hz)]
         if information is None or information.can("has_tracking_geo_status"):
-            kinds.append(m.CameraTrackingGeoStatus)
-        self._status_rates = [self._link.request_rate(kind, status_hz) for kind in kinds]
+            self._status_rates.append(self._link.request_rate(m.CameraTrackingGeoStatus, status_hz))
 
     def _release_status_rates(self) -> None:
         while self._status_rates:
@@ -280,9 +276,7 @@ class StorageMixin(CameraMixin):
     def __init__(self, link: CameraLink) -> None:
         super().__init__(link)
         self.mode: StateCell[str] = link.polled_cell("camera.mode", m.CameraSettings, SETTINGS_POLL_INTERVAL_S)
-        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS). Polled every 5 s while your program uses
-        this value.
-        """
+        """Mode: ``"photo"``, ``"video"`` or ``"survey"`` (CAMERA_SETTINGS), polled every 5 s while you use it."""
         self.zoom_percent: StateCell[float | None] = link.polled_cell(
             "camera.zoom_percent", m.CameraSettings, SETTINGS_POLL_INTERVAL_S
         )
@@ -317,7 +311,7 @@ class StorageMixin(CameraMixin):
         """
         await self._link.require_capability("set_mode", "has_modes")
         with self._link.new_order("mode") as order:
-            await self._link.command(MavCmd.SET_CAMERA_MODE, self._link.device, MODES[mode], order=order)
+            await self._link.command(MavCmd.SET_CAMERA_MODE, self._link.device_id, MODES[mode], order=order)
         reported = ""
         with anyio.move_on_after(timeout):
             while reported != mode:
@@ -391,7 +385,7 @@ class StorageMixin(CameraMixin):
         await self._link.identify()
         # The reset also changes the mode, so it ends the retries of an earlier order to change the mode.
         with self._link.new_order("mode") as order:
-            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, 1, self._link.device, order=order)  # 1: reset
+            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, 1, self._link.device_id, order=order)  # 1: reset
         await self._link.request(m.CameraSettings, timeout=MODE_REQUEST_TIMEOUT_S)
 
     def _on_settings(self, message: m.CameraSettings) -> None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # A camera with a component id sends a HEARTBEAT within this time.
 DISCOVERY_TIMEOUT_S = 2.5
 
-# If a camera sends no heartbeat for more seconds than this, another camera may be using its component id.
+# After a silence of more than this many seconds, another camera may be using the component id.
 MAX_SILENCE_S = 5.0
 
 
@@ -84,7 +84,7 @@ class CameraLink(CameraOrders):
     @property
     def video_stream(self) -> int:
         """Stream id for recording commands; 0 means all streams."""
-        return self.device if self._session.autopilot.video_addresses_camera else 0
+        return self.device_id if self._session.autopilot.video_addresses_camera else 0
 
     @property
     def telemetry(self) -> Any:
@@ -155,8 +155,8 @@ class CameraLink(CameraOrders):
         return not self.information.is_known or self._was_silent
 
     async def _find_first_camera(self) -> None:
-        # A camera with its own component id takes precedence over one that is attached to the autopilot. The wait gives
-        # such a camera time to send a heartbeat.
+        # A camera with its own component id takes precedence over one that is attached to the autopilot, and gets time
+        # to send a heartbeat.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_bound.wait()
@@ -165,7 +165,7 @@ class CameraLink(CameraOrders):
 
     async def _request_information(self) -> None:
         try:
-            await self.requests.request(m.CameraInformation, self.device, where=self._is_from_this_camera)
+            await self.requests.request(m.CameraInformation, self.device_id, where=self._is_from_this_camera)
         except CommandRejected:
             # An autopilot may have no information about its camera. Information that was received earlier stays valid.
             # In both cases, the refusal is no error.
@@ -299,8 +299,8 @@ class ActiveOperation:
         """Record that the camera has accepted the start."""
         self.order.commit()
 
-    def may_run_despite(self, error: BaseException) -> bool:
-        """Record that the start failed. Return True if the camera may nevertheless execute it, and must be stopped."""
+    def record_failed_start(self, error: BaseException) -> bool:
+        """Record that the start failed; return True if the camera may have started anyway, and must be stopped."""
         was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
         if not was_sent or was_refused:
             self.order.withdraw()
@@ -356,7 +356,8 @@ class CameraBlock:
         try:
             await self._start(operation.order)
         except BaseException as error:
-            if operation.may_run_despite(error):
+            must_stop = operation.record_failed_start(error)
+            if must_stop:
                 # Raise the error without delay: the stop command is sent at once, and retried in the background.
                 await operation.stop(is_awaited=False)
             raise

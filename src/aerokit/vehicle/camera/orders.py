@@ -67,7 +67,7 @@ class CameraOrders:
         return self.number in AUTOPILOT_CAMERA_IDS
 
     @property
-    def device(self) -> int:
+    def device_id(self) -> int:
         """Camera device id for commands; 0 means the component itself."""
         return self.number if self.number is not None and self.is_autopilot_attached else 0
 
@@ -94,7 +94,7 @@ class CameraOrders:
 
         ``subject`` names the function, such as ``"video"``. All objects of the same camera return the same key.
         """
-        return ("camera", self.component.component_id, self.device, subject)
+        return ("camera", self.component.component_id, self.device_id, subject)
 
     def begin_order(self, subject: str) -> Order:
         """Begin an order, which ends the previous order about this subject."""
@@ -181,13 +181,15 @@ class CameraOrders:
         """
         if not order.is_newest or self._session.is_closed:
             return
-        answered, errors = anyio.Event(), []
+        self.send_now(command, *params)
+        answered = anyio.Event()
+        errors: list[AerokitError] = []
 
         async def confirm() -> None:
-            # `is_sent` is True because `send_now` below makes the first transmission.
+            """Wait for the acknowledgement of the command, and repeat the command until then."""
             try:
                 if order.is_newest:
-                    await self.command(command, *params, order=order, is_sent=True)
+                    await self.command(command, *params, order=order, was_just_sent=True)
             except AerokitError as error:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:
@@ -195,7 +197,6 @@ class CameraOrders:
             finally:
                 answered.set()
 
-        self.send_now(command, *params)
         self._session.background.start(confirm, "aerokit end of a camera's block")
         if not is_awaited:
             return
@@ -340,6 +341,7 @@ class MessageRequests:
             cell.is_refused = cell.is_doubtful = False
 
     async def run(self) -> None:
+        """Poll the state values that are in use, until cancelled."""
         while True:
             await anyio.sleep(POLL_INTERVAL_S)
             for cell in self._polled:

@@ -144,7 +144,7 @@ class Shutter:
                 await self._send_digicam_control()
             else:
                 interval_s, count = 0, 1  # a single picture
-                params = (self.link.device, interval_s, count, self._sequence_number)
+                params = (self.link.device_id, interval_s, count, self._sequence_number)
                 await self.link.command(START, *params, attempts=1)
         except CommandTimeout as error:
             return error
@@ -158,14 +158,16 @@ class Shutter:
         return None
 
     async def _send_digicam_control(self) -> None:
-        # The older command, for PX4's trigger and for cameras that do not support MAV_CMD_IMAGE_START_CAPTURE.
-        await self.link.command(MavCmd.DO_DIGICAM_CONTROL, 0, 0, 0, 0, 1, 0, 0, attempts=1)
+        """Send the older command, for PX4's trigger and for cameras without MAV_CMD_IMAGE_START_CAPTURE."""
+        unchanged, take_photo = (0, 0, 0, 0), 1  # param1 to param4: session, zoom and focus; param5: the shutter
+        await self.link.command(MavCmd.DO_DIGICAM_CONTROL, *unchanged, take_photo, 0, 0, attempts=1)
 
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
         """Start a series; repeat the order only if the camera reports that it has not started."""
         if self.link.is_trigger:
-            await self.link.command(TRIGGER_INTERVAL, seconds * 1000.0, UNCHANGED)  # milliseconds, shutter time
-            await self.link.command(TRIGGER, 1, UNCHANGED, 0, 0, order=order)  # 1 enables the trigger.
+            interval_ms, shutter_time, enable = seconds * 1000.0, UNCHANGED, 1
+            await self.link.command(TRIGGER_INTERVAL, interval_ms, shutter_time)
+            await self.link.command(TRIGGER, enable, UNCHANGED, 0, 0, order=order)
             return
 
         async def has_started() -> bool | None:
@@ -174,12 +176,12 @@ class Shutter:
                 return None  # Without both reports, the number of pictures cannot be compared.
             return status.is_in_series or status.is_capturing or status.image_count > before.image_count
 
-        command = (START, self.link.device, seconds, count, 0)
+        command = (START, self.link.device_id, seconds, count, 0)
         await self.link.order_once(order, lambda: self.link.command(*command, order=order, attempts=1), has_started)
 
     @property
     def stop_command(self) -> tuple[float, ...]:
-        return (TRIGGER, 0, UNCHANGED, 0, 0) if self.link.is_trigger else (STOP, self.link.device)
+        return (TRIGGER, 0, UNCHANGED, 0, 0) if self.link.is_trigger else (STOP, self.link.device_id)
 
 
 def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
@@ -230,7 +232,8 @@ class PhotoInterval:
             await self._begin(operation)
         except BaseException as error:
             self._new_captures.__exit__()
-            if operation.may_run_despite(error):
+            must_stop = operation.record_failed_start(error)
+            if must_stop:
                 # Raise the error without delay: the stop command is sent at once, and retried in the background.
                 await operation.stop(is_awaited=False)
             raise
@@ -312,7 +315,8 @@ class PhotoInterval:
             first = self._first_after_reset(capture)
             if first is not None:  # The series goes on with the new indices.
                 self._known_reset_at = self._log.reset_at
-                self._next_index, self._is_start_guessed = first.index, False
+                self._next_index = first.index
+                self._is_start_guessed = False
                 self._newest_index, self._newest_at = first.index, self._link.now()
                 self._waiting = {first.index: first}
             # Without a status, the first capture determines the start. A later capture with a much lower index shows

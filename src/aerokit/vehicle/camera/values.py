@@ -249,21 +249,17 @@ def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
 
 def storage_of(message: m.StorageInformation) -> CameraStorage:
     is_ready = message.status == StorageStatus.READY
-    total, used, available = (
-        finite_or_none(size) if is_ready else None
-        for size in (message.total_capacity, message.used_capacity, message.available_capacity)
-    )
     return CameraStorage(
-        message.storage_id,
-        message.storage_count,
-        message.name,
-        _name(StorageType, message.type),
-        _name(StorageStatus, message.status),
-        total,
-        used,
-        available,
-        _positive(message.read_speed),
-        _positive(message.write_speed),
+        number=message.storage_id,
+        count=message.storage_count,
+        name=message.name,
+        kind=_name(StorageType, message.type),
+        status=_name(StorageStatus, message.status),
+        total_mib=finite_or_none(message.total_capacity) if is_ready else None,
+        used_mib=finite_or_none(message.used_capacity) if is_ready else None,
+        available_mib=finite_or_none(message.available_capacity) if is_ready else None,
+        read_mib_s=_positive(message.read_speed),
+        write_mib_s=_positive(message.write_speed),
     )
 
 
@@ -327,11 +323,11 @@ def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
 
 def thermal_range_of(message: m.CameraThermalRange) -> ThermalRange:
     return ThermalRange(
-        message.stream_id,
-        message.max,
-        _point(message.max_point_x, message.max_point_y),
-        message.min,
-        _point(message.min_point_x, message.min_point_y),
+        stream=message.stream_id,
+        max_celsius=message.max,
+        max_at=_point(message.max_point_x, message.max_point_y),
+        min_celsius=message.min,
+        min_at=_point(message.min_point_x, message.min_point_y),
     )
 
 

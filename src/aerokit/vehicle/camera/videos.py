@@ -83,7 +83,7 @@ class VideoMixin(CameraMixin):
             await self._start(order, status_hz, timeout)
 
     async def _start(self, order: Order, status_hz: float, timeout: float) -> None:
-        command = (START, self._link.video_stream, status_hz, self._link.device)
+        command = (START, self._link.video_stream, status_hz, self._link.device_id)
         await self._link.order_once(
             order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
         )
@@ -105,10 +105,9 @@ class VideoMixin(CameraMixin):
             await self._wait_recording(timeout, expected=False)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
-        """Record for the duration of an ``async with`` block. The end of the block stops recording, also under
-        cancellation.
+        """Record for the duration of an ``async with`` block.
 
-        Entering raises the errors of :meth:`start_video`.
+        The end of the block stops recording, also under cancellation. Entering raises as :meth:`start_video`.
 
         Raises:
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
@@ -123,9 +122,10 @@ class VideoMixin(CameraMixin):
         )
 
     def _stop_command(self) -> tuple[float, ...]:
-        return (STOP, self._link.video_stream, self._link.device)
+        return (STOP, self._link.video_stream, self._link.device_id)
 
     async def _is_recording(self) -> bool | None:
+        """Ask the camera whether it records; return None if it does not report that."""
         if self._link.is_autopilot_attached:  # ArduPilot always reports that it is not recording.
             return None
         message = await self._link.request(m.CameraCaptureStatus, timeout=1.0)
@@ -146,8 +146,7 @@ class VideoMixin(CameraMixin):
         raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 
     async def load_streams(self) -> tuple[CameraStream, ...]:
-        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if the camera requires
-        that.
+        """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if necessary.
 
         Raises:
             NotSupported: the camera has no video streams. Nothing was sent.
@@ -207,7 +206,7 @@ class VideoMixin(CameraMixin):
         check_range("stream", stream, 0, 255)
         await self._link.require_capability(action, "has_video_stream")
         with self._link.new_order("streams") as order:
-            await self._link.command(command, stream, self._link.device, order=order)
+            await self._link.command(command, stream, self._link.device_id, order=order)
         await self._link.request(m.VideoStreamStatus, stream, timeout=1.0)
 
     async def select_source(self, primary: SourceName, secondary: SourceName = "default") -> None:

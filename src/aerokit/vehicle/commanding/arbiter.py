@@ -36,28 +36,24 @@ STEERING, ACTION = "steering", "action"
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
     """Return True if the order that the vehicle accepted at ``accepted_at`` has armed it.
 
-    ``disarmed_at`` is the time of the last report of disarmed. If it is later than an effect of the order can be, the
-    order did not arm the vehicle: another party did.
+    ``disarmed_at`` is the time of the last report of disarmed. If HEARTBEAT still reports disarmed more than
+    ``ARM_HEARTBEAT_DELAY_S`` after the acceptance, the order had no effect, and another party has armed the vehicle.
     """
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
 class CommandArbiter:
-    """Keeps the orders to one vehicle, and updates them with each HEARTBEAT.
-
-    It also determines the newest order about each topic.
+    """Keeps the orders to one vehicle, updates them with each HEARTBEAT, and knows the newest order about each topic.
 
     Every order of the program is registered here: flight actions, set-points, devices, fleets and classic scripts.
     """
-
-    arming_orders: int
 
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
         self._now, self._telemetry = now, telemetry
         self.slept_since: Callable[[float], float] = lambda _: 0.0  # see `Connection._slept_since`
         self.newest: Order | None = None
         """The last steering order given by an action or a raw command."""
-        self.arming_orders = 0
+        self.arming_orders: int = 0
         """Number of arm and disarm commands sent."""
         self.mode_is_in_doubt: bool = False
         """True while the result of a mode change is unknown, so that the reported mode may still change."""
@@ -126,7 +122,7 @@ class CommandArbiter:
         was_flown = self.is_flown_by_program
         order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
         order.was_flown_before = was_flown
-        # If this order replaces another one in progress, the vehicle may already be moving.
+        # If this order replaces an order in progress, the vehicle may already be moving.
         order.may_move = self._is_steering()
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
@@ -192,7 +188,8 @@ class CommandArbiter:
         its subjects and, if it steers, the action in progress.
         """
         first_subject = subjects[0]
-        is_steering, disarms = first_subject != "arm", armed is False
+        is_steering = first_subject != "arm"
+        disarms = armed is False
         if is_steering:
             self._notify_steering()
             if self.newest is not None:  # A change to a mode of the posted order is not a takeover.
@@ -255,12 +252,12 @@ class CommandArbiter:
         self._record_accepted(armed)
 
     def _record_accepted(self, armed: bool | None) -> None:
-        """Record when an arm command (``armed`` True) was accepted, because HEARTBEAT reports the effect later."""
+        """Record when a command that arms was accepted, because HEARTBEAT reports the effect later."""
         if armed:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm, because a command that does so is sent. None: some other command."""
+        """End earlier orders to arm or disarm if a newer command does so; ``armed`` is None for any other command."""
         if armed is None:
             return
         self.arming_orders += 1
@@ -299,18 +296,20 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program.
 
-        Either the program armed the vehicle, and it was not disarmed since. Or the program steers the vehicle, and
-        there was no takeover.
+        This is so if the program armed the vehicle, and it was not disarmed since; or if the program steers the
+        vehicle, and there was no takeover.
         """
         order, topics = self.newest, self._ordered_since_disarmed
         # After an order without modes, such as a raw command, a mode change does not prove a takeover.
         was_taken_over = order is not None and order.modes and order.takeover_reason and order.is_newest
-        return "arm" in topics if was_taken_over else bool(topics)
+        if was_taken_over:  # Of the program's orders, only the one that armed the vehicle still has an effect.
+            return "arm" in topics
+        return bool(topics)
 
     @property
     def is_state_recent(self) -> bool:
         """True while the last HEARTBEAT is recent enough to describe the vehicle's state."""
-        self.slept_since(self._now())  # adds a sleep of the computer to the age
+        self.slept_since(self._now())  # If the computer has just slept, this call adds the sleep to all ages.
         return self._telemetry.armed.age <= MODE_MAX_AGE_S
 
     @contextmanager
@@ -416,10 +415,10 @@ class CommandArbiter:
     def _on_arming(self) -> None:
         """Decide whether the program or another party has armed the vehicle."""
         self._armed_at = self._telemetry.armed.updated_at
-        is_unanswered = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
+        is_order_open = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
-        is_effect = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
-        was_armed_by_program = is_unanswered or is_effect
+        was_caused_by_order = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
+        was_armed_by_program = is_order_open or was_caused_by_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
         self._armed_by_program = self._create_order(modes, ()) if was_armed_by_program else None

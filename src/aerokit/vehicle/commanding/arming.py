@@ -19,7 +19,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity
+from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity, MavState
 from aerokit.mavlink.messages import Statustext
 from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 from aerokit.vehicle.commanding.context import VehicleBase
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 FORCE_REBOOT = 20190226
 """param6 of PREFLIGHT_REBOOT_SHUTDOWN that makes ArduPilot reboot even while armed (GCS_Common.cpp)."""
-REASONS_S = 3.0
+REASONS_TIMEOUT_S = 3.0
 """A vehicle that is requested to run its pre-arm checks reports the failures within this many seconds."""
 POLL_INTERVAL_S = 0.1
 """Poll interval in seconds while waiting for a reboot."""
-# Values of HEARTBEAT.system_status during a boot: MAV_STATE_BOOT and MAV_STATE_CALIBRATING.
-BOOTING = (1, 2)
-REBOOT_ANSWER_S = 3.0
+# Values of HEARTBEAT.system_status during a boot.
+BOOT_STATES = (MavState.BOOT, MavState.CALIBRATING)
+REBOOT_ACK_TIMEOUT_S = 3.0
 """Seconds to wait for the acknowledgement of a reboot command."""
 MODE_READY_TIMEOUT_S = 3.0
 """Seconds to wait after a mode change until the vehicle can arm in the new mode."""
@@ -54,9 +54,9 @@ class ArmingActions(VehicleBase):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If its arming checks fail, includes the vehicle's texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests them. A vehicle may arm all the same: ArduCopter arms in STABILIZE without a
-        position.
+        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
+        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
+        without a position.
         """
         return self._health.missing_for_flight()
 
@@ -75,7 +75,7 @@ class ArmingActions(VehicleBase):
         """Wait until position and home are known, the estimator is healthy and the pre-arm checks pass.
 
         The present mode does not matter: if the vehicle cannot arm in it, :meth:`arm` changes the mode first.
-        :meth:`why_not_armable` reports such a mode.
+        :meth:`why_not_armable` reports a mode that does not allow arming.
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
@@ -89,7 +89,7 @@ class ArmingActions(VehicleBase):
             anyio.move_on_after(timeout),
         ):
             # Shortly before the time-out, ask the vehicle once for the reasons, so that the error can contain them.
-            ask_at = self.connection.now() + timeout - REASONS_S
+            ask_at = self.connection.now() + timeout - REASONS_TIMEOUT_S
             while self._health.missing_for_flight():
                 self.connection.raise_if_ended()
                 if self.connection.now() >= ask_at:
@@ -121,12 +121,12 @@ class ArmingActions(VehicleBase):
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
         ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
-        command is sent again. Otherwise it is sent only once: a repetition might arm a vehicle that a pilot has just
-        disarmed. After a cancellation, or an error other than a refusal, the command may still be executed. aerokit
-        therefore monitors the vehicle for 15 seconds, as long as the connection is open. If this command arms the
-        vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle accepts it, or
-        reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed otherwise stays armed. Logger
-        "aerokit" warns about the outcome.
+        command is sent again. In all other cases the command is sent only once, because a repetition might arm a
+        vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
+        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open. If
+        this command arms the vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle
+        accepts the command, or reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed
+        otherwise stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
@@ -160,7 +160,7 @@ class ArmingActions(VehicleBase):
         self._arm_cleanup.stop()
         if reason:
             logger.info("arming vehicle %d: %s", self.system_id, reason)
-            self.connection.send(Statustext(MavSeverity.INFO, reason, 0, 0))
+            self.connection.send(Statustext(severity=MavSeverity.INFO, text=reason, id=0, chunk_seq=0))
         started = self.connection.now()
         try:
             may_change_mode = mode is None
@@ -268,7 +268,7 @@ class ArmingActions(VehicleBase):
             return arming_mode
         # A set-point stream needs the mode that it has set. A booting vehicle may still change its mode by itself, so a
         # change now may be lost.
-        is_booting = self.telemetry.system_status.latest in BOOTING
+        is_booting = self.telemetry.system_status.latest in BOOT_STATES
         must_keep_mode = self._flight_cleanup.stop_stream is not None or is_booting
         may_arm_in_mode = not self._health.unarmable_mode() or self._is_in_optional_mode()
         if must_keep_mode or may_arm_in_mode or not self.telemetry.is_confirmed_disarmed:
@@ -283,7 +283,8 @@ class ArmingActions(VehicleBase):
 
     async def _change_to_arming_mode(self, mode: Mode) -> None:
         """Change the mode for arming; raise if the order to arm was superseded meanwhile."""
-        order, arming_orders_before = self._arbiter.order(mode), self._arbiter.arming_orders
+        order = self._arbiter.order(mode)
+        arming_orders_before = self._arbiter.arming_orders
         await self._sender.ensure_mode(mode, order)
         await self._wait_until_armable()
         self._sender.raise_if_ended(order)
@@ -343,16 +344,19 @@ class ArmingActions(VehicleBase):
     async def _order_reboot(self, force: bool) -> None:
         """Send the command once: if only its acknowledgement was lost, a second one would cause another reboot."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
-        options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ANSWER_S}
+        options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ACK_TIMEOUT_S}
         await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots_before: int) -> None:
-        """Poll the time since boot, frequently at first: a fast simulation soon exceeds its previous uptime."""
-        accepted_at = request_at = self.connection.now()
+        """Poll the time since boot until it shows a reboot.
+
+        The polls are frequent at first, because a fast simulation soon exceeds its uptime from before the reboot.
+        """
+        started = next_request_at = self.connection.now()
         while self._session.watch.reboots == reboots_before:
             self.connection.raise_if_ended()
             now = self.connection.now()
-            if now >= request_at:
+            if now >= next_request_at:
                 self._session.link_watch.request_time()
-                request_at = now + POLL_INTERVAL_S + (now - accepted_at) / 10
+                next_request_at = now + POLL_INTERVAL_S + (now - started) / 10
             await anyio.sleep(POLL_INTERVAL_S)

@@ -115,7 +115,7 @@ class FlightCleanup:
         self._session, self._arbiter, self._sender = session, arbiter, sender
         self.stop_stream: Callable[[str], None] | None = None
         self._flight: Order | None = None
-        self._task = BackgroundTask(session, "aerokit hold", "before a hold was confirmed")
+        self._task = BackgroundTask(session, "aerokit hold", warning_clause="before a hold was confirmed")
         # A new steering order makes the confirmation of an earlier hold pointless.
         arbiter.on_steering(self._task.cancel)
 
@@ -147,7 +147,7 @@ class FlightCleanup:
             modes=() if self._holds_by_reposition else (mode,),
             attempt_timeout=HOLD_ACK_TIMEOUT_S,
             attempts=MAX_HOLD_RESENDS,
-            is_sent=True,
+            was_just_sent=True,
         )
 
     # ---------------------------------------------------------------------- abandoned orders
@@ -169,12 +169,12 @@ class FlightCleanup:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:  # A hold must not be sent.
             return False
-        is_sent = self._arbiter.is_state_recent
-        if is_sent:
+        can_send_now = self._arbiter.is_state_recent
+        if can_send_now:
             self._send_hold(mode)
             order = self._arbiter.order(*order.modes, mode)
             self._arbiter.doubt_mode()
-        self._task.start(partial(self._hold_after_heartbeat, mode, order, is_sent=is_sent))
+        self._task.start(partial(self._complete_hold, mode, order, is_sent=can_send_now))
         return True
 
     def _send_hold(self, mode: Mode) -> None:
@@ -185,8 +185,8 @@ class FlightCleanup:
                 MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params
             )
 
-    async def _hold_after_heartbeat(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
-        """Wait for the confirmation of a hold that was sent, or send it after the next HEARTBEAT.
+    async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
+        """Wait for the confirmation of a hold. If it was not sent yet, send it after the next HEARTBEAT.
 
         Without a confirmation, the hold is sent again after the next HEARTBEAT, unless the order has ended by then, for
         example because a pilot took over.
@@ -226,7 +226,7 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Hold the vehicle if its `async with` block ends during this `with` block, in which a call awaits the order.
+        """Hold the vehicle if its `async with` block ends while a call awaits the order in this `with` block.
 
         The vehicle must also hold after it has hit the ground, because its target may still be in the air.
         """
@@ -247,7 +247,7 @@ class FlightCleanup:
             raise BusyError("another set-point stream is open: leave it first; nothing was sent")
 
     @contextmanager
-    def preparing(self, mode: Mode) -> Iterator[Order]:
+    def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Give the order to change to ``mode``. The caller prepares a stream in the `with` block, and may wait there.
 
         Raises:
@@ -294,8 +294,9 @@ class ArmCleanup:
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender
-        warning_clause = "while an arm command may still be executed"
-        self._task = BackgroundTask(session, "aerokit late arming", warning_clause)
+        self._task = BackgroundTask(
+            session, "aerokit late arming", warning_clause="while an arm command may still be executed"
+        )
 
     def hint(self) -> str:
         """Return the hint for error texts that an arm command may still be executed."""
@@ -309,6 +310,7 @@ class ArmCleanup:
         self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
 
     async def _watch_arming(self, order: Order, was_armed: bool, arming_orders_before: int) -> None:
+        """Disarm the vehicle if the abandoned order arms it within `ARM_WATCH_S`."""
         armed = self._session.telemetry.armed
         last_disarmed_at = order.given_at
 
@@ -368,8 +370,8 @@ class ArmCleanup:
         """
         if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
             return False
-        reported_after_s = self._session.telemetry.armed.updated_at - order.given_at
-        if not order.end and reported_after_s <= ARM_HEARTBEAT_DELAY_S:
+        armed_after_s = self._session.telemetry.armed.updated_at - order.given_at
+        if not order.end and armed_after_s <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)

@@ -109,7 +109,8 @@ class PathFlight:
         self._change_speed(seconds, length_m - self._flown_m)
         self._flown_m += self._present_speed_m_s * seconds
         if self._flown_m >= length_m:
-            self.is_on_path, self._present_speed_m_s, self._flown_m = True, 0.0, length_m
+            self.is_on_path = True
+            self._present_speed_m_s, self._flown_m = 0.0, length_m
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
             coordinate + fraction * component for coordinate, component in zip(self._start, to_path, strict=True)
@@ -129,13 +130,15 @@ class PathFlight:
         phase_rate = self._present_speed_m_s / math.hypot(*tangent)
         # The acceleration must not change the speed. The part of the second derivative that is parallel to the path
         # would do so, and is subtracted.
-        (north_1, east_1), (north_2, east_2) = tangent, second_derivative
-        parallel_factor = (north_2 * north_1 + east_2 * east_1) / (north_1**2 + east_1**2)
+        tangent_north, tangent_east = tangent
+        curve_north, curve_east = second_derivative
+        tangent_squared = tangent_north**2 + tangent_east**2
+        parallel_factor = (curve_north * tangent_north + curve_east * tangent_east) / tangent_squared
         centripetal = (
-            (north_2 - parallel_factor * north_1) * phase_rate**2,
-            (east_2 - parallel_factor * east_1) * phase_rate**2,
+            (curve_north - parallel_factor * tangent_north) * phase_rate**2,
+            (curve_east - parallel_factor * tangent_east) * phase_rate**2,
         )
-        return self._setpoint(place, 0.0, (tangent[0] * phase_rate, tangent[1] * phase_rate, 0.0), centripetal)
+        return self._setpoint(place, 0.0, (tangent_north * phase_rate, tangent_east * phase_rate, 0.0), centripetal)
 
     def _change_speed(self, seconds: float, remaining_m: float) -> None:
         """Accelerate to the ordered speed, or slow down so that the set-point can stop after ``remaining_m``."""
@@ -181,7 +184,9 @@ class LobeCounter:
     """Counts figure eights: two different lobes in a row are one figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
-        self._half_m, self._axis = major_m / 2, math.radians(axis_deg)
+        # A vehicle that is farther from the centre along the axis is in a lobe.
+        self._min_along_m = major_m / 2
+        self._axis = math.radians(axis_deg)
         self._lobe = 0  # The last lobe that the vehicle was in is 1 or -1; 0 means that it was in none yet.
         self.rounds: float = 0.0
         self.is_on_path: bool = False
@@ -190,8 +195,8 @@ class LobeCounter:
     def add(self, north_m: float, east_m: float) -> None:
         """Process a reported position of the vehicle, in metres from the centre."""
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
-        self.is_on_path = abs(along) > self._half_m
-        lobe = int(math.copysign(1, along)) if self.is_on_path else 0
-        if lobe not in (0, self._lobe):
+        self.is_on_path = abs(along) > self._min_along_m
+        lobe = 1 if along > 0 else -1
+        if self.is_on_path and lobe != self._lobe:
             self._lobe = lobe
             self.rounds += 0.5

@@ -55,7 +55,8 @@ class VehicleContext:
     def describe_now(self) -> str:
         """Return a clause about the vehicle's reported state, for warnings."""
         autopilot, telemetry = self.session.autopilot, self.session.telemetry
-        hold_mode, mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol), telemetry.mode.latest
+        hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
+        mode = telemetry.mode.latest
         if mode is not None and mode == hold_mode:
             where = "holding in"
         elif telemetry.is_armed and is_reported_on_ground(telemetry):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.autopilots import TakeOff
     from aerokit.vehicle.commanding.order import Order
 
-# Maps the values of MAV_LANDED_STATE that mean that the vehicle is flying to their names in error texts.
+# Maps each MAV_LANDED_STATE of a flying vehicle to its name in error texts.
 IN_THE_AIR: dict[int | None, str] = {
     MavLandedState.IN_AIR: "in the air",
     MavLandedState.TAKEOFF: "taking off",
@@ -237,7 +237,8 @@ class FlightActions(VehicleBase):
         """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
-        landing_failure, ground = self._sender.landing_failure(order), GroundCheck(self._session)
+        landing_failure = self._sender.landing_failure(order)
+        ground = GroundCheck(self._session)
 
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
@@ -313,8 +314,8 @@ class ModeActions(VehicleBase):
             OperationRejected: a pilot or a failsafe has chosen another mode meanwhile.
             OperationTimeout: the vehicle did not acknowledge, or accepted the mode but stayed in another mode.
         """
-        found_mode = self.autopilot.find_mode(mode, self.telemetry.mode_names)
-        await self._sender.change_mode(found_mode, self._arbiter.order(found_mode), timeout)
+        target_mode = self.autopilot.find_mode(mode, self.telemetry.mode_names)
+        await self._sender.change_mode(target_mode, self._arbiter.order(target_mode), timeout)
 
     async def hold(self) -> None:
         """Stop and stay (a fixed wing circles). Returns when HEARTBEAT reports the autopilot's hold mode.

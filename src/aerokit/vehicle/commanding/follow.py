@@ -212,7 +212,7 @@ class FollowStream(SteeringStream[TargetState]):
         mode = self._stream_mode()
         self._start_reading()
         try:
-            with self._context.flight_cleanup.preparing(mode) as self._prepared_order:
+            with self._context.flight_cleanup.preparing_stream(mode) as self._prepared_order:
                 self._value = await self._first_state()
                 self._choose_place(self._value.position)
                 self._replace_value(self._value)  # Raises for an invalid place before the mode changes.

@@ -21,7 +21,7 @@ SETTLING_S, SETTLED_M_S = 0.5, 2.0
 A vehicle whose motors stop while it climbs is slower than this speed for 0.4 s at most.
 """
 
-UNSETTLED_S, UNSETTLED_M = 5.0, 2.0
+STANDING_S, STANDING_M = 5.0, 2.0
 """A vehicle whose height changes by less than this distance in this time is on the ground.
 
 This applies whatever velocity the vehicle reports, because the velocity may be wrong.
@@ -74,7 +74,8 @@ class ImpactDetector:
         self._impact_height_m: float | None = None
         # Height before the descent; None if it is unknown.
         self._top_m: float | None = None
-        self._has_stopped = False
+        # True once the vehicle was slow over ground after the impact.
+        self._has_slowed = False
 
     def update(self) -> None:
         """Process the vehicle's last reported velocity."""
@@ -104,11 +105,11 @@ class ImpactDetector:
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
             self._top_m = height_m
         is_slow = math.hypot(velocity.north_m_s, velocity.east_m_s) <= MAX_SLIDE_M_S
-        self._has_stopped = self._impact_m_s is not None and (self._has_stopped or is_slow)
+        self._has_slowed = self._impact_m_s is not None and (self._has_slowed or is_slow)
 
     def describe(self) -> str:
         """Return a clause about the impact; empty if there was none, or if the vehicle has flown on since."""
-        if self._impact_m_s is None or not self._has_stopped:
+        if self._impact_m_s is None or not self._has_slowed:
             return ""
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
 
@@ -181,11 +182,11 @@ class GroundCheck:
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
             height_m = height_above_home(self._session.telemetry)
-            # The reported velocity may be wrong. If the height has not changed for UNSETTLED_S, the vehicle stands on
+            # The reported velocity may be wrong. If the height has not changed for STANDING_S, the vehicle stands on
             # the ground although it reports a velocity.
             is_known = height_m is not None and self._reported_height_m is not None
-            is_still = is_known and not _has_changed(self._reported_height_m, height_m, UNSETTLED_M)
-            return is_still and now - reported_at >= UNSETTLED_S
+            is_still = is_known and not _has_changed(self._reported_height_m, height_m, STANDING_M)
+            return is_still and now - reported_at >= STANDING_S
         self._settled_since = min(self._settled_since, max(updated_at, reported_at))
         return updated_at >= self._settled_since + SETTLING_S
 
@@ -195,4 +196,5 @@ class GroundCheck:
 
 
 def _has_changed(before_m: float | None, now_m: float | None, min_change_m: float) -> bool:
+    """Return True if the height changed by more than ``min_change_m``; False if one of the heights is unknown."""
     return before_m is not None and now_m is not None and abs(now_m - before_m) > min_change_m

@@ -45,7 +45,7 @@ SetpointT = TypeVar("SetpointT")
 # times at the stream's rate, because one may be lost, and then at this interval.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
-# Set-points that the autopilot executes with its own limits of acceleration.
+# Set-points that the autopilot executes with its own limits of acceleration. With these, a sudden stop is an impact.
 BRAKED_BY_AUTOPILOT = (
     VelocitySetpoint,
     BodyVelocitySetpoint,
@@ -177,7 +177,8 @@ class Guided:
             NotSupported: this firmware ignores the message, or its version is not known yet. Nothing was sent.
         """
         session = self._context.session
-        version, supported_before = session.telemetry.version.latest, session.autopilot.actuators_until
+        version = session.telemetry.version.latest
+        supported_before = session.autopilot.actuators_until
         if supported_before is None or version is None or version.number[:2] >= supported_before:
             version_text = "of unknown version" if version is None else str(version.firmware)
             raise NotSupported(

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Mode
     from aerokit.vehicle.session.session import VehicleSession
 
-# After the vehicle was requested to run its checks, status texts are collected for this many seconds.
-TEXTS_S = 1.0
+# Seconds to collect status texts after the vehicle was requested to run its checks, and to wait for missing states.
+REPORT_WAIT_S = 1.0
 # Values older than this many seconds do not describe the present state.
 HEALTH_MAX_AGE_S = 5.0
 PREARM_REPORT_INTERVAL_S = 35.0
@@ -27,18 +27,19 @@ PREARM_REPORT_DURATION_S = 3.0
 CHECKS_FAIL = "the vehicle's pre-arm checks do not pass (SYS_STATUS)"
 """The reason for a refusal to arm if no other reason is known."""
 REPORTS_ABOUT_ARMING = ("heartbeats (", "sensors (")
-"""How reasons begin that are about reports without which it is unknown whether the vehicle arms."""
+"""Beginnings of reasons about missing or old reports, without which it is unknown whether the vehicle can arm."""
 RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
-def in_order(reports: list[str], known: list[str]) -> list[str]:
-    """Return reasons in the order in which all programs list them, the plainest first.
+def in_order(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
+    """Return all reasons in the order in which aerokit's programs list them.
 
-    ``reports`` are missing or old reports. Those without which it is unknown whether the vehicle arms come first, the
-    others after ``known``: the vehicle's own texts, its mode, failing sensors, a missing GPS fix and estimates.
+    ``report_reasons`` name missing or old reports. Those in ``REPORTS_ABOUT_ARMING`` come first, the others last.
+    Between them are ``other_reasons``: the vehicle's own texts, its mode, failing sensors, and missing estimates.
     """
-    needed = [report for report in reports if report.startswith(REPORTS_ABOUT_ARMING)]
-    return [*needed, *known, *(report for report in reports if report not in needed)]
+    first = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
+    last = [reason for reason in report_reasons if reason not in first]
+    return [*first, *other_reasons, *last]
 
 
 class Health:
@@ -67,7 +68,7 @@ class Health:
         texts = self._recent_texts()
         is_explained = texts or self._failing_sensors() or (self._needs_position() and self._missing_estimates())
         unexplained = self._unnamed_reasons() if self._checks_fail() and not is_explained else []
-        return in_order([*missing, *self._out_of_date()], [*texts, *self._failing(), *unexplained])
+        return in_order([*missing, *self._outdated_states()], [*texts, *self._health_problems(), *unexplained])
 
     def _recent_texts(self) -> list[str]:
         """Return the vehicle's texts about its failing checks, since it was last requested to run them."""
@@ -86,8 +87,8 @@ class Health:
             reasons = [(at, reason) for at, reason in reasons if at >= report_at]
         return list(dict.fromkeys(reason for _, reason in reasons))
 
-    def _out_of_date(self) -> list[str]:
-        """Return the states that are too old to describe the present."""
+    def _outdated_states(self) -> list[str]:
+        """Return one text for each state that is too old to describe the present."""
         telemetry = self._telemetry
         is_lost = self._session.watch.link_state.latest is LinkState.LOST
         lost_link = ", the link is lost" if is_lost else ""
@@ -113,7 +114,7 @@ class Health:
         return list(await self.arming_reasons(self._session.connection.now()))
 
     async def arming_reasons(self, since: float) -> tuple[str, ...]:
-        """Return the reasons against arming: status texts received since ``since``, then failing sensors and flags.
+        """Return the reasons against arming, among them the status texts received since ``since``.
 
         If there are no such texts, the vehicle is requested to run its pre-arm checks.
         """
@@ -121,10 +122,12 @@ class Health:
             await self._session.wait_for_status_texts()
             await self._request_texts(since)
             await self._refresh()
-        failing = self._failing() if self._needs_position() else self._failing_sensors()
-        known = [*self.arming_texts(since), *self.unarmable_mode(), *failing]
-        reasons = self._session.deduplicate_reasons(*in_order(self._out_of_date(), known))
-        return reasons or (tuple(self._unnamed_reasons()) if self._checks_fail() else ())
+        problems = self._health_problems() if self._needs_position() else self._failing_sensors()
+        other_reasons = [*self.arming_texts(since), *self.unarmable_mode(), *problems]
+        reasons = self._session.deduplicate_reasons(*in_order(self._outdated_states(), other_reasons))
+        if not reasons and self._checks_fail():
+            return tuple(self._unnamed_reasons())
+        return reasons
 
     def _unnamed_reasons(self) -> list[str]:
         """Return the probable reasons why checks fail, if the vehicle names none. PX4 names a low battery only once."""
@@ -164,7 +167,7 @@ class Health:
 
     async def _refresh(self) -> None:
         """Wait briefly for states that are missing or too old."""
-        with anyio.move_on_after(TEXTS_S):
+        with anyio.move_on_after(REPORT_WAIT_S):
             await self._telemetry.sensors.wait_until(lambda _: self._telemetry.sensors.age <= HEALTH_MAX_AGE_S)
             await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= HEALTH_MAX_AGE_S)
 
@@ -184,13 +187,13 @@ class Health:
         except (CommandRejected, CommandTimeout):
             return
         self._checked_at = requested_at
-        await anyio.sleep(TEXTS_S)
+        await anyio.sleep(REPORT_WAIT_S)
 
     def arming_texts(self, since: float) -> list[str]:
         """Return the status texts about arming that were received since this time."""
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
-    def _failing(self) -> list[str]:
+    def _health_problems(self) -> list[str]:
         """Return failing sensors and missing estimates. If estimates are missing, also report a missing GPS fix."""
         return [*self._failing_sensors(), *self._missing_estimates()]
 

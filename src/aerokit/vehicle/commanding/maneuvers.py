@@ -58,8 +58,8 @@ class ManeuverActions(VehicleBase):
         orders the vehicle to hold.
 
         PX4 flies the circle itself (MAV_CMD_DO_ORBIT). ArduPlane circles a place in GUIDED (MAV_CMD_DO_REPOSITION).
-        ArduCopter has no such command, and its mode CIRCLE follows the throttle stick; aerokit therefore streams
-        set-points in GUIDED, and the vehicle stops if your program dies.
+        ArduCopter has no command for a circle, and its mode CIRCLE follows the throttle stick. aerokit therefore
+        streams set-points in GUIDED, and the vehicle stops if your program dies.
 
         Args:
             center: the middle of the circle, at the altitude of the circle. For home, or a position without altitude,
@@ -87,7 +87,8 @@ class ManeuverActions(VehicleBase):
         check_range("speed_m_s", speed_m_s, 0, MAX_SPEED_M_S, above=True)
         if turns is not None:
             check_range("turns", turns, 0, MAX_ROUNDS, above=True)
-        place, counter = travel_target(center), TurnCounter(radius_m, clockwise=clockwise)
+        place = travel_target(center)
+        counter = TurnCounter(radius_m, clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
         if self.autopilot.circles_by == "setpoints":
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
@@ -96,7 +97,8 @@ class ManeuverActions(VehicleBase):
         else:
             command, params, mode = self._circle_command("orbit", radius_m, speed_m_s, facing, clockwise=clockwise)
             flight = RoundFlight(self._context, "orbit", place, counter, turns, limits)
-            await flight.fly_by_command(command, params, mode, is_held=not self._is_on_wings, circle_m=radius_m)
+            holds_at_end = not self._is_on_wings
+            await flight.fly_by_command(command, params, mode, holds_at_end=holds_at_end, radius_m=radius_m)
 
     async def figure_eight(
         self,
@@ -146,13 +148,14 @@ class ManeuverActions(VehicleBase):
         is_flown_by_px4 = self._is_on_wings and self.autopilot.circles_by == "orbit"
         if not is_flown_by_px4 and (self._is_on_wings or not self.autopilot.setpoints.trajectory):
             raise NotSupported(f"figure_eight: {self.autopilot.firmware} has no such manoeuvre; nothing was sent")
-        counter, limits = LobeCounter(major_radius_m, axis_deg), (max_distance_m, timeout, max_silence_s)
+        counter = LobeCounter(major_radius_m, axis_deg)
+        limits = (max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "figure_eight", travel_target(center), counter, rounds, limits)
         if is_flown_by_px4:
             major_m = major_radius_m if clockwise else -major_radius_m
             params = (major_m, minor_radius_m, 0, math.radians(axis_deg))
             mode = self._sender.mode_for("figure_eight", "hold")
-            await flight.fly_by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, is_held=False)
+            await flight.fly_by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, holds_at_end=False)
         else:
             path = Eight(major_radius_m, minor_radius_m, axis_deg, clockwise=clockwise)
             await flight.fly_by_setpoints(path, speed_m_s, "ahead")
@@ -220,8 +223,9 @@ class ManeuverActions(VehicleBase):
             command, params, mode = self._circle_command("loiter", radius_m, math.nan, "free", clockwise=clockwise)
         limits = (max_distance_m, timeout, max_silence_s)
         flight = RoundFlight(self._context, "loiter", center, counter, turns or 0.0, limits, center_name="target")
-        stay_s, circle_m = duration_s or 0.0, radius_m or 0.0
-        await flight.fly_by_command(command, params, mode, is_held=False, stay_s=stay_s, circle_m=circle_m)
+        await flight.fly_by_command(
+            command, params, mode, holds_at_end=False, stay_s=duration_s or 0.0, radius_m=radius_m or 0.0
+        )
 
     def follow(
         self,

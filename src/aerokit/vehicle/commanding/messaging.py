@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from aerokit.events import LinkState
     from aerokit.vehicle.session.session import VehicleSession
 
-# In REQUEST_DATA_STREAM, 0 means all groups of messages (``req_stream_id``) and all components (``target_component``).
+# In REQUEST_DATA_STREAM, 0 means all groups of messages (``req_stream_id``) and all components (``target_component``),
+# and 1 starts the streams (``start_stop``).
 ALL_GROUPS = ALL_COMPONENTS = 0
+START_STREAMS = 1
 
 # Seconds until the first streamed message must arrive after a request.
 FIRST_MESSAGE_TIMEOUT_S = 3.0
@@ -79,16 +81,25 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
 
 
 async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: _StreamMonitor) -> None:
-    """Request all streams by REQUEST_DATA_STREAM. Repeat the request while none arrives, and after some events."""
+    """Request all streams by REQUEST_DATA_STREAM.
+
+    The request is repeated while no stream arrives, and after events such as a reboot, see `_StreamMonitor`.
+    """
     retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
-    rate = max(1, round(rate_hz))
+    request = m.RequestDataStream(
+        target_system=session.system_id,
+        target_component=ALL_COMPONENTS,
+        req_stream_id=ALL_GROUPS,
+        req_message_rate=max(1, round(rate_hz)),
+        start_stop=START_STREAMS,
+    )
     while True:
-        session.send(m.RequestDataStream(session.system_id, ALL_COMPONENTS, ALL_GROUPS, rate, 1))
+        session.send(request)
         monitor.reset()
         with anyio.move_on_after(retry_interval_s):
             await monitor.must_request.wait()
             retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
-            continue
+            continue  # An event has occurred, so the streams are requested again at once.
         retry_interval_s = min(2 * retry_interval_s, MAX_RETRY_INTERVAL_S)
         if monitor.has_received:  # The vehicle streams, so only an event requires a new request.
             await monitor.must_request.wait()
@@ -106,7 +117,7 @@ async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: Exi
 
 
 class _StreamMonitor:
-    """Tracks whether streamed messages arrive, and decides whether the streams must be requested again."""
+    """Tracks whether streamed messages arrive, and sets ``must_request`` when the vehicle may have lost the request."""
 
     def __init__(self, session: VehicleSession, cleanup: ExitStack) -> None:
         self.has_received = False
@@ -326,10 +337,10 @@ class MessagingActions(VehicleBase):
     def streams(self, rate_hz: float) -> Iterator[None]:
         """Request all streams of the vehicle at ``rate_hz`` for the duration of the ``with`` block.
 
-        For recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot receives
-        REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no message
-        arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit requests
-        common states that are missing, like :meth:`rate`.
+        Use it for recordings, ground stations, and firmware that cannot set the rate of a single message. ArduPilot
+        gets REQUEST_DATA_STREAM (whole Hz, at least 1). aerokit repeats it after a reboot or a silence, and while no
+        message arrives. ArduPilot continues to stream after the block. Other autopilots stream by themselves; aerokit
+        requests only those common states that are missing.
 
         Raises:
             InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.

@@ -100,7 +100,7 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
 
 
 def is_worse_failsafe(state: int, state_before: int | None) -> bool:
-    """Return True if this MAV_STATE reports a failsafe, and the previous MAV_STATE none or a less severe failsafe."""
+    """Return True if MAV_STATE changed to a failsafe, or to a more severe one. ``state_before`` is None at first."""
     if state not in FAILSAFE_STATES:
         return False
     return state_before is None or state_before not in FAILSAFE_STATES or state > state_before
@@ -173,7 +173,7 @@ class Order:
         self.failsafe: str = ""
         """The failsafe that became active after the order, as a clause; empty if there was none."""
         self.unexplained: str = ""
-        """A clause about a mode change by a raw command or another party, which is unclear; empty if there was none."""
+        """A clause about a mode change that a raw command or another party may have caused; empty if there was none."""
         self.has_lost_mode: bool = False
         """True if the vehicle has changed to a mode that the order does not explain."""
         self.mode_lost_at: float = -math.inf
@@ -217,7 +217,7 @@ class Order:
         return mode.custom_mode in self._own_modes
 
     def expect(self, modes: Collection[Mode]) -> None:
-        """Also accept these modes, because they may be the effect of another order of the program."""
+        """Count these modes as the order's own, because another order of the program may lead to them."""
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
@@ -243,21 +243,21 @@ class Order:
 
         Once one of the order's own modes was reported, a return to the mode before the order is a takeover.
         """
-        number, was_reported_before = mode.custom_mode, self._mode_now is not None
-        is_change = was_reported_before and number != self._mode_now
+        number = mode.custom_mode
+        is_first_report = self._mode_now is None
+        is_change = not is_first_report and number != self._mode_now
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
             has_taken_effect = is_change or not self._requires_mode_change
             if has_taken_effect and reported_at >= self._settles_at:
-                self._accepted_modes.clear()
+                self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
         elif number in self._expected_modes & self._accepted_modes and reported_at >= self._settles_at:
             # An earlier order of the program has taken effect, so only another party can restore the mode before it.
             self._accepted_modes -= self._modes_before
-        elif not was_reported_before or reported_at < self._any_mode_until:
-            # This is the first report of a mode, or the mode may be the effect of a raw command.
-            if was_reported_before and number not in self._accepted_modes:
+        elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
+            if not is_first_report and number not in self._accepted_modes:
                 self.unexplained = f"the mode changed to {mode}"
             self._accepted_modes.add(number)
         elif number not in self._accepted_modes and self._ends_on_mode_change:
@@ -314,7 +314,7 @@ class SentCommand:
         order.was_sent = True
         self.heartbeat_at: float = -math.inf
         """Time of the last HEARTBEAT."""
-        self._is_reported = False
+        self._is_effect_reported = False
         self._mode_now = None if mode_now is None else mode_now.custom_mode
         self._modes = {mode.custom_mode for mode in modes}
         self._armed_now = armed_now
@@ -326,8 +326,8 @@ class SentCommand:
     @property
     def is_confirmed(self) -> bool:
         """True once the command's effect was reported."""
-        self._is_reported = self._is_reported or self._is_done()
-        return self._is_reported
+        self._is_effect_reported = self._is_effect_reported or self._is_done()
+        return self._is_effect_reported
 
     @property
     def end(self) -> str:
@@ -346,10 +346,12 @@ class SentCommand:
     def on_mode(self, mode: Mode, reported_at: float) -> None:
         """Process the reported mode."""
         mode_before, self._mode_now = self._mode_now, mode.custom_mode
-        self._is_reported = self._is_reported or (self._mode_now != mode_before and self._mode_now in self._modes)
+        if self._mode_now != mode_before and self._mode_now in self._modes:
+            self._is_effect_reported = True
 
     def on_armed(self, armed: bool, reported_at: float) -> None:
         """Process the reported armed state."""
         armed_before, self._armed_now = self._armed_now, armed
-        self._is_reported = self._is_reported or (armed is not armed_before and armed is self.arms)
+        if armed is not armed_before and armed is self.arms:
+            self._is_effect_reported = True
         self.heartbeat_at = reported_at

@@ -116,7 +116,7 @@ class PostedOrder:
             raise InvalidArgument(f"mode = {mode} is not allowed: this order does not lead to this mode")
         for attempts_left in reversed(range(MAX_MODE_ATTEMPTS)):
             try:
-                self._prepare(MavCmd.DO_SET_MODE)
+                self._begin_command(MavCmd.DO_SET_MODE)
                 await self._sender.request_mode(mode, self._order, base_mode=mode.base_mode, component_id=component_id)
                 await self.wait_confirmed(timeout)
             except CommandRejected as error:
@@ -167,12 +167,12 @@ class PostedOrder:
     async def _send(
         self, send: Callable[..., Awaitable[CommandAck]], command: int, *params: float, **options: Any
     ) -> None:
-        self._prepare(command)
+        self._begin_command(command)
         order = self._order
         await self._sender.run_command(order, send, command, *params, modes=order.modes, armed=order.armed, **options)
 
-    def _prepare(self, command: int) -> None:
-        """Prepare to send a command: from now on, collect refusals that follow an acceptance of the command."""
+    def _begin_command(self, command: int) -> None:
+        """Check that the block is open, and collect refusals that follow an acceptance of this command."""
         if self._was_left:
             raise InvalidArgument(f"the `with` block of this order was left: {command_name(command)} was not sent")
         self._refusal_watch.close()

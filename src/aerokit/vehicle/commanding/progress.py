@@ -340,7 +340,8 @@ class VehiclePosition:
             )
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.accepts_relative_altitude:
-            altitude, is_relative = altitude + self.home_altitude(), False
+            altitude += self.home_altitude()
+            is_relative = False
         frame = MavFrame.GLOBAL_RELATIVE_ALT_INT if is_relative else MavFrame.GLOBAL_INT
         return round(target.latitude_deg * 1e7), round(target.longitude_deg * 1e7), altitude, frame
 
@@ -366,5 +367,5 @@ class VehiclePosition:
 
     @property
     def accepts_relative_altitude(self) -> bool:
-        """Return True if the autopilot supports altitudes relative to home."""
+        """True if the autopilot supports altitudes relative to home."""
         return self._autopilot.reposition is None or self._autopilot.reposition.relative_altitude

@@ -44,7 +44,8 @@ class RoundFlight:
     """One flight around a place, or to the place if there is no ``counter``.
 
     Without ``rounds``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s.
-    ``center_name`` is the argument of the public method. The constructor raises if the vehicle cannot fly there.
+    ``center_name`` is the name of the public method's argument with the place, for error texts. The constructor raises
+    if the vehicle cannot fly there.
     """
 
     def __init__(
@@ -84,13 +85,14 @@ class RoundFlight:
         params: tuple[float, ...],
         mode: Mode,
         *,
-        is_held: bool,
+        holds_at_end: bool,
         stay_s: float = 0.0,
-        circle_m: float = 0.0,
+        radius_m: float = 0.0,
     ) -> None:
         """Send the command, and wait until the rounds are flown and another ``stay_s`` seconds have passed.
 
-        At the end, the vehicle is ordered to hold if ``is_held``; otherwise it continues on a circle of ``circle_m``.
+        At the end, the vehicle is ordered to hold if ``holds_at_end``; otherwise it continues to circle. ``radius_m``
+        is the ordered radius, 0 if the command has none.
         """
         context, cleanup = self._context, self._context.flight_cleanup
         hold_mode = context.sender.mode_for(self._operation, "hold")
@@ -100,11 +102,11 @@ class RoundFlight:
                 send = self._session.commands.send_int
                 await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
             with cleanup.flying(order), self._session.streaming("position"):
-                await self._await_rounds(order, mode, stay_s, circle_m)
-            if is_held:
+                await self._await_rounds(order, mode, stay_s, radius_m)
+            if holds_at_end:
                 await cleanup.stop_in(hold_mode, order)
-            elif circle_m:
-                context.vehicle_position.record_circle(circle_m)
+            elif radius_m:
+                context.vehicle_position.record_circle(radius_m)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the command, so it is ordered to hold.
             cleanup.hold_in_background(order)
@@ -114,7 +116,7 @@ class RoundFlight:
                 cleanup.hold_in_background(order)
             raise
 
-    async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, circle_m: float) -> None:
+    async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, radius_m: float) -> None:
         """Wait until the rounds are flown; without rounds, until the vehicle is at the place."""
         session, started = self._session, self._session.connection.now()
         detect_stall, mode_failure = StallDetector(session), self._context.sender.mode_failure(order, mode)
@@ -122,10 +124,10 @@ class RoundFlight:
         def on_status(status: OrbitExecutionStatus) -> None:
             """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
             flown_m = abs(status.radius)
-            is_wrong = circle_m and abs(flown_m - circle_m) > RADIUS_ERROR_M
-            self._circle_problem = (
-                f"the vehicle flies a circle of {flown_m:.1f} m instead of {circle_m:g} m" if is_wrong else ""
-            )
+            if radius_m > 0 and abs(flown_m - radius_m) > RADIUS_ERROR_M:
+                self._circle_problem = f"the vehicle flies a circle of {flown_m:.1f} m instead of {radius_m:g} m"
+            else:
+                self._circle_problem = ""
 
         def failure_reason() -> str | None:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
@@ -161,7 +163,7 @@ class RoundFlight:
     def _is_flown_since(self, started: float) -> bool:
         """Return True if the rounds are flown; without rounds, if the vehicle is in place."""
         is_known = self._context.vehicle_position.is_known_since(started)
-        if not is_known or self._count() < self._rounds:
+        if not is_known or self._count_rounds() < self._rounds:
             return False
         return self._rounds > 0 or self._is_in_place
 
@@ -173,7 +175,7 @@ class RoundFlight:
             return self._counter.is_on_path
         return position.remaining_distance(self._center) <= position.arrival_radius_m
 
-    def _count(self) -> float:
+    def _count_rounds(self) -> float:
         """Pass the present position to the counter, and return the rounds flown."""
         here = self._telemetry.position.latest
         if self._counter is None or here is None:
@@ -198,7 +200,7 @@ class RoundFlight:
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
                 mode = self._context.sender.mode_for(self._operation, "setpoint")
-                with self._context.flight_cleanup.preparing(mode) as order:
+                with self._context.flight_cleanup.preparing_stream(mode) as order:
                     flight = await self._path_flight(path, speed_m_s, facing)
                 await self._stream(flight, order)
         except SetpointStreamStopped as error:
@@ -208,9 +210,9 @@ class RoundFlight:
             raise OperationTimeout(f"{self._operation}: not done within {self._timeout:g} s; {self._describe()}")
 
     async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
-        """Return the flight along the path.
+        """Return the flight along the path, with the center in the local frame.
 
-        The vehicle's positions in the global and in the local frame give the center in the local frame.
+        The vehicle's position is known in both frames, so the center can be converted from the global to the local one.
         """
         local_position, since = self._telemetry.local_position, self._session.connection.now()
         local = await local_position.wait_until(lambda _: local_position.updated_at >= since, timeout=FRAME_TIMEOUT_S)
@@ -234,22 +236,24 @@ class RoundFlight:
         return heading
 
     async def _stream(self, flight: PathFlight, order: Order) -> None:
-        initial, limits = flight.advance(0.0), {"valid_for_s": VALID_FOR_S, "max_lag_s": VALID_FOR_S}
-        stream = Guided(self._context).trajectory(initial, rate_hz=SETPOINT_RATE_HZ, **limits)
+        """Stream the set-points of the flight until the vehicle itself has flown the rounds."""
+        stream = Guided(self._context).trajectory(
+            flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
+        )
         stream._prepared_order = order
         async with stream:
             while not flight.is_complete:
                 await self._supply(stream, flight.advance(SETPOINT_INTERVAL_S))
                 if flight.is_on_path:
-                    self._count()
+                    self._count_rounds()
             # The vehicle follows the set-point with a delay, so it reaches the end later.
             give_up_at = self._session.connection.now() + END_TIMEOUT_S
-            while self._count() < self._rounds - LAG_ROUNDS:
+            while self._count_rounds() < self._rounds - LAG_ROUNDS:
                 if self._session.connection.now() > give_up_at:
                     raise OperationTimeout(
                         f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
                     )
-                await self._supply(stream, flight.advance(0.0))
+                await self._supply(stream, flight.advance(0.0))  # the set-point at the end, once more
 
     async def _supply(self, stream: SetpointStream[TrajectorySetpoint], setpoint: TrajectorySetpoint) -> None:
         stream.set(setpoint)

@@ -88,13 +88,13 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Before a step of an order that has waited, wait for the next HEARTBEAT if the last one is not recent.
+        """Wait for the next HEARTBEAT if the last one is not recent; called before a further step of an order.
 
-        The event loop may have been blocked meanwhile. Without ``order``, nothing of the order was sent yet.
+        The event loop may have been blocked before this step. Without ``order``, nothing was sent yet.
 
         Raises:
             OperationRejected: the order has ended meanwhile, or the computer slept since it was given.
-            HeartbeatTimeout: the last HEARTBEAT is older than ``MAX_SILENCE_S``, or no other one arrived by then.
+            HeartbeatTimeout: no HEARTBEAT was received for ``MAX_SILENCE_S``.
         """
         if order:
             self.raise_if_slept(order)
@@ -111,7 +111,7 @@ class OrderSender:
             self.raise_if_slept(order)
 
     def raise_if_slept(self, order: Order) -> None:
-        """Raise OperationRejected if the computer slept since the order was given, so that a further step is late."""
+        """Raise OperationRejected if the computer slept after the order was given: a further step would be too late."""
         if not order.only_stops and self._arbiter.slept_since(order.given_at) > 0:
             raise OperationRejected("the computer slept; the rest of the order was not sent")
 
@@ -264,7 +264,8 @@ class OrderSender:
         ``modes``. The vehicle has three seconds to report one of the modes.
         """
         impact = self.impact_failure(order)
-        grace_until, settles_at = self._session.connection.now() + MODE_GRACE_S, self._arbiter.mode_settles_at
+        grace_until = self._session.connection.now() + MODE_GRACE_S
+        settles_at = self._arbiter.mode_settles_at
         was_in_mode = False
 
         def failure_reason() -> str | None:
@@ -355,8 +356,9 @@ class OrderSender:
     @contextmanager
     def _raw_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
         """Register a raw command as an order. A command that steers supersedes actions."""
-        if CHANGED_BY_COMMAND.get(command, ARM_ALONE) != ARM_ALONE:
-            yield self._arbiter.raw_order(CHANGED_BY_COMMAND[command], modes=modes)
+        subjects = CHANGED_BY_COMMAND.get(command, ())
+        if subjects and subjects != ARM_ALONE:
+            yield self._arbiter.raw_order(subjects, modes=modes)
         else:
             with self._arbiter.auxiliary_order() as order:
                 yield order

@@ -184,12 +184,12 @@ class SetpointEncoder:
 
     def local(self, setpoint: LocalSetpoint, frame: int = MavFrame.LOCAL_NED) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with the vectors that the set-point has."""
-        mask, yaw, yaw_rate = _yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
+        mask, yaw, yaw_rate = _encode_yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         vectors: list[tuple[float, float, float]] = []
-        for ignore_bits, (x_field, y_field, z_field) in VECTORS.items():
-            if hasattr(setpoint, x_field):
-                vectors.append((getattr(setpoint, x_field), getattr(setpoint, y_field), getattr(setpoint, z_field)))
-            else:
+        for ignore_bits, (north, east, down) in VECTORS.items():
+            if hasattr(setpoint, north):
+                vectors.append((getattr(setpoint, north), getattr(setpoint, east), getattr(setpoint, down)))
+            else:  # The set-point does not have this vector, so the vehicle must ignore it.
                 vectors.append(ZERO)
                 mask |= ignore_bits
         position, velocity, acceleration = vectors
@@ -200,13 +200,14 @@ class SetpointEncoder:
     def body_velocity(self, setpoint: BodyVelocitySetpoint) -> Message:
         """Return SET_POSITION_TARGET_LOCAL_NED with a velocity in MAV_FRAME_BODY_NED.
 
-        For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading. In
-        MAV_FRAME_BODY_NED, ArduPilot adds each yaw to the previous target. A correction by telemetry would make the
-        vehicle's heading oscillate.
+        For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading, because
+        in MAV_FRAME_BODY_NED ArduPilot adds each yaw to the previous target. Correcting the yaw by telemetry instead
+        would make the vehicle's heading oscillate.
         """
         forward, right, frame = setpoint.forward_m_s, setpoint.right_m_s, MavFrame.BODY_NED
         if setpoint.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
-            heading, frame = math.radians(self._session.telemetry.heading_deg.value), MavFrame.LOCAL_NED
+            frame = MavFrame.LOCAL_NED
+            heading = math.radians(self._session.telemetry.heading_deg.value)
             forward, right = (
                 forward * math.cos(heading) - right * math.sin(heading),
                 forward * math.sin(heading) + right * math.cos(heading),
@@ -220,12 +221,14 @@ class SetpointEncoder:
 
         ``velocity`` is the velocity of the position itself, in m/s north, east, down.
         """
-        mask, yaw, yaw_rate = _yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
-        mask |= IGNORE_ACCELERATION | (IGNORE_VELOCITY if velocity is None else 0)
+        mask, yaw, yaw_rate = _encode_yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
+        mask |= IGNORE_ACCELERATION
+        if velocity is None:
+            mask |= IGNORE_VELOCITY
         latitude, longitude, altitude, frame = self._position.global_target(setpoint.position, "position")
-        now, speeds = self._time_ms(), velocity or ZERO
+        vectors = (*(velocity or ZERO), *ZERO)  # velocity and acceleration
         return SetPositionTargetGlobalInt(
-            now, *self._address, frame, mask, latitude, longitude, altitude, *speeds, *ZERO, yaw, yaw_rate
+            self._time_ms(), *self._address, frame, mask, latitude, longitude, altitude, *vectors, yaw, yaw_rate
         )
 
     def attitude(self, setpoint: AttitudeSetpoint) -> Message:
@@ -261,7 +264,7 @@ class SetpointEncoder:
         return int(self._session.connection.now() * 1000) & 0xFFFFFFFF
 
 
-def _yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
+def _encode_yaw(yaw_deg: float | None, yaw_rate_deg_s: float | None) -> tuple[int, float, float]:
     """Return type-mask bits, yaw in radians and yaw rate in radians per second."""
     if yaw_deg is not None and yaw_rate_deg_s is not None:
         raise InvalidArgument(f"yaw_deg = {yaw_deg} and yaw_rate_deg_s = {yaw_rate_deg_s} are not allowed together")

@@ -152,11 +152,18 @@ class StickStream(SteeringStream[StickInput]):
         for name in ("forward", "right", "throttle", "yaw"):
             check_range(name, getattr(sticks, name), -1, 1)
         check_range("buttons", sticks.buttons, 0, MAX_BUTTONS)
-        forward, right, yaw = (round(1000 * value) for value in (sticks.forward, sticks.right, sticks.yaw))
-        is_throttle_signed = self._rules is not None and self._rules.signed_throttle
-        # -1000 to 1000, or 0 to 1000.
-        throttle = 1000 * sticks.throttle if is_throttle_signed else 500 * (sticks.throttle + 1)
-        return ManualControl(self._session.system_id, forward, right, round(throttle), yaw, sticks.buttons)
+        if self._rules is not None and self._rules.signed_throttle:
+            throttle = 1000 * sticks.throttle  # −1000 to 1000
+        else:
+            throttle = 500 * (sticks.throttle + 1)  # 0 to 1000
+        return ManualControl(
+            target=self._session.system_id,
+            x=round(1000 * sticks.forward),
+            y=round(1000 * sticks.right),
+            z=round(throttle),
+            r=round(1000 * sticks.yaw),
+            buttons=sticks.buttons,
+        )
 
     def _send(self) -> None:
         super()._send()
@@ -169,7 +176,8 @@ class StickStream(SteeringStream[StickInput]):
         self._has_sent = False
         message: Message | None = None
         if self._rules.release == "axes":
-            message = ManualControl(self._session.system_id, NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE, 0)
+            target = self._session.system_id
+            message = ManualControl(target=target, x=NO_VALUE, y=NO_VALUE, z=NO_VALUE, r=NO_VALUE, buttons=0)
         elif self._rules.release == "channels":
             # The message has 18 channels. The upper ten, above channel 8, have another value for a release.
             released_upper_count = SUB_CHANNELS - 8

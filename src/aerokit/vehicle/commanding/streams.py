@@ -201,7 +201,7 @@ class SteeringStream(ValueStream[ValueT]):
     """
 
     _prepared_order: Order | None = None
-    """The steering order, if it was given before the stream is entered; see `FlightCleanup.preparing`."""
+    """The steering order, if it was given before the stream is entered; see `FlightCleanup.preparing_stream`."""
     _order: Order | None = None
     _mode: Mode | None = None
     _impact: ImpactDetector | None = None
@@ -245,8 +245,8 @@ class SteeringStream(ValueStream[ValueT]):
             await self._enter(mode, order)
         except BaseException as error:
             self._end()
-            # OperationRejected means that a pilot or a failsafe took over, who keeps control. After all other errors,
-            # the vehicle is ordered to hold.
+            # OperationRejected means that a pilot or a failsafe has taken over, and keeps control. After all other
+            # errors, the vehicle is ordered to hold.
             if not isinstance(error, OperationRejected):
                 self._hold()
             self._release()

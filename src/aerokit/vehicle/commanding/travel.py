@@ -37,7 +37,10 @@ KEEP_THROTTLE = -1
 """param3 of DO_CHANGE_SPEED that leaves the throttle unchanged."""
 
 # A target that is sent without an acknowledgement is repeated at this interval in seconds.
-RESEND_S = 1.0
+RESEND_INTERVAL_S = 1.0
+
+# The vehicle has arrived once it has been within the arrival radius for this many seconds.
+ARRIVED_FOR_S = 0.5
 
 
 @checks_arguments
@@ -105,7 +108,13 @@ class TravelActions(VehicleBase):
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._flight_cleanup.flying(order):
                 await self._await_arrival(
-                    target, arrival_radius_m, timeout, max_silence_s, order, mode, unacknowledged_target
+                    target,
+                    arrival_radius_m,
+                    order=order,
+                    mode=mode,
+                    unacknowledged_target=unacknowledged_target,
+                    timeout=timeout,
+                    max_silence_s=max_silence_s,
                 )
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the command, so it is ordered to hold.
@@ -138,8 +147,18 @@ class TravelActions(VehicleBase):
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
             self._sender.raise_if_ended(order)
             await self._sender.await_recent_state(order)
-            address, position = (self.system_id, self.component_id), (place["x"], place["y"], place["z"])
-            message = SetPositionTargetGlobalInt(0, *address, place["frame"], POSITION_ONLY, *position, *(0.0,) * 8)
+            ignored = dict.fromkeys(("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate"), 0.0)
+            message = SetPositionTargetGlobalInt(
+                time_boot_ms=0,
+                target_system=self.system_id,
+                target_component=self.component_id,
+                coordinate_frame=place["frame"],
+                type_mask=POSITION_ONLY,
+                lat_int=place["x"],
+                lon_int=place["y"],
+                alt=place["z"],
+                **ignored,
+            )
             self.connection.send(message)
             return message
         return None
@@ -148,11 +167,12 @@ class TravelActions(VehicleBase):
         self,
         target: Position,
         arrival_radius_m: float,
-        timeout: float | None,
-        max_silence_s: float | None,
+        *,
         order: Order,
         mode: Mode,
         unacknowledged_target: SetPositionTargetGlobalInt | None,
+        timeout: float | None,
+        max_silence_s: float | None,
     ) -> None:
         """Wait for the arrival. Meanwhile, repeat ``unacknowledged_target``, see :meth:`_send_target`."""
         started = sent_at = self.connection.now()
@@ -160,7 +180,7 @@ class TravelActions(VehicleBase):
         def resend_if_due() -> None:
             nonlocal sent_at
             now = self.connection.now()
-            if unacknowledged_target is None or now - sent_at < RESEND_S:
+            if unacknowledged_target is None or now - sent_at < RESEND_INTERVAL_S:
                 return
             if self._arbiter.is_state_recent and not order.end and not self._arbiter.slept_since(sent_at):
                 sent_at = now
@@ -180,7 +200,7 @@ class TravelActions(VehicleBase):
                 describe=lambda: f"the vehicle is {self._position.remaining_distance(target):.1f} m away",
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                held_for=0.5,
+                held_for=ARRIVED_FOR_S,
                 stall_reason=StallDetector(self._session),
             )
 
@@ -283,7 +303,7 @@ class TravelActions(VehicleBase):
         """Move the home position, and wait until HOME_POSITION reports the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
-        firmware that does not support this gets a COMMAND_LONG, which has a resolution of about a metre.
+        firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
@@ -406,7 +426,7 @@ class LookActions(VehicleBase):
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:
-        """Raise if the order was superseded. The program may change the mode, because a ROI applies in any mode."""
+        """Raise if the order was superseded. A mode change does not matter, because a ROI applies in any mode."""
         if order.end and not order.takeover_reason:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 

@@ -56,7 +56,8 @@ class TuningActions(VehicleBase):
             raise NotSupported(
                 f"autotune: {self.autopilot.firmware} needs a pilot for its mode AUTOTUNE; nothing was sent"
             )
-        started, percent = self.connection.now(), -1  # -1: no progress reported yet
+        started = self.connection.now()
+        percent = -1  # No progress was reported yet.
         answers: list[CommandAck] = []
         detach = self.connection.bus.attach(CommandAck, answers.append, system_id=self.system_id)
         try:

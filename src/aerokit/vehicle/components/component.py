@@ -154,13 +154,13 @@ class Component(ReadOnly):
         """
         message = await self.request(m.ComponentInformationBasic, timeout=timeout)
         return ComponentInformation(
-            message.vendor_name,
-            message.model_name,
-            message.software_version,
-            message.hardware_version,
-            message.serial_number,
-            message.capabilities,
-            message.time_manufacture_s or None,
+            vendor=message.vendor_name,
+            model=message.model_name,
+            software_version=message.software_version,
+            hardware_version=message.hardware_version,
+            serial_number=message.serial_number,
+            capabilities=message.capabilities,
+            manufactured_at=message.time_manufacture_s or None,
         )
 
     async def metadata(self, kind: MetadataKind = "general", *, timeout: float = 3.0) -> dict[str, Any]:
@@ -379,7 +379,8 @@ class Components:
         session.at_close(bus.attach(m.Heartbeat, self._on_heartbeat, system_id=session.system_id))
         for message_type, field, kind in DEVICE_MESSAGES:
             if bus.dialect.get(message_type.ID) is not None:  # The user's dialect may lack a message.
-                session.at_close(bus.attach(message_type, self._listener(field, kind), system_id=session.system_id))
+                on_message = self._device_listener(field, kind)
+                session.at_close(bus.attach(message_type, on_message, system_id=session.system_id))
         for (system_id, _), heartbeat in session.connection.heartbeats.items():
             if system_id == session.system_id:
                 self._on_heartbeat(heartbeat)
@@ -406,18 +407,20 @@ class Components:
     def _on_heartbeat(self, heartbeat: m.Heartbeat) -> None:
         frame = heartbeat.received_frame
         if frame is not None:
-            self._record(frame, 0, kind_of(heartbeat, frame.component_id))
+            self._record(frame, device_id=0, kind=kind_of(heartbeat, frame.component_id))
 
-    def _listener(self, field: str, kind: str) -> Any:
+    def _device_listener(self, id_field: str, kind: str) -> Callable[[Any], None]:
+        """Return a callback that records the device whose id is in ``id_field`` of a message."""
+
         def on_message(message: Any) -> None:
-            number, frame = getattr(message, field), message.received_frame
-            if frame is not None and number in DEVICE_IDS:
-                self._record(frame, number, kind)
+            device_id, frame = getattr(message, id_field), message.received_frame
+            if frame is not None and device_id in DEVICE_IDS:
+                self._record(frame, device_id=device_id, kind=kind)
 
         return on_message
 
-    def _record(self, frame: Frame, device_id: int, kind: str) -> None:
-        key = frame.component_id, device_id
-        self._statuses[key] = ComponentStatus(*key, kind, frame.received_at)
+    def _record(self, frame: Frame, *, device_id: int, kind: str) -> None:
+        status = ComponentStatus(frame.component_id, device_id, kind, frame.received_at)
+        self._statuses[frame.component_id, device_id] = status
         source = Source(frame.system_id, frame.component_id, "HEARTBEAT")
         self.cell.set(tuple(self._statuses[key] for key in sorted(self._statuses)), source)

@@ -149,8 +149,7 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting that the known values of other settings allow, as a mapping of names to
-        values.
+        """Return the options of a setting, by name, that the known values of other settings allow.
 
         Empty without a definition, and for settings without options.
         """
@@ -236,12 +235,12 @@ class Settings:
         check_name(name)
         with self._transfers.limit(timeout):
             async with self._writing:
-                defined = None if self._definition is None else self._definition.settings.get(name)
-                if defined is None:
+                setting_definition = self._definition_of(name)
+                if setting_definition is None:
                     return self._with_definition(await self._write_undefined(name, value, idle_timeout_s))
-                confirmed = await self._write_defined(defined, value, idle_timeout_s)
-                if defined.updates:
-                    await self._read_again(defined.updates, idle_timeout_s)
+                confirmed = await self._write_defined(setting_definition, value, idle_timeout_s)
+                if setting_definition.updates:
+                    await self._read_again(setting_definition.updates, idle_timeout_s)
                 return self._with_definition(confirmed)
 
     async def _write_undefined(self, name: str, value: object, idle_timeout_s: float) -> Setting:
@@ -252,33 +251,38 @@ class Settings:
         raw_value = checked_setting(name, value, known.type)
         return await self._write(name, raw_value, known.type, known.value, idle_timeout_s)
 
-    async def _write_defined(self, defined: SettingDefinition, value: object, idle_timeout_s: float) -> Setting:
-        """Read the unknown settings that restrict this setting, then check the value against its definition and write
-        it.
+    async def _write_defined(
+        self, setting_definition: SettingDefinition, value: object, idle_timeout_s: float
+    ) -> Setting:
+        """Check the value against the definition of the setting, and write it.
+
+        Unknown settings that restrict this setting are read before.
         """
-        definition, name = self._definition, defined.name
+        definition, name = self._definition, setting_definition.name
         assert definition is not None
         # Before anything is sent, refuse a value that is never allowed.
         definition.checked(name, value, self._values())
         to_read = [
             setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])
         ]
-        if name not in self._known and not defined.write_only:
+        if name not in self._known and not setting_definition.write_only:
             to_read.append(name)
         answers = await self._read(to_read, idle_timeout_s) if to_read else {}
-        self._missing |= {read for read, answer in answers.items() if isinstance(answer, ParameterRejected)}
+        for answered_name, answer in answers.items():
+            if isinstance(answer, ParameterRejected):
+                self._missing.add(answered_name)
         if name in answers:
             _setting_or_raise(answers[name])  # Raise an error if the component does not have this setting.
         # Check the value again, because the values that were just read may exclude or restrict this setting.
         checked_value = definition.checked(name, value, self._values())
         known = self._known.get(name)
-        kind = defined.wire_type if known is None else known.type
+        wire_type = setting_definition.wire_type if known is None else known.type
         old_value = None if known is None else known.value
-        raw_value = checked_setting(name, checked_value, kind)
-        return await self._write(name, raw_value, kind, old_value, idle_timeout_s)
+        raw_value = checked_setting(name, checked_value, wire_type)
+        return await self._write(name, raw_value, wire_type, old_value, idle_timeout_s)
 
     async def _write(
-        self, name: str, value: SettingValue, kind: int, old_value: SettingValue | None, idle_timeout_s: float
+        self, name: str, value: SettingValue, wire_type: int, old_value: SettingValue | None, idle_timeout_s: float
     ) -> Setting:
         transfers = self._transfers
         exchange = SettingWrite(
@@ -286,7 +290,7 @@ class Settings:
             transfers.component_id,
             name,
             value,
-            kind,
+            wire_type,
             before=old_value,
             round_trip=transfers.round_trip,
             idle_timeout_s=idle_timeout_s,
@@ -320,10 +324,15 @@ class Settings:
         was_read = setting.name in self._known or setting.name in self._missing or self._is_complete
         return not was_read and not setting.write_only
 
+    def _definition_of(self, name: str) -> SettingDefinition | None:
+        return None if self._definition is None else self._definition.settings.get(name)
+
     def _with_definition(self, setting: Setting) -> Setting:
         """Return the setting with its value converted to the type in the definition, if there is one."""
-        defined = None if self._definition is None else self._definition.settings.get(setting.name)
-        return setting if defined is None else setting.replace(value=defined.convert(setting.value))
+        setting_definition = self._definition_of(setting.name)
+        if setting_definition is None:
+            return setting
+        return setting.replace(value=setting_definition.convert(setting.value))
 
     def _on_ack(self, message: m.ParamExtAck) -> None:
         if message.param_result == ParamAck.ACCEPTED:

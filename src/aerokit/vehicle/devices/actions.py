@@ -131,7 +131,9 @@ class DeviceActions(VehicleBase):
         self._last_text_id = self._last_text_id % 0xFFFF + 1  # a number from 1 to 65535
         text_id = 0 if len(data) <= CHUNK_LENGTH else self._last_text_id  # 0 means that the text has only one chunk.
         for chunk_number, chunk in enumerate(_chunks(text)):
-            self._session.send(Statustext(MavSeverity[severity.upper()], chunk, text_id, chunk_number))
+            self._session.send(
+                Statustext(severity=MavSeverity[severity.upper()], text=chunk, id=text_id, chunk_seq=chunk_number)
+            )
 
     _last_text_id = 0  # Each vehicle begins with this value.
 

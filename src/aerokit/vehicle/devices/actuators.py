@@ -234,11 +234,14 @@ class Actuators(ReadOnly):
         stop: tuple[float, ...]
         # On ArduPilot, a test with throttle 0 for 0 s ends a running test. On PX4, a test of 0 s releases the output.
         if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
-            command, start = MavCmd.ACTUATOR_TEST, (throttle_percent / 100, duration_s, 0, 0, number)
+            command = MavCmd.ACTUATOR_TEST
+            start = (throttle_percent / 100, duration_s, 0, 0, number)
             stop = (math.nan, 0, 0, 0, number)
         else:
-            command, start = MavCmd.DO_MOTOR_TEST, (number, PERCENT, throttle_percent, duration_s, 1)
-            stop = (number, PERCENT, 0, 0, 1)
+            command = MavCmd.DO_MOTOR_TEST
+            motor_count = 1
+            start = (number, PERCENT, throttle_percent, duration_s, motor_count)
+            stop = (number, PERCENT, 0, 0, motor_count)
         session.check_disarmed("test_motor", is_current=arbiter.is_state_recent)
         # On ArduPilot, a new test ends the test of another motor.
         order = arbiter.device_order("motor test" if command == MavCmd.DO_MOTOR_TEST else f"motor test {number}")
@@ -288,7 +291,7 @@ class Actuators(ReadOnly):
             ParachuteAction.RELEASE,
             topic="parachute",
             is_done=lambda text, _: text.startswith("Parachute: Released"),
-            # `is_done` has not accepted the text, and all other texts about the parachute are reasons for a refusal.
+            # A text that `is_done` accepts ends the wait. All other texts about the parachute are refusals.
             is_refusal=lambda text: text.startswith("Parachute: "),
             timeout=PARACHUTE_TIMEOUT_S,
         )

@@ -18,8 +18,8 @@ NUMBER = Argument("number", 1, 8)
 GRIP_TIMEOUT_S = 10.0
 EPM_WAIT_S = 3.0
 """Seconds until an electro-permanent gripper has moved. ArduPilot reports only the start of its movement."""
-BEGINS = {GripperActions.GRAB: "Gripper load grabbing", GripperActions.RELEASE: "Gripper load releasing"}
-ENDS = {GripperActions.GRAB: "Gripper load grabbed", GripperActions.RELEASE: "Gripper load released"}
+BEGIN_TEXTS = {GripperActions.GRAB: "Gripper load grabbing", GripperActions.RELEASE: "Gripper load releasing"}
+END_TEXTS = {GripperActions.GRAB: "Gripper load grabbed", GripperActions.RELEASE: "Gripper load released"}
 
 
 @checks_arguments
@@ -57,8 +57,8 @@ class Gripper(ReadOnly):
             return
 
         def has_moved(text: str, since_acknowledgement_s: float) -> bool:
-            has_begun = text == BEGINS[action]
+            has_begun = text == BEGIN_TEXTS[action]
             # For an electro-permanent gripper, ArduPilot reports no end, so wait as long as its movement takes.
-            return text == ENDS[action] or (has_begun and since_acknowledgement_s >= EPM_WAIT_S)
+            return text == END_TEXTS[action] or (has_begun and since_acknowledgement_s >= EPM_WAIT_S)
 
         await order.send_until_text(context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S)

@@ -20,7 +20,9 @@ __all__ = ["Shell"]
 
 PROMPTS = ("pxh> ", "nsh> ")
 """PX4's prompts, in simulation and on NuttX. The shell shows its prompt when a command has ended."""
-DATA_BYTES, MAX_LINE, MAX_WAITING, OPEN_TIMEOUT_S = 70, 1000, 4096, 5.0
+DATA_BYTES = 70
+"""Size of the field ``data`` of SERIAL_CONTROL."""
+MAX_LINE_BYTES, MAX_WAITING_MESSAGES, OPEN_TIMEOUT_S = 1000, 4096, 5.0
 _RESPOND, _REPLY = SerialControlFlag.RESPOND, SerialControlFlag.REPLY
 
 
@@ -41,7 +43,7 @@ class Shell(ReadOnly):
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
         self._output: Subscription[SerialControl] = session.connection.subscribe(
-            SerialControl, system_id=session.system_id, capacity=MAX_WAITING
+            SerialControl, system_id=session.system_id, capacity=MAX_WAITING_MESSAGES
         )
         self._is_open = False
 
@@ -78,9 +80,10 @@ class Shell(ReadOnly):
             InvalidArgument: the line is too long or has a line break, or the shell is not open. Nothing was sent.
         """
         data = line.encode()
-        if len(data) > MAX_LINE or "\n" in line or "\r" in line:
+        if len(data) > MAX_LINE_BYTES or "\n" in line or "\r" in line:
             raise InvalidArgument(
-                f"line of {len(data)} bytes is not allowed: it must have at most {MAX_LINE} bytes, and no line break"
+                f"line of {len(data)} bytes is not allowed: it must have at most {MAX_LINE_BYTES} bytes, and no line"
+                " break"
             )
         if not self._is_open:
             raise InvalidArgument("the shell is not open: write to it inside its `async with` block")
@@ -89,10 +92,17 @@ class Shell(ReadOnly):
             self._send(data[start : start + DATA_BYTES], _RESPOND)
 
     def _send(self, data: bytes, flags: int) -> None:
-        session = self._session
-        padded = data.ljust(DATA_BYTES, b"\0")
-        target = (session.system_id, session.component_id)
-        session.send(SerialControl(SerialControlDev.DEV_SHELL, flags, 0, 0, len(data), padded, *target))
+        message = SerialControl(
+            device=SerialControlDev.DEV_SHELL,
+            flags=flags,
+            timeout=0,
+            baudrate=0,
+            count=len(data),
+            data=data.ljust(DATA_BYTES, b"\0"),
+            target_system=self._session.system_id,
+            target_component=self._session.component_id,
+        )
+        self._session.send(message)
 
     async def read(self, *, timeout: float | None = None) -> str:
         """Return the next piece of output, up to 70 bytes, including echoes and prompts.
@@ -130,7 +140,8 @@ class Shell(ReadOnly):
             pass  # Discard earlier output.
         self.write(command)
         now = self._session.connection.now
-        deadline, text = now() + timeout, ""
+        deadline = now() + timeout
+        text = ""
         try:
             while not text.endswith(PROMPTS):
                 text += await self.read(timeout=max(0.0, deadline - now()))
@@ -140,5 +151,5 @@ class Shell(ReadOnly):
                 f"shell: {command!r} has not ended within {timeout:g} s; output: {text!r}; {link}"
             ) from None
         # The output begins with an echo of the command, and its last line is the prompt.
-        text = text.removeprefix(command).removeprefix("\n")
-        return text.rpartition("\n")[0] if "\n" in text else ""
+        output, _, _ = text.removeprefix(command).removeprefix("\n").rpartition("\n")
+        return output

@@ -34,7 +34,7 @@ class Winch(ReadOnly):
 
     ArduCopter supports :meth:`relax`, :meth:`pay_out` and :meth:`set_rate`. The other orders are for winches that are
     MAVLink components: ``vehicle.winch(component_id=169)``. PX4 itself drives no winch, but forwards the command to
-    such a component. An order is sent only once if a second transmission could pay out more line. A newer order for the
+    these components. An order is sent only once if a second transmission could pay out more line. A newer order for the
     winch ends the call that waits for the previous order. A cancelled call does not stop the winch: call
     ``set_rate(0)``.
     """
@@ -89,12 +89,17 @@ class Winch(ReadOnly):
         # order.
         order = self._context.arbiter.device_order(self._topic)
         start = await receive_once(self._context, m.WinchStatus, self._component_id)
-        goal_m = None if start is None else start.line_length + length_m
+
+        def has_paid_out(status: m.WinchStatus) -> bool:
+            assert start is not None
+            goal_m = start.line_length + length_m
+            return abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M
+
         await self._send(
             WinchActions.RELATIVE_LENGTH_CONTROL,
             length_m,
             rate_m_s,
-            None if goal_m is None else lambda status: abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M,
+            is_done=None if start is None else has_paid_out,
             timeout=timeout,
             order=order,
         )
@@ -112,7 +117,9 @@ class Winch(ReadOnly):
         """
         check_range("rate_m_s", rate_m_s, -MAX_RATE_M_S, MAX_RATE_M_S)
         await self._send(
-            WinchActions.RATE_CONTROL, 0, rate_m_s, lambda status: abs(status.speed - rate_m_s) <= RATE_TOLERANCE_M_S
+            WinchActions.RATE_CONTROL,
+            rate_m_s=rate_m_s,
+            is_done=lambda status: abs(status.speed - rate_m_s) <= RATE_TOLERANCE_M_S,
         )
 
     async def lock(self) -> None:

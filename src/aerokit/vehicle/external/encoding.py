@@ -71,21 +71,28 @@ class MeasurementEncoder:
             if velocity is not None:  # The velocity is along the axes of the body in every frame.
                 forward, left, upward = velocity
                 velocity = (forward, -left, -upward)
-        frame = self._session.autopilot.external.ned_frame if is_earth_frame else MavFrame.LOCAL_FRD
+        x, y, z = position
+        vx, vy, vz = UNKNOWN_VECTOR if velocity is None else velocity
         return (
             m.Odometry(
-                self._time_us(value.measured_at),
-                frame,
-                MavFrame.BODY_FRD,
-                *position,
-                _normalized(quaternion),
-                *(UNKNOWN_VECTOR if velocity is None else velocity),
-                *UNKNOWN_VECTOR,  # turn rates
-                _triangle(value.position_variance_m2, value.orientation_variance_rad2),
-                _triangle(value.velocity_variance_m2_s2, None),
-                _reset_counter(value.reset_counter),
-                VISION,
-                value.quality,
+                time_usec=self._time_us(value.measured_at),
+                frame_id=self._session.autopilot.external.ned_frame if is_earth_frame else MavFrame.LOCAL_FRD,
+                child_frame_id=MavFrame.BODY_FRD,
+                x=x,
+                y=y,
+                z=z,
+                q=_normalized(quaternion),
+                vx=vx,
+                vy=vy,
+                vz=vz,
+                rollspeed=NAN,
+                pitchspeed=NAN,
+                yawspeed=NAN,
+                pose_covariance=_triangle(value.position_variance_m2, value.orientation_variance_rad2),
+                velocity_covariance=_triangle(value.velocity_variance_m2_s2, None),
+                reset_counter=_reset_counter(value.reset_counter),
+                estimator_type=VISION,
+                quality=value.quality,
             ),
         )
 
@@ -121,20 +128,26 @@ class MeasurementEncoder:
             _check_variance(variance)
             covariance = [NAN] * 9 if variance is None else [variance, 0, 0, 0, variance, 0, 0, 0, variance]
             return (m.VisionSpeedEstimate(time_us, *speeds, covariance, reset_count),)
-        frames = (MavFrame.LOCAL_NED, MavFrame.LOCAL_NED)
-        unknown_quaternion = (NAN,) * 4
-        covariances = (_triangle(None, None), _triangle(variance, None))
-        last_fields = (reset_count, VISION, 100)  # 100 is the quality in percent
         return (
             m.Odometry(
-                time_us,
-                *frames,
-                *UNKNOWN_VECTOR,  # position
-                unknown_quaternion,
-                *speeds,
-                *UNKNOWN_VECTOR,  # turn rates
-                *covariances,
-                *last_fields,
+                time_usec=time_us,
+                frame_id=MavFrame.LOCAL_NED,
+                child_frame_id=MavFrame.LOCAL_NED,
+                x=NAN,
+                y=NAN,
+                z=NAN,
+                q=(NAN,) * 4,
+                vx=value.north_m_s,
+                vy=value.east_m_s,
+                vz=value.down_m_s,
+                rollspeed=NAN,
+                pitchspeed=NAN,
+                yawspeed=NAN,
+                pose_covariance=_triangle(None, None),
+                velocity_covariance=_triangle(variance, None),
+                reset_counter=reset_count,
+                estimator_type=VISION,
+                quality=100,
             ),
         )
 
@@ -163,25 +176,28 @@ class MeasurementEncoder:
         yaw_cdeg = 0  # 0 means that the yaw is unknown, so north is sent as 36000.
         if value.yaw_deg is not None:
             yaw_cdeg = round(value.yaw_deg % 360 * 100) or 36000
+        north_m_s, east_m_s, down_m_s = value.velocity_m_s or (0.0, 0.0, 0.0)
         return (
             m.GpsInput(
-                self._time_us(value.measured_at),
-                value.instance,
-                ignore_flags,
-                week_ms,
-                week,
-                value.fix,
-                round(value.latitude_deg * 1e7),
-                round(value.longitude_deg * 1e7),
-                value.altitude_amsl_m,
-                value.hdop or 0.0,
-                value.vdop or 0.0,
-                *(value.velocity_m_s or (0.0, 0.0, 0.0)),
-                value.speed_accuracy_m_s or 0.0,
-                value.horizontal_accuracy_m or 0.0,
-                value.vertical_accuracy_m or 0.0,
-                value.satellites,
-                yaw_cdeg,
+                time_usec=self._time_us(value.measured_at),
+                gps_id=value.instance,
+                ignore_flags=ignore_flags,
+                time_week_ms=week_ms,
+                time_week=week,
+                fix_type=value.fix,
+                lat=round(value.latitude_deg * 1e7),
+                lon=round(value.longitude_deg * 1e7),
+                alt=value.altitude_amsl_m,
+                hdop=value.hdop or 0.0,
+                vdop=value.vdop or 0.0,
+                vn=north_m_s,
+                ve=east_m_s,
+                vd=down_m_s,
+                speed_accuracy=value.speed_accuracy_m_s or 0.0,
+                horiz_accuracy=value.horizontal_accuracy_m or 0.0,
+                vert_accuracy=value.vertical_accuracy_m or 0.0,
+                satellites_visible=value.satellites,
+                yaw=yaw_cdeg,
             ),
         )
 
@@ -199,10 +215,19 @@ class MeasurementEncoder:
                 continue
             is_free = distance_m > value.max_m  # A sector without an obstacle is sent as max_distance + 1.
             distances[index] = max_cm + 1 if is_free else _centimetres("distances_m", distance_m)
-        time_us = self._time_us(value.measured_at)
-        # The fields increment_f, which the autopilots read instead of the integer field increment, and angle_offset.
-        angles = (value.step_deg, value.first_deg)
-        return (m.ObstacleDistance(time_us, LASER, distances, 0, min_cm, max_cm, *angles, MavFrame.BODY_FRD),)
+        return (
+            m.ObstacleDistance(
+                time_usec=self._time_us(value.measured_at),
+                sensor_type=LASER,
+                distances=distances,
+                increment=0,  # The autopilots read increment_f instead of this integer field.
+                min_distance=min_cm,
+                max_distance=max_cm,
+                increment_f=value.step_deg,
+                angle_offset=value.first_deg,
+                frame=MavFrame.BODY_FRD,
+            ),
+        )
 
     def obstacle_points(self, value: v.ObstaclePoints) -> tuple[Message, ...]:
         """Return one OBSTACLE_DISTANCE_3D for each point, all with the same time stamp."""
@@ -225,15 +250,25 @@ class MeasurementEncoder:
         if value.quality is not None:
             check_range("quality", value.quality, 1, 100)
         _check_variance(value.variance_m2)
-        limits_cm = (_centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m))
+        min_cm, max_cm = _centimetres("min_m", value.min_m), _centimetres("max_m", value.max_m)
         distance_cm = _centimetres("distance_m", value.distance_m)
         covariance_cm2 = UNKNOWN_COVARIANCE
         if value.variance_m2 is not None:
             covariance_cm2 = min(UNKNOWN_COVARIANCE - 1, round(value.variance_m2 * 1e4))
         time_ms = (self._time_us(value.measured_at) // 1000) & 0xFFFFFFFF  # The field has 32 bits.
-        sensor = (LASER, 0, ORIENTATIONS[value.direction])  # type, id, orientation
-        quality = value.quality or 0  # 0 means "unknown"
-        return (m.DistanceSensor(time_ms, *limits_cm, distance_cm, *sensor, covariance_cm2, signal_quality=quality),)
+        return (
+            m.DistanceSensor(
+                time_boot_ms=time_ms,
+                min_distance=min_cm,
+                max_distance=max_cm,
+                current_distance=distance_cm,
+                type=LASER,
+                id=0,
+                orientation=ORIENTATIONS[value.direction],
+                covariance=covariance_cm2,
+                signal_quality=value.quality or 0,  # 0 means "unknown"
+            ),
+        )
 
     def landing_target(self, value: v.TargetMeasurement) -> tuple[Message, ...]:
         """Return LANDING_TARGET relative to the vehicle, or converted to the local frame for PX4."""
@@ -247,15 +282,26 @@ class MeasurementEncoder:
             )
         frame = MavFrame.LOCAL_FRD if value.is_level else MavFrame.BODY_FRD
         if self._session.autopilot.external.target_is_local:
-            frame, offset = MavFrame.LOCAL_NED, self._in_local_frame(offset, is_level=value.is_level)
-        time_us, unknown_size = self._time_us(value.measured_at), (0.0, 0.0)
-        # Angular offsets of the target from the centre of the picture, for a camera that looks straight down.
-        angles = (math.atan2(value.right_m, value.down_m), -math.atan2(value.forward_m, value.down_m))
-        no_rotation = (1.0, 0.0, 0.0, 0.0)
-        last_fields = (LANDING_TARGET_TYPE_VISION_FIDUCIAL, 1)  # 1: the position is valid
+            frame = MavFrame.LOCAL_NED
+            offset = self._in_local_frame(offset, is_level=value.is_level)
+        x, y, z = offset
         return (
             m.LandingTarget(
-                time_us, value.number, frame, *angles, distance, *unknown_size, *offset, no_rotation, *last_fields
+                time_usec=self._time_us(value.measured_at),
+                target_num=value.number,
+                frame=frame,
+                # Angles of the target from the centre of the picture, for a camera that looks straight down.
+                angle_x=math.atan2(value.right_m, value.down_m),
+                angle_y=-math.atan2(value.forward_m, value.down_m),
+                distance=distance,
+                size_x=0.0,  # unknown
+                size_y=0.0,
+                x=x,
+                y=y,
+                z=z,
+                q=(1.0, 0.0, 0.0, 0.0),  # no rotation
+                type=LANDING_TARGET_TYPE_VISION_FIDUCIAL,
+                position_valid=1,
             ),
         )
 
@@ -268,18 +314,42 @@ class MeasurementEncoder:
         distance_m = -1.0 if value.distance_m is None else value.distance_m  # A negative distance means "unknown".
         check_finite("distance_m", distance_m)
         if self._session.autopilot.external.flow_in_radians:
-            gyro = UNKNOWN_VECTOR if value.gyro_rad is None else value.gyro_rad
-            interval_us = round(value.interval_s * 1e6)
-            flow = (value.x_rad, value.y_rad, *gyro)
-            return (m.OpticalFlowRad(time_us, 0, interval_us, *flow, 0, value.quality, 0, distance_m),)
+            gyro_x, gyro_y, gyro_z = UNKNOWN_VECTOR if value.gyro_rad is None else value.gyro_rad
+            return (
+                m.OpticalFlowRad(
+                    time_usec=time_us,
+                    sensor_id=0,
+                    integration_time_us=round(value.interval_s * 1e6),
+                    integrated_x=value.x_rad,
+                    integrated_y=value.y_rad,
+                    integrated_xgyro=gyro_x,
+                    integrated_ygyro=gyro_y,
+                    integrated_zgyro=gyro_z,
+                    temperature=0,
+                    quality=value.quality,
+                    time_delta_distance_us=0,
+                    distance=distance_m,
+                ),
+            )
         # ArduPilot takes flow_x times the interval between messages as the rate in rad/s (AP_OpticalFlow_MAV.cpp). The
         # angle is therefore divided by the interval twice. The result must fit into 16 bits.
         unit_rad = value.interval_s**2
         for name, angle in (("x_rad", value.x_rad), ("y_rad", value.y_rad)):
             check_range(name, angle, -0x8000 * unit_rad, 0x7FFF * unit_rad)
-        flow_x, flow_y = round(value.x_rad / unit_rad), round(value.y_rad / unit_rad)
-        rates = (value.x_rad / value.interval_s, value.y_rad / value.interval_s)
-        return (m.OpticalFlow(time_us, 0, flow_x, flow_y, 0.0, 0.0, value.quality, distance_m, *rates),)
+        return (
+            m.OpticalFlow(
+                time_usec=time_us,
+                sensor_id=0,
+                flow_x=round(value.x_rad / unit_rad),
+                flow_y=round(value.y_rad / unit_rad),
+                flow_comp_m_x=0.0,
+                flow_comp_m_y=0.0,
+                quality=value.quality,
+                ground_distance=distance_m,
+                flow_rate_x=value.x_rad / value.interval_s,
+                flow_rate_y=value.y_rad / value.interval_s,
+            ),
+        )
 
     def _in_local_frame(self, offset: Vector, *, is_level: bool) -> Vector:
         """Return a position in the local frame; ``offset`` is relative to the vehicle, along its body axes."""

@@ -99,7 +99,7 @@ async def land_on(
                 await landing.await_disarmed(order, timeout, max_silence_s)
             finally:
                 reader.cancel()
-                # Even if the call is cancelled, it waits until the program's source has ended. Hence the shield.
+                # The shield makes even a cancelled call wait until the program's source has ended.
                 with anyio.CancelScope(shield=True):
                     await asyncio.wait([reader])
         return landing.report(is_used=stream.sent > sent_before, texts=session.texts_since(order.given_at))
@@ -114,9 +114,10 @@ class TargetLanding:
         # When the target was last visible, and the vehicle's height at that time.
         self._seen_at = -math.inf
         self._seen_height_m: float | None = None
+        # The lowest height so far, and the greatest climb above it.
         self._lowest_m, self._climbed_m = math.inf, 0.0
         self._losses: list[TargetLoss] = []
-        self._error: Exception | None = None
+        self._source_error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
         """Read the source until it ends or fails. ``acquire`` and ``await_disarmed`` raise the source's exception."""
@@ -130,13 +131,13 @@ class TargetLanding:
                 self._on_target(await result if isawaitable(result) else result)
                 await anyio.sleep(period_s)
         except Exception as error:
-            self._error = error
+            self._source_error = error
 
     async def acquire(self, reader: asyncio.Task[None], timeout: float) -> None:
         """Wait until the target is visible for the first time, before the landing is ordered."""
         started = self._now()
         while self._last is None:
-            self._raise_error()
+            self._raise_if_source_failed()
             has_source_ended = reader.done()
             if has_source_ended or self._now() - started >= timeout:
                 when = "before the source of targets ended" if has_source_ended else f"within {timeout:g} s"
@@ -153,7 +154,7 @@ class TargetLanding:
             if height is not None:  # The climb above the lowest height so far shows a retry or a search.
                 self._lowest_m = min(self._lowest_m, height)
                 self._climbed_m = max(self._climbed_m, height - self._lowest_m)
-            self._raise_error()
+            self._raise_if_source_failed()
             return ground.confirms(telemetry.is_confirmed_disarmed and telemetry.armed.updated_at > order.given_at)
 
         def describe() -> str:
@@ -179,9 +180,9 @@ class TargetLanding:
     def _now(self) -> float:
         return self._session.connection.now()
 
-    def _raise_error(self) -> None:
-        if self._error is not None:
-            raise self._error
+    def _raise_if_source_failed(self) -> None:
+        if self._source_error is not None:
+            raise self._source_error
 
     def _on_target(self, target: TargetMeasurement | None) -> None:
         """Send the target, if it is visible, and record it for the report."""

@@ -62,10 +62,12 @@ class TimesyncAnswers:
 
     def _on_timesync(self, request: Timesync) -> None:
         frame = request.received_frame
+        # In a request, tc1 is 0.
         if request.tc1 == 0 and frame is not None and frame.component_id == self._session.component_id:
             connection = self._session.connection
             if connection.is_open:
-                connection.send(Timesync(int(frame.received_at * 1e9), request.ts1), to=self._session.system_id)
+                answer = Timesync(tc1=int(frame.received_at * 1e9), ts1=request.ts1)
+                connection.send(answer, to=self._session.system_id)
 
 
 @checks_arguments

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Maximum number of times that a transfer opens its file, because the vehicle may close a file at any time.
+# The vehicle may close a file at any time. A transfer then opens it again, up to this many times in total.
 MAX_OPEN_ATTEMPTS = 3
 # Error codes with which vehicles refuse to open a file while another file is open.
 SESSION_IN_USE = (MavFtpErr.FAIL, MavFtpErr.INVALIDSESSION, MavFtpErr.NOSESSIONSAVAILABLE)
@@ -68,7 +68,7 @@ class FileChannel:
         idle_timeout_s: float,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Wait for the previous operations, and for sessions that are still being closed.
+        """Run one operation in a block, after the previous operations have ended and their sessions are closed.
 
         Raises FileTimeout after ``timeout`` seconds; the error has the ranges that ``missing()`` returns.
         """
@@ -125,7 +125,7 @@ class FileChannel:
                 self._close_soon(file.session, path)
                 raise
             except Exception:
-                with suppress(FileTimeout):  # The error of the transfer tells more than that of closing.
+                with suppress(FileTimeout):  # The error of the transfer must reach the caller, not an error of closing.
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:  # A cancelled call must not wait.
@@ -141,7 +141,8 @@ class FileChannel:
 
     async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
         """Open a file. If another session is in the way, wait once until the vehicle times that session out."""
-        may_wait, may_be_own_session = True, True
+        may_wait = True
+        may_be_own_session = True
         while True:
             request = self._session_request(opcode, path, self.client.next_session(), idle_timeout_s)
             try:
@@ -197,6 +198,7 @@ class FileChannel:
 
     def _close_soon(self, session: int, path: str) -> None:
         """Close a session without waiting; the next operation waits for the confirmation."""
+        # The request is sent at once. The background task waits for the reply, and sends the request only to repeat it.
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
         with suppress(AerokitError):  # The connection may be closed.
             self.transfers.connection.send(request.message)
@@ -232,7 +234,8 @@ class LogChannel:
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._lock = asyncio.Lock()
-        self._ending: asyncio.Event | None = None
+        # Set when the end of the last failed operation is confirmed; None if no operation has failed.
+        self._end_confirmed: asyncio.Event | None = None
 
     async def list(
         self, idle_timeout_s: float, only_id: int | None, *, max_unanswered: int | None
@@ -282,12 +285,15 @@ class LogChannel:
         timeout: float | None,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Run one operation after the previous one has ended. If it fails, tell the vehicle to stop sending."""
+        """Run one operation in a block, after the previous one. If it fails, tell the vehicle to stop sending.
+
+        Raises FileTimeout after ``timeout`` seconds; the error has the ranges that ``missing()`` returns.
+        """
         try:
             with anyio.fail_after(timeout):
                 async with self._lock:
-                    if self._ending is not None:
-                        await self._ending.wait()
+                    if self._end_confirmed is not None:
+                        await self._end_confirmed.wait()
                     try:
                         yield
                     except BaseException:
@@ -299,19 +305,20 @@ class LogChannel:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
 
     def _end(self) -> None:
-        """Send LOG_REQUEST_END. A background task confirms the end before the next operation starts."""
+        """Send LOG_REQUEST_END. The next operation starts when a background task has confirmed the end."""
         transfers = self._transfers
+        # LOG_REQUEST_END is sent at once. The background task sends it only to repeat it.
         exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)
-        ended = asyncio.Event()
+        confirmed = asyncio.Event()
 
         async def confirm() -> None:
             try:
                 with suppress(AerokitError):
                     await transfers.run(exchange)
             finally:
-                ended.set()
+                confirmed.set()
 
         with suppress(AerokitError):  # The connection may be closed.
             transfers.connection.send(exchange.message)
-            self._ending = ended
+            self._end_confirmed = confirmed
             transfers.background.start(confirm, "aerokit end of logs")

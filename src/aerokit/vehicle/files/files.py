@@ -31,8 +31,8 @@ CRC_UNSUPPORTED = (MavFtpErr.FAIL, MavFtpErr.UNKNOWNCOMMAND)
 MAX_FILE_SIZE = 0xFFFFFFFF
 CRC_INVERSION = 0xFFFFFFFF
 BLOCK_SIZE = 1 << 16
-# A directory listing counts as endless after this many consecutive replies without entries, or this many entries.
-MAX_EMPTY_REPLIES, MAX_ENTRIES = 50, 1_000_000
+# A directory listing counts as endless after this many consecutive replies without a new entry, or this many entries.
+MAX_REPLIES_WITHOUT_NEW_ENTRY, MAX_ENTRIES = 50, 1_000_000
 
 
 class FileEntry(Snapshot):
@@ -134,26 +134,29 @@ class Files:
         """
         path_bytes(path)  # Raises InvalidArgument before anything is sent.
         entries: dict[str, FileEntry] = {}
-        offset = empty_replies = 0
+        offset = 0  # number of entries that were listed or skipped so far
+        replies_without_new_entry = 0
         async with self._channel.operation(f"list {path}", timeout=timeout, idle_timeout_s=idle_timeout_s):
             while (reply := await self._list_from(path, offset, idle_timeout_s)) is not None:
-                texts = [text for text in reply.data.split(b"\0") if text]
+                listed = [text for text in reply.data.split(b"\0") if text]
                 count_before = len(entries)
-                for text in texts:
+                for text in listed:
                     entry = _parse_entry(text)
                     if entry is not None:
                         entries[entry.name] = entry
-                offset += len(texts) or 1  # An empty reply: the next name is too long for a message, so skip it.
-                empty_replies = empty_replies + 1 if len(entries) == count_before else 0
-                if empty_replies > MAX_EMPTY_REPLIES or offset > MAX_ENTRIES:
+                # A reply is empty if the next name is too long for a message. This entry is skipped.
+                offset += max(len(listed), 1)
+                replies_without_new_entry += 1
+                if len(entries) > count_before:
+                    replies_without_new_entry = 0
+                if replies_without_new_entry > MAX_REPLIES_WITHOUT_NEW_ENTRY or offset > MAX_ENTRIES:
                     raise RemoteProtocolError(
                         f"list {path}: the vehicle's listing does not end; the last entry was number {offset}"
                     )
         return tuple(entries.values())
 
     async def crc32(self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> int:
-        """Return the CRC-32 of a file as computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final
-        XOR.
+        """Return the CRC-32 of a file, computed by the vehicle: polynomial 0x04C11DB7, initial value 0, no final XOR.
 
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
@@ -297,6 +300,7 @@ class Files:
         timeout: float | None,
         on_progress: OnProgress | None,
     ) -> None:
+        """Read a file into ``into``, beginning at ``into.start``."""
         path_bytes(path)  # Raises InvalidArgument before anything is sent.
         channel = self._channel
 

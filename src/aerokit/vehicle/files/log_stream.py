@@ -24,6 +24,8 @@ STOP = SimpleOrder("logs.stream", MavCmd.LOGGING_STOP)
 MAGIC, HEADER_BYTES = b"ULog\x01\x12\x35", 16
 NO_MESSAGE_START = 255
 """Value of ``first_message_offset`` if no ULog message begins in a LOGGING_DATA."""
+SEQUENCE_RANGE = 1 << 16
+"""The sequence numbers of the stream have 16 bits."""
 MAX_WAITING = 8192
 """Maximum number of messages that wait for the reader; they need about 2 MB."""
 DROPOUT = b"\x02\x00O"
@@ -39,32 +41,35 @@ class UlogAssembler:
     def __init__(self) -> None:
         self.lost: int = 0
         """Number of messages that were not received."""
-        self._next: int | None = None
-        self._has_header = self._is_aligned = False
+        self._next_sequence: int | None = None
+        self._has_header = False
+        # False after a gap, until the beginning of a ULog message is received.
+        self._is_aligned = False
         self._buffer = bytearray()
         self._received_at = 0.0
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
         """Add a message of the stream; return the next data of the file, up to the last complete ULog message."""
-        gap = 0 if self._next is None else (message.sequence - self._next) % 0x10000
-        if gap >= 0x8000:  # PX4 repeats an earlier message, whose acknowledgement was lost.
+        gap = 0 if self._next_sequence is None else (message.sequence - self._next_sequence) % SEQUENCE_RANGE
+        if gap >= SEQUENCE_RANGE // 2:  # PX4 repeats an earlier message, whose acknowledgement was lost.
             return b""
-        data, first_offset = bytes(message.data[: message.length]), message.first_message_offset
+        data = bytes(message.data[: message.length])
         prefix = b""  # the header of the file, or a ULog message that marks a gap
         if gap:
             self.lost += gap
             self._buffer.clear()  # The rest of this ULog message is lost.
-            self._is_aligned = False  # Skip data up to the beginning of the next ULog message.
-        self._next = (message.sequence + 1) % 0x10000
+            self._is_aligned = False
+        self._next_sequence = (message.sequence + 1) % SEQUENCE_RANGE
         if not self._has_header:
             self._has_header = self._is_aligned = data.startswith(MAGIC)
             if not self._has_header:
                 return b""  # The log begins with its header, so nothing before the header is used.
             prefix, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
         elif not self._is_aligned:
-            if first_offset == NO_MESSAGE_START:
-                return b""  # The rest of a message whose beginning was lost.
-            self._is_aligned, data = True, data[first_offset:]
+            if message.first_message_offset == NO_MESSAGE_START:
+                return b""  # This is the rest of a ULog message whose beginning was lost.
+            data = data[message.first_message_offset :]
+            self._is_aligned = True
             gap_ms = round(1000 * (now - self._received_at))
             prefix = DROPOUT + min(0xFFFF, gap_ms).to_bytes(2, "little")  # The field has 16 bits.
         self._received_at = now
@@ -75,10 +80,10 @@ class UlogAssembler:
         """Remove and return the complete messages: 2 bytes of length, 1 byte of type, content."""
         end = 0
         while len(self._buffer) >= end + 3:
-            size = 3 + int.from_bytes(self._buffer[end : end + 2], "little")
-            if len(self._buffer) < end + size:
+            message_size = 3 + int.from_bytes(self._buffer[end : end + 2], "little")
+            if len(self._buffer) < end + message_size:
                 break
-            end += size
+            end += message_size
         complete = bytes(self._buffer[:end])
         del self._buffer[:end]
         return complete
@@ -130,9 +135,7 @@ class LogStream(ReadOnly):
         self._detach()
 
     def _acknowledge(self, message: LoggingDataAcked) -> None:
-        """Acknowledge a message at once. PX4 repeats an unacknowledged message every 50 ms, and stops after 50
-        attempts.
-        """
+        """Acknowledge a message at once. PX4 repeats a message every 50 ms, and stops after 50 attempts."""
         session = self._context.session
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 
@@ -140,8 +143,8 @@ class LogStream(ReadOnly):
         is_stopped = False
         try:
             if error is None:
-                # STOP is sent while log messages are still acknowledged, which `_close` ends: PX4 answers STOP only
-                # after the acknowledgement of its last log message (logger.cpp).
+                # `_close` ends the acknowledgements, so STOP is sent before. PX4 answers STOP only after its last log
+                # message was acknowledged (logger.cpp).
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

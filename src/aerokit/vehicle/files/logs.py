@@ -39,7 +39,7 @@ LogMethod = Literal["auto", "ftp", "log"]
 MAX_UNANSWERED_REQUESTS = 4
 MAX_LOG_ID = 0xFFFF
 ERASE_RETRY_INTERVAL_S = 1.0
-ERASE_PATIENCE_S = 60.0
+ERASE_TIMEOUT_S = 60.0
 # The time of a log that is being written comes from the vehicle's clock, the time of a finished log from its file. For
 # the same log, these times may differ by this much.
 MAX_CLOCK_DIFFERENCE = timedelta(days=1)
@@ -65,20 +65,21 @@ class GrowthReporter:
 
     def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
         self._entry, self._on_progress = entry, on_progress
-        self._size = entry.size
+        self._present_size = entry.size
 
     def __call__(self, progress: TransferProgress) -> None:
-        self._size = progress.total or self._size
+        if progress.total:
+            self._present_size = progress.total
         if self._on_progress is not None:
             self._on_progress(progress)
 
     def log_growth(self) -> None:
-        if self._size > self._entry.size:
+        if self._present_size > self._entry.size:
             logger.info(
                 "flight log %d was still being written: listed with %d bytes, downloaded with %d",
                 self._entry.id,
                 self._entry.size,
-                self._size,
+                self._present_size,
             )
 
 
@@ -197,7 +198,7 @@ class Logs:
         growth.log_growth()
         return content
 
-    async def erase(self, *, idle_timeout_s: float = ERASE_PATIENCE_S, timeout: float | None = None) -> None:
+    async def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
         LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
@@ -263,7 +264,7 @@ class Logs:
         directories = self._transfers.autopilot.log_directories
         if not directories or not await self._files.is_supported():
             return None
-        return await log_path(self._files, directories, entry, idle_timeout_s, has_grown=entry == self._newest)
+        return await log_path(self._files, directories, entry, idle_timeout_s, may_have_grown=entry == self._newest)
 
     async def _entry(
         self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
@@ -350,13 +351,13 @@ async def log_path(
     log: LogEntry,
     idle_timeout_s: float,
     *,
-    has_grown: bool = False,
+    may_have_grown: bool = False,
 ) -> str | None:
     """Return the path of a log for MAVFTP; None if the file cannot be identified.
 
     ArduPilot's log 1 is the lowest of its numbered files such as ``00000001.BIN``. PX4 writes a list of paths to a file
-    when its logs are requested, in the order of the ids. The size must match the entry, except for a log that is still
-    growing, or was growing at the time of the entry (``has_grown``).
+    when its logs are requested, in the order of the ids. The size must match the entry. A log that is still being
+    written, or that was being written at the time of the entry (``may_have_grown``), may be larger.
     """
     for directory in directories:
         try:
@@ -369,9 +370,9 @@ async def log_path(
             if match is not None:
                 numbered[int(match[1])] = entry
         if numbered:
-            return _numbered_path(directory, numbered, log, has_grown)
+            return _numbered_path(directory, numbered, log, may_have_grown)
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
-            logs = await _list_in(files, directory, idle_timeout_s)
+            logs = await _read_list_file(files, directory, idle_timeout_s)
             has_size = log.id < len(logs) and logs[log.id].size == log.size
             return logs[log.id].path if has_size else None
     return None
@@ -386,12 +387,12 @@ async def listed_logs(
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
         except FileError:  # The vehicle has no such directory.
             continue
-        logs = await _list_in(files, directory, idle_timeout_s)
+        logs = await _read_list_file(files, directory, idle_timeout_s)
         return None if entries and not logs else logs
     return ()
 
 
-async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple[ListedLog, ...]:
+async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -> tuple[ListedLog, ...]:
     """Read the list file next to the directory of the logs; return an empty tuple if there is none."""
     root = directory.rpartition("/")[0]
     try:
@@ -411,12 +412,12 @@ async def _list_in(files: Files, directory: str, idle_timeout_s: float) -> tuple
     return tuple(logs)
 
 
-def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry, has_grown: bool) -> str | None:
+def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry, may_have_grown: bool) -> str | None:
     """Return the path of a log among ArduPilot's numbered files; log 1 is the file with the lowest number."""
     number = min(entries) + log.id - 1
     entry = entries.get(number)
     if entry is None or entry.size is None:
         return None
-    may_be_larger = has_grown or number == max(entries)  # The vehicle may still be writing the newest log.
+    may_be_larger = may_have_grown or number == max(entries)  # The vehicle may still be writing the newest log.
     has_size = entry.size >= log.size if may_be_larger else entry.size == log.size
     return f"{directory}/{entry.name}" if has_size else None

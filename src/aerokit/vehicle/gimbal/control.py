@@ -71,13 +71,13 @@ class ReleaseCommand:
         """Send the command without waiting, e.g. when a block exits by an error or cancellation."""
         if not self._session.connection.is_open or self._session.is_closed or not self._is_still_due():
             return
-        is_sent = self._orders.context.arbiter.is_state_recent
-        if is_sent:
+        can_send_now = self._orders.context.arbiter.is_state_recent
+        if can_send_now:
             self._send()
 
         async def send_until_acknowledged() -> None:
             with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
-                if not is_sent:
+                if not can_send_now:
                     await self._session.wait_for_heartbeat()
                     if not self._is_still_due():
                         return
@@ -109,7 +109,7 @@ class ReleaseCommand:
                 is_done=lambda: not self._is_still_due(),
                 attempts=RELEASE_ATTEMPTS,
                 attempt_timeout=ATTEMPT_TIMEOUT_S,
-                is_sent=True,
+                was_just_sent=True,
             )
 
     def _is_target_silent(self) -> bool:
@@ -131,8 +131,7 @@ class ReleaseCommand:
             detach()
 
 
-# The manager's confirmation of our control is requested if it does not arrive within the first number of seconds. The
-# second number is the maximum wait in total.
+# Seconds after which the manager's confirmation of our control is requested, and seconds to wait for it in total.
 STATUS_TIMEOUT_S, CONFIRM_TIMEOUT_S = 0.5, 3.0
 
 STATUS_HZ = 1.0
@@ -218,7 +217,7 @@ class GimbalControl:
         if self._is_primary in orders.device.control_blocks:
             raise BusyError(f"{orders.name}: another block of this program already has control; nothing was sent")
         if not self._is_primary and not orders.rules.has_secondary:
-            orders.raise_not_supported("has no secondary control")
+            raise orders.not_supported("has no secondary control")
         self._was_entered = True
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
@@ -261,7 +260,7 @@ class GimbalControl:
             await orders.send(None, CONFIGURE, *params)  # None, because the command is not part of an order.
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:
-                orders.raise_not_supported("has no gimbal manager whose control could be taken")
+                raise orders.not_supported("has no gimbal manager whose control could be taken") from error
             raise
 
     async def _await_confirmation(self, since: float) -> None:
@@ -284,7 +283,7 @@ class GimbalControl:
             orders.ask_in_background(GimbalManagerStatus.ID)
             await wait(CONFIRM_TIMEOUT_S - STATUS_TIMEOUT_S)
         device = orders.device
-        # Another block may have been entered during the wait, or the first gimbal may now be another one.
+        # Another block may have been entered during the wait, or another gimbal may be the first one now.
         if self._is_primary in device.control_blocks:
             raise BusyError(f"{orders.name}: another block of this program already has control")
         self._device = device
@@ -296,14 +295,13 @@ class GimbalControl:
         controller = self._controller_in(controllers)
         if controller == self._orders.own_ids or self._taken is not None:
             return
-        text = f"{controller[0]}/{controller[1]} has it now" if controller != (0, 0) else "it has no controller now"
+        system_id, component_id = controller
+        text = f"{system_id}/{component_id} has it now" if controller != (0, 0) else "it has no controller now"
         self._taken = GimbalTaken(
-            f"{self._orders.name}: control was lost: {text}",
-            system_id=controller[0],
-            component_id=controller[1],
+            f"{self._orders.name}: control was lost: {text}", system_id=system_id, component_id=component_id
         )
         device_id = 0 if self._device is None else self._device.device_id
-        self._session.publish(GimbalControlLost, device_id, self._is_primary, *controller)
+        self._session.publish(GimbalControlLost, device_id, self._is_primary, system_id, component_id)
         self._lost.set()
 
     def _controller_in(self, controllers: GimbalControllers) -> tuple[int, int]:
@@ -315,7 +313,7 @@ class GimbalControl:
         requests = orders.registry.control_requests
 
         def is_still_due() -> bool:
-            return self._taken is None and self._control_request.may_be_released(requests)
+            return self._taken is None and not self._control_request.leave_release_to(requests)
 
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 

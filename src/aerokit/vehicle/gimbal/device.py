@@ -221,7 +221,7 @@ class GimbalDevice:
         self.flags, self.failures = message.flags, message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
-        """Set the controllers from a status. Returns False if the status is older than one that has already arrived."""
+        """Set the controllers from a status; return False for a late status, which is older than the newest one."""
         older_by_ms = self._status_ms - message.time_boot_ms
         if 0 < older_by_ms < REORDER_WINDOW_MS:
             return False
@@ -275,15 +275,16 @@ class ControlRequest:
     def is_released_with(self, other: ControlRequest) -> bool:
         """Return True if one release command would release the control of both requests."""
         has_same_role = (self.manager_id, self.is_primary) == (other.manager_id, other.is_primary)
-        gimbals = (self.gimbal_id_param, other.gimbal_id_param)
-        return has_same_role and (gimbals[0] == gimbals[1] or 0 in gimbals)
+        is_same_gimbal = self.gimbal_id_param == other.gimbal_id_param
+        is_for_all_gimbals = 0 in (self.gimbal_id_param, other.gimbal_id_param)
+        return has_same_role and (is_same_gimbal or is_for_all_gimbals)
 
-    def may_be_released(self, requests: Iterable[ControlRequest]) -> bool:
-        """Return True if the release would not also take control from another block of this program.
+    def leave_release_to(self, requests: Iterable[ControlRequest]) -> bool:
+        """Leave the release to other blocks of this program that need the same control; return False if there are none.
 
-        Otherwise mark the requests of the other blocks, so that these blocks release control.
+        Releasing now would take the control from these blocks. Their requests are marked, so that they release it.
         """
         shared = [request for request in requests if request is not self and request.is_released_with(self)]
         for request in shared:
             request.must_release = True
-        return not shared
+        return bool(shared)

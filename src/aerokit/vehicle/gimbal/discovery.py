@@ -65,7 +65,7 @@ class GimbalRegistry:
         return min(self.devices.values(), key=self.sort_key, default=self.placeholder)
 
     @property
-    def reporting(self) -> GimbalDevice | None:
+    def first_reporting(self) -> GimbalDevice | None:
         """The first of the gimbals that have reported their attitude."""
         reporting = [device for device in self.devices.values() if device.attitude.is_known]
         return min(reporting, key=self.sort_key, default=None)
@@ -153,12 +153,12 @@ class GimbalRegistry:
         if all(map(math.isfinite, message.q)):
             attitude = from_device(message, self._heading())
         device.set_attitude(message, attitude)
-        if device is self.reporting:  # This is the first gimbal that reports its attitude.
+        if device is self.first_reporting:  # This is the first gimbal that reports its attitude.
             self.placeholder.update_flags(message)
             self.placeholder.set_attitude(message, attitude)
 
     def _on_orientation(self, message: MountOrientation) -> None:
-        if self.reporting is None:
+        if self.first_reporting is None:
             self.placeholder.set_attitude(message, from_orientation(message, self._heading()))
 
     def _on_status(self, message: GimbalManagerStatus) -> None:

@@ -22,7 +22,7 @@ from aerokit.vehicle.gimbal.pointing import (
     PointingMixin,
     attitude_stream,
     direction_to,
-    wait_until_there,
+    wait_until_reached,
 )
 from aerokit.vehicle.gimbal.rates import GimbalRates
 
@@ -112,7 +112,7 @@ class RoiMixin(GimbalMixin):
             since = self._now()
             await orders.send_roi(order, MavCmd.DO_SET_ROI_LOCATION, orders.roi_parameter, **place)
             if wait:
-                await wait_until_there(orders, order, f"{orders.name}: look_at", aim, since=since, timeout=timeout)
+                await wait_until_reached(orders, order, f"{orders.name}: look_at", aim, since=since, timeout=timeout)
 
     async def look_at_system(
         self, system_id: int, *, wait: bool = True, tolerance_deg: float = 5.0, timeout: float = 15.0
@@ -141,7 +141,7 @@ class RoiMixin(GimbalMixin):
         orders = self._orders
         orders.check_roi()
         if not orders.rules.supports_roi_sysid:
-            orders.raise_not_supported("cannot point a gimbal at another system")
+            raise orders.not_supported("cannot point a gimbal at another system")
         order = orders.begin_order()
         with (
             _SystemTracker(self._context, system_id) as tracker,
@@ -153,7 +153,7 @@ class RoiMixin(GimbalMixin):
             if wait:
                 aim = AngleTarget(tracker.direction, tolerance_deg, f"the position of system {system_id} is unknown")
                 description = f"{orders.name}: look_at_system({system_id})"
-                await wait_until_there(orders, order, description, aim, since=since, timeout=timeout)
+                await wait_until_reached(orders, order, description, aim, since=since, timeout=timeout)
 
     async def stop_looking(self) -> None:
         """End :meth:`look_at` (MAV_CMD_DO_SET_ROI_NONE). Afterwards the gimbal manager chooses the direction.
@@ -174,7 +174,7 @@ INFORMATION_TIMEOUT_S = 2.0
 
 @checks_arguments
 class Gimbal(ReadOnly, PointingMixin, RoiMixin):
-    """One gimbal, by the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
+    """One gimbal with the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
     reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while
@@ -275,9 +275,7 @@ class Gimbals:
         self._registry = GimbalRegistry(context)
         self._gimbals: dict[tuple[int, int], Gimbal] = {}
         self.first: Gimbal = Gimbal(context, self._registry, None)
-        """The first gimbal. A gimbal attached to the autopilot takes precedence over gimbals with their own component
-        id.
-        """
+        """The first gimbal. A gimbal attached to the autopilot comes before gimbals with their own component id."""
 
     @property
     def ids(self) -> tuple[int, ...]:

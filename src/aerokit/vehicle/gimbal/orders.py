@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.formatting import short_repr
 from aerokit.autopilots import GimbalRules
@@ -49,11 +49,12 @@ class GimbalOrders:
         self.session: VehicleSession = context.session
         self.registry: GimbalRegistry = registry
         self._device = device
-        # Component id of the manager whose control was claimed outside of a control block.
-        self._claimed: int | None = None
+        # The manager whose control was claimed outside of a control block.
+        self._claimed_manager_id: int | None = None
 
     @property
     def device(self) -> GimbalDevice:
+        """The gimbal that orders go to. For ``vehicle.gimbal``, this is the gimbal that is the first at present."""
         return self.registry.first if self._device is None else self._device
 
     @property
@@ -64,7 +65,7 @@ class GimbalOrders:
     @property
     def attitude_source(self) -> GimbalDevice:
         """The device that reports the attitude; the placeholder if only an old mount (MOUNT_STATUS) reports it."""
-        is_mount = self._device is None and self.registry.reporting is None
+        is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 
     @property
@@ -82,34 +83,37 @@ class GimbalOrders:
 
     @property
     def rules(self) -> GimbalRules:
+        """Capabilities of the manager. A manager other than the autopilot is expected to follow the standard."""
         is_autopilot = self.manager_id == self.session.component_id
         return self.session.autopilot.gimbals if is_autopilot else STANDARD_RULES
 
     @property
     def roi_parameter(self) -> int:
+        """Parameter of region-of-interest commands that selects the gimbal; 0 if the manager does not read it."""
         return self.gimbal_id_param if self.rules.roi_per_gimbal else 0
 
     def check_roi(self) -> None:
         """Raise unless region-of-interest commands can be sent to this gimbal now."""
         if not self.rules.roi_per_gimbal and self.gimbal_id_param not in (0, 1):
-            self.raise_not_supported("supports a region of interest for its first gimbal only")
+            raise self.not_supported("supports a region of interest for its first gimbal only")
         self.raise_if_taken()
 
     @property
     def own_ids(self) -> tuple[int, int]:
+        """System id and component id of this program."""
         return self.session.connection.source_system, self.session.connection.source_component
 
     @property
     def name(self) -> str:
         return f"gimbal {self.device.device_id}" if self.device.component_id else "the gimbal"
 
-    async def send(self, order: Order | None, command: int, *params: float, is_sent: bool = False) -> None:
+    async def send(self, order: Order | None, command: int, *params: float) -> None:
+        """Send a COMMAND_LONG to the manager, as a part of ``order`` if there is one."""
         with self.context.arbiter.auxiliary_order(order) as sent_order:
-            await self.context.sender.send_long(
-                sent_order, command, *params, component_id=self.manager_id, is_sent=is_sent
-            )
+            await self.context.sender.send_long(sent_order, command, *params, component_id=self.manager_id)
 
     def begin_order(self) -> Order:
+        """Create an order to the gimbal, which supersedes the previous one."""
         return self.context.arbiter.device_order(self.device.topic)
 
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
@@ -125,13 +129,17 @@ class GimbalOrders:
                 raise
             await send()
 
-    async def send_pitch_yaw(self, order: Order, pitch: float, yaw: float, *rates: float, flags: int) -> bool:
-        """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW in degrees; return False if the manager does not support it."""
+    async def send_pitch_yaw(
+        self, order: Order, pitch: float, yaw: float, *, rates: tuple[float, float] = (NAN, NAN), flags: int
+    ) -> bool:
+        """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; return False if the manager does not support it.
+
+        Angles are in degrees, ``rates`` (pitch, yaw) in degrees per second. NaN leaves a value to the gimbal.
+        """
         if self.session.commands.is_unsupported(PITCHYAW, self.manager_id):
             return False
-        pitch_rate, yaw_rate = rates or (NAN, NAN)
         reserved = 0
-        params = (pitch, yaw, pitch_rate, yaw_rate, flags, reserved, self.gimbal_id_param)
+        params = (pitch, yaw, *rates, flags, reserved, self.gimbal_id_param)
         try:
             await self.send_claiming_control(PITCHYAW, lambda: self.send(order, PITCHYAW, *params))
         except CommandRejected as error:
@@ -167,7 +175,8 @@ class GimbalOrders:
         """
         if not self.session.commands.is_unsupported(MOUNT, self.manager_id):
             try:
-                await self.send(order, MOUNT, pitch, roll, yaw, 0, 0, 0, mode)
+                unused_place = (0, 0, 0)  # altitude, latitude, longitude
+                await self.send(order, MOUNT, pitch, roll, yaw, *unused_place, mode)
             except CommandRejected as error:
                 if error.result != MavResult.UNSUPPORTED:
                     raise
@@ -208,6 +217,7 @@ class GimbalOrders:
         self.session.background.start(ask, "aerokit gimbal")
 
     async def ask(self, message_id: int, component_id: int, *, attempts: int = 3) -> None:
+        """Request a message from a component once."""
         await self.session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )
@@ -235,7 +245,7 @@ class GimbalOrders:
         """Return the manager. If none is known, first ask the device whether it is its own manager."""
         device = self.device
         if device.manager_id is None and device.component_id:
-            # Without the information, the autopilot counts as the manager.
+            # If the device does not answer, the autopilot counts as the manager.
             with suppress(CommandRejected, CommandTimeout):
                 await self.ask(GimbalManagerInformation.ID, device.component_id, attempts=1)
                 await self.wait_for(lambda: device.manager_id, GimbalManagerInformation, MANAGER_TIMEOUT_S)
@@ -249,7 +259,8 @@ class GimbalOrders:
         controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         primary, secondary = (controller, unchanged) if is_primary else (unchanged, controller)
-        return (*primary, *secondary, 0, 0, self.gimbal_id_param)
+        reserved = (0, 0)
+        return (*primary, *secondary, *reserved, self.gimbal_id_param)
 
     def claim_if_denied(self, command: int) -> bool:
         """Claim control if the manager denied this command because we are not in control.
@@ -262,13 +273,13 @@ class GimbalOrders:
             return False
         commands.forget_result(command, manager_id)  # One denial must not lead to a second claim.
         commands.send_unconfirmed(CONFIGURE, *self.control_params(is_primary=True), component_id=manager_id)
-        self._claimed = manager_id
+        self._claimed_manager_id = manager_id
         return True
 
     async def release_control(self, order: Order) -> None:
         """Release control that was claimed outside of a control block."""
-        if self._claimed == self.manager_id:
-            self._claimed = None
+        if self._claimed_manager_id == self.manager_id:
+            self._claimed_manager_id = None
             await self.send(order, CONFIGURE, *self.control_params(is_primary=True, release=True))
 
     def raise_if_taken(self) -> None:
@@ -284,11 +295,11 @@ class GimbalOrders:
         blocks = self.device.control_blocks.values()
         return bool(blocks) and not any(block.is_held for block in blocks)
 
-    def raise_not_supported(self, predicate: str) -> NoReturn:
-        """Raise NotSupported with the text ``<gimbal>: <manager> <predicate>``."""
+    def not_supported(self, predicate: str) -> NotSupported:
+        """Return the error with the text ``<gimbal>: <manager> <predicate>``."""
         autopilot = self.session.autopilot
         manager = autopilot.firmware if self.manager_id == self.session.component_id else short_repr(self.manager_id)
-        raise NotSupported(f"{self.name}: {manager} {predicate}; nothing was sent")
+        return NotSupported(f"{self.name}: {manager} {predicate}; nothing was sent")
 
 
 class GimbalMixin:

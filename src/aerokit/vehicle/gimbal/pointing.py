@@ -59,13 +59,14 @@ class AngleTarget:
 
 
 class RestTarget:
-    """Target of an order: the gimbal stands still in a position that a flag reports, or straight ahead.
+    """Target of an order: the gimbal stands still in its retracted or neutral position.
 
-    The flag is RETRACT or NEUTRAL.
+    ``flag`` is the GIMBAL_DEVICE_FLAGS bit that reports this position. With ``accepts_ahead``, a gimbal that is level
+    and straight ahead also counts as being there, because it may not report the flag.
     """
 
-    def __init__(self, flag: int, *, or_ahead: bool) -> None:
-        self._flag, self._accepts_ahead = flag, or_ahead
+    def __init__(self, flag: int, *, accepts_ahead: bool) -> None:
+        self._flag, self._accepts_ahead = flag, accepts_ahead
         # Angles (pitch, roll, yaw from the nose) at the last movement, and its time.
         self._last_angles: tuple[float, float, float] | None = None
         self._moved_at = 0.0
@@ -76,7 +77,6 @@ class RestTarget:
         if self._has_moved((pitch, roll, yaw)):
             self._last_angles, self._moved_at = (pitch, roll, yaw), updated_at
             return False
-        # A gimbal that is level and straight ahead counts as neutral, even if it does not report the flag.
         is_ahead = abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
         is_at_rest = bool(device.flags & self._flag) or (self._accepts_ahead and is_ahead)
         return updated_at - self._moved_at >= STILL_S and is_at_rest
@@ -107,7 +107,7 @@ def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
         release()
 
 
-async def wait_until_there(
+async def wait_until_reached(
     orders: GimbalOrders,
     order: Order,
     description: str,
@@ -117,9 +117,11 @@ async def wait_until_there(
     timeout: float,
 ) -> None:
     """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
-    session, checked_at = orders.session, since
+    session = orders.session
+    deadline = session.connection.now() + timeout
+    checked_at = since  # time of the last attitude that was checked
     # `vehicle.gimbal` has one `public_device` for its state values, even while `attitude_source` and `device` change.
-    deadline, reboots_before = session.connection.now() + timeout, orders.public_device.reboots
+    reboots_before = orders.public_device.reboots
     watched = (orders.public_device.attitude, orders.attitude_source.attitude, orders.device.controllers)
     with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:
         while True:
@@ -265,14 +267,15 @@ class PointingMixin(GimbalMixin):
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
         from_nose = frame == "vehicle"
         self._check_limits(pitch_deg, roll_deg, yaw_deg if from_nose else None)
-        orders, order = self._orders, self._orders.begin_order()
+        orders = self._orders
+        order = orders.begin_order()
 
         async def send() -> None:
             flags = LEVEL if from_nose else LOCKED
             # The gimbal manager's command has no roll, so an order with roll uses the mount command.
-            was_sent = not roll_deg and await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags)
-            if not was_sent:
-                await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
+            if roll_deg == 0 and await orders.send_pitch_yaw(order, pitch_deg, yaw_deg, flags=flags):
+                return
+            await orders.send_mount_angles(order, pitch_deg, roll_deg, yaw_deg, from_nose=from_nose)
 
         angles = ordered_angles(pitch_deg, yaw_deg, roll_deg or None, from_nose=from_nose)
         if not wait:
@@ -283,7 +286,7 @@ class PointingMixin(GimbalMixin):
             await send()
             description = f"{orders.name}: point({pitch_deg:g}, {yaw_deg:g})"
             target = AngleTarget(lambda: angles, tolerance_deg)
-            await wait_until_there(orders, order, description, target, since=since, timeout=timeout)
+            await wait_until_reached(orders, order, description, target, since=since, timeout=timeout)
 
     async def neutral(self, *, wait: bool = True, timeout: float = 10.0) -> None:
         """Turn the gimbal to its neutral position, usually level and straight ahead; returns when it rests there.
@@ -315,7 +318,7 @@ class PointingMixin(GimbalMixin):
         Otherwise raises as :meth:`neutral`.
         """
         if not self._orders.rules.supports_retract:
-            self._orders.raise_not_supported("cannot retract a gimbal")
+            raise self._orders.not_supported("cannot retract a gimbal")
         await self._rest("retract", RETRACT, MavMountMode.RETRACT, wait=wait, timeout=timeout)
 
     async def release(self) -> None:
@@ -330,7 +333,9 @@ class PointingMixin(GimbalMixin):
         await self._orders.release_control(order)
 
     async def _rest(self, action: str, flag: int, mode: int, *, wait: bool, timeout: float) -> None:
-        orders, order = self._orders, self._orders.begin_order()
+        """Turn the gimbal to a rest position: by ``flag`` of the gimbal manager, or by ``mode`` of an older mount."""
+        orders = self._orders
+        order = orders.begin_order()
 
         async def send() -> None:
             is_supported = await orders.send_pitch_yaw(order, NAN, NAN, flags=flag)
@@ -343,10 +348,11 @@ class PointingMixin(GimbalMixin):
         with attitude_stream(orders):
             since = self._now()
             await send()
-            target = RestTarget(flag, or_ahead=flag == NEUTRAL)  # The neutral position is usually straight ahead.
-            await wait_until_there(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
+            target = RestTarget(flag, accepts_ahead=flag == NEUTRAL)  # The neutral position is usually straight ahead.
+            await wait_until_reached(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
+        """Raise InvalidArgument for an angle beyond the gimbal's limits. ``yaw`` is from the nose; None: from north."""
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
             return  # The program has not requested the limits by `information()`.

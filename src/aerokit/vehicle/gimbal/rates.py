@@ -59,12 +59,12 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     ) -> None:
         check_range("rate_hz", rate_hz, 2, MAX_RATE_HZ)
         super().__init__(orders.context, self._encode_rates, first_rates, rate_hz, valid_for_s, max_lag_s)
-        _check(*first_rates)
+        _check_rates(*first_rates)
         self._orders, self._flags = orders, int(LOCKED if is_from_north else LEVEL)
         self._began_at = -math.inf
         self._order: Order | None = None
         self._taken: AerokitError | None = None
-        # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another one.
+        # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another gimbal.
         self._in_use = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
@@ -79,12 +79,12 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             SetpointStreamStopped: the stream has stopped, or the block has ended.
             GimbalTaken: your program had control and lost it.
         """
-        _check(pitch_deg_s, yaw_deg_s)
+        _check_rates(pitch_deg_s, yaw_deg_s)
         self._set((pitch_deg_s, yaw_deg_s))
 
     async def turn(self, pitch_deg_s: float, yaw_deg_s: float, duration_s: float) -> None:
         """Turn at one pair of rates for ``duration_s`` seconds. Arguments and errors are those of :meth:`set`."""
-        _check(pitch_deg_s, yaw_deg_s)
+        _check_rates(pitch_deg_s, yaw_deg_s)
         await self._supply_for((pitch_deg_s, yaw_deg_s), duration_s)
 
     async def __aenter__(self) -> Self:
@@ -95,9 +95,9 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._order = orders.begin_order()
         self._in_use.enter_context(orders.device.in_use())
         try:
-            is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, *self._value, flags=self._flags)
+            is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, rates=self._value, flags=self._flags)
             if not is_supported:
-                orders.raise_not_supported("has no gimbal manager, which is needed for rates")
+                raise orders.not_supported("has no gimbal manager, which is needed for rates")
             self._began_at = self._now()
             orders.context.on_finish.append(self._finish)
             self._begin_sending()
@@ -114,7 +114,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if reason:
             self._stop(reason, hold=False)
         if self._stop_error is None:
-            zero = self._zero_rates_command()  # Must precede `_end`, after which the first gimbal may be another one.
+            zero = self._zero_rates_command()  # for this gimbal; after `_end`, another gimbal may be the first one
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
@@ -129,18 +129,21 @@ class GimbalRates(ValueStream[tuple[float, float]]):
 
     def _encode_rates(self, rates: tuple[float, float]) -> Message:
         orders = self._orders
-        pitch, yaw = (math.radians(rate) for rate in rates)
-        address = (self._session.system_id, orders.manager_id, self._flags, orders.gimbal_id_param)
+        pitch_rate, yaw_rate = (math.radians(rate) for rate in rates)
+        first_fields = (self._session.system_id, orders.manager_id, self._flags, orders.gimbal_id_param)
         if orders.rules.supports_pitchyaw:
-            return GimbalManagerSetPitchyaw(*address, NAN, NAN, pitch, yaw)
-        return GimbalManagerSetAttitude(*address, (NAN, NAN, NAN, NAN), 0.0, pitch, yaw)
+            return GimbalManagerSetPitchyaw(*first_fields, pitch=NAN, yaw=NAN, pitch_rate=pitch_rate, yaw_rate=yaw_rate)
+        no_attitude = (NAN, NAN, NAN, NAN)
+        angular_velocity = (0.0, pitch_rate, yaw_rate)
+        return GimbalManagerSetAttitude(*first_fields, no_attitude, *angular_velocity)
 
     def _stop_reason(self, lag: float) -> str | None:
         manager_id = self._orders.manager_id
         silent_for_s = min(self._orders.registry.silent_for_s(manager_id), self._now() - self._began_at)
         is_silent = manager_id != self._session.component_id and silent_for_s > SILENT_AFTER_S
-        manager_silence = f"the gimbal's manager has been silent for {silent_for_s:.1f} s" if is_silent else None
-        return super()._stop_reason(lag) or manager_silence
+        if reason := super()._stop_reason(lag):
+            return reason
+        return f"the gimbal's manager has been silent for {silent_for_s:.1f} s" if is_silent else None
 
     def _takeover_reason(self) -> str | None:
         try:
@@ -178,6 +181,6 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._orders.context.on_finish.remove(self._finish)
 
 
-def _check(pitch_deg_s: float, yaw_deg_s: float) -> None:
+def _check_rates(pitch_deg_s: float, yaw_deg_s: float) -> None:
     check_range("pitch_deg_s", pitch_deg_s, -MAX_RATE_DEG_S, MAX_RATE_DEG_S)
     check_range("yaw_deg_s", yaw_deg_s, -MAX_RATE_DEG_S, MAX_RATE_DEG_S)

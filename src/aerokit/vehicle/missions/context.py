@@ -40,7 +40,7 @@ SECOND_APPROACH_S = 1.0
 # After a landing, a vehicle may report another item than the last one for up to this many seconds, until it disarms.
 FINAL_ITEM_MAX_AGE_S = 3.0
 
-# After a second start of its mission, a vehicle may still report for this long that the mission is complete.
+# For this many seconds after a second start of its mission, a vehicle may still report that the mission is complete.
 STALE_STATE_S = 3.0
 
 
@@ -180,16 +180,19 @@ class MissionTracker:
         return self._session.connection.now() - self._last_item_current_at <= FINAL_ITEM_MAX_AGE_S
 
     def on_transfer_count(self, count: int) -> None:
+        """Set the number of items, which is known after a transfer."""
         self.count.set(count, Source(self._session.system_id, self._session.component_id, "MISSION_COUNT"))
 
     def start(self) -> None:
+        """Begin to track a new flight of the mission."""
         self.is_complete = self._was_active = False
         self._stale_until = self._session.connection.now() + STALE_STATE_S
 
     def forget(self) -> None:
         for cell in (self.current, self.count, self.progress):
             cell.forget()
-        self.reached, self._was_active, self.is_complete = None, False, False
+        self.reached = None
+        self._was_active = self.is_complete = False
 
     def close(self, error: Exception) -> None:
         for cell in (self.current, self.count, self.progress):
@@ -232,7 +235,8 @@ class MissionTracker:
         if state != MissionState.COMPLETE:
             self._stale_until = -math.inf
             if state == MissionState.ACTIVE and self.is_in_mission_mode and self._session.telemetry.is_armed:
-                self._was_active, self.is_complete = True, False
+                self._was_active = True
+                self.is_complete = False
         elif self._session.connection.now() >= self._stale_until:
             self._complete()
 
@@ -241,8 +245,8 @@ class MissionTracker:
             self._complete()
 
     def _on_reached(self, _: int | None, seq: int) -> None:
-        # ArduPilot reports item 0 (home) when it has reached a guided target. `item` is then negative.
-        item, now = seq - self._offset, self._session.connection.now()
+        now = self._session.connection.now()
+        item = seq - self._offset  # negative if ArduPilot reports item 0 (home), as it does at a guided target
         # The vehicle repeats its report, so an item counts as reached again only if it was approached again.
         if self._repeats_item_reached:
             is_duplicate = item == self.reached and not self._is_approached_again
@@ -250,7 +254,8 @@ class MissionTracker:
             is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S
         if item < 0 or is_duplicate:
             return
-        self.reached, self._reached_at, self._is_approached_again = item, now, False
+        self.reached, self._reached_at = item, now
+        self._is_approached_again = False
         self._session.publish(MissionItemReached, item)
 
     def _complete(self) -> None:

@@ -50,9 +50,9 @@ class MissionStallDetector:
         self._session, self._tracker, self._mode = session, tracker, mode
         self._items, self._is_paused = items or (), is_paused
         self._stall = StallDetector(session)
-        # The item at which the vehicle had to be moving at the last call, and the time since which it had to move. The
+        # The item at which the vehicle had to move at the last call, and the time since which it has had to move. The
         # item is None if the vehicle was allowed to stand still.
-        self._item: int | None = None
+        self._moving_item: int | None = None
         self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:
@@ -66,8 +66,8 @@ class MissionStallDetector:
         standstill = self._stall()  # None unless the vehicle has stood still for 12 s
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
-        if not should_move or current != self._item:
-            self._item = current if should_move else None
+        if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.
+            self._moving_item = current if should_move else None
             self._should_move_since = self._session.connection.now()
             return None
         is_late = self._session.connection.now() - self._should_move_since >= MISSION_STALL_TIMEOUT_S

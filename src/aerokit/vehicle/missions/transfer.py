@@ -40,7 +40,7 @@ REFUSAL_TEXT_DELAY_S = 0.3
 class PlanChannel:
     """Transfers plans of one MAV_MISSION_TYPE. Items are numbered as the vehicle numbers them.
 
-    Errors use the item numbers of the program, and contain the vehicle's status texts and which items it has now.
+    Errors have the item numbers of the program and the vehicle's status texts, and say which items the vehicle has now.
     """
 
     def __init__(
@@ -64,9 +64,9 @@ class PlanChannel:
                 raise
         return await self._run(await self._upload(items, window=1))
 
-    async def send_part(self, items: Sequence[MissionItem], first: int) -> UploadResult | None:
-        """Replace the items from ``first`` on; return None if the vehicle does not support partial uploads."""
-        exchange = await self._upload(items, window=1, first=first)
+    async def send_part(self, items: Sequence[MissionItem], first_seq: int) -> UploadResult | None:
+        """Replace the items from ``first_seq`` on; return None if the vehicle does not support partial uploads."""
+        exchange = await self._upload(items, window=1, first_seq=first_seq)
         try:
             result = await self._run(exchange)
         except MissionRejected:
@@ -136,11 +136,13 @@ class PlanChannel:
         self.is_single_precision = not is_supported
         return is_supported
 
-    async def _upload(self, items: Sequence[MissionItem], *, window: int, first: int | None = None) -> MissionUpload:
+    async def _upload(
+        self, items: Sequence[MissionItem], *, window: int, first_seq: int | None = None
+    ) -> MissionUpload:
         return MissionUpload(
             *self._target,
             items,
-            first=first,
+            first=first_seq,
             window=window,
             takes_int=await self._supports_int(),
             **self._wire_options,
@@ -251,9 +253,10 @@ class PlanTransfer(Generic[PlanT]):
     async def clear(self) -> None:
         self._cache.forget(self._context.now())
         await self._channel.clear()
-        remaining = (await self._channel.receive(only=())).count - self._offset  # Requests only the count.
+        received = await self._channel.receive(only=())  # Without item numbers, only the count is requested.
+        remaining = received.count - self._offset
         if remaining > 0:
-            self._raise_mismatch((f"the vehicle still has items: {remaining}",))
+            raise self._mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
         """Read the plan into the cache, as a file if possible."""
@@ -295,8 +298,9 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.set(items, self._context.now())
         if (result.is_confirmed and not verify) or await self._has_checksum_of(items):
             return
+        received = await self._read(method)
         try:
-            self._compare(dict(enumerate(items)), dict(enumerate(await self._read(method))))
+            self._compare(dict(enumerate(items)), dict(enumerate(received)))
         except VerificationFailed as error:
             if result.is_confirmed:
                 raise
@@ -352,13 +356,13 @@ class PlanTransfer(Generic[PlanT]):
         self._cache.set(vehicle_items, self._context.now())
         return True
 
-    async def _send_part(self, items: Sequence[MissionItem], first: int, *, verify: bool) -> bool:
+    async def _send_part(self, items: Sequence[MissionItem], first_seq: int, *, verify: bool) -> bool:
         """Send consecutive items; return False if the vehicle does not support partial uploads."""
-        result = await self._channel.send_part(items, first)
+        result = await self._channel.send_part(items, first_seq)
         if result is None:
             return False
         if verify or not result.is_confirmed:
-            seqs = range(first, first + len(items))
+            seqs = range(first_seq, first_seq + len(items))
             received = await self._channel.receive(only=seqs)
             self._compare(dict(zip(seqs, items)), dict(zip(seqs, received.items)))  # noqa: B905 - may be shorter
         return True
@@ -405,12 +409,13 @@ class PlanTransfer(Generic[PlanT]):
                 texts = item_differences(item, vehicle_item, self._storage, single_precision=is_single_precision)
                 differences += [f"item {seq - self._offset} ({item.name}): {text}" for text in texts]
         if differences:
-            self._raise_mismatch(tuple(differences))
+            raise self._mismatch(tuple(differences))
 
-    def _raise_mismatch(self, differences: tuple[str, ...]) -> None:
+    def _mismatch(self, differences: tuple[str, ...]) -> VerificationFailed:
+        """Forget the vehicle's items, and return the error."""
         self._cache.forget(self._context.now())
         message = f"{self._name}: the vehicle confirmed the plan, but has other items"
-        raise VerificationFailed(message, differences=differences)
+        return VerificationFailed(message, differences=differences)
 
     @property
     def _name(self) -> str:

@@ -42,8 +42,8 @@ DEFAULT_INTERVAL = 0
 ECHO_WINDOW_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
 MAX_READS_UNBOOSTED = 5
-# If reading a few parameters takes longer than this many seconds, ArduPilot's rate of answers is raised. This happens
-# if the vehicle lacks a parameter, which only several requests without an answer show.
+# If reading a few parameters takes longer than this many seconds, the vehicle probably lacks one of them. It is then
+# requested several times, so ArduPilot's rate of answers is raised.
 BOOST_DELAY_S = 0.5
 # Fewer changes than this are set one by one, which is as fast as a file. The vehicle then confirms each value.
 MIN_PACK_SIZE = 10
@@ -60,22 +60,22 @@ class ParameterAccess:
         self._downloading = asyncio.Lock()
         self._writing = asyncio.Lock()
         self._has_pack: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
-        self._answer_round_trip: RoundTrip | None = None
+        self._cached_read_round_trip: RoundTrip | None = None
         self._boosts = 0  # number of running operations that need a raised rate of answers
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
         # Last value of each parameter that this program has written and the vehicle has confirmed.
         self.written: dict[str, int | float] = {}
 
     @property
-    def _reply_round_trip(self) -> RoundTrip:
+    def _read_round_trip(self) -> RoundTrip:
         """Estimate of the time from a read to its answer.
 
         The time is longer than the round trip of the link, because ArduPilot answers at most five reads every 0.1 s.
         """
-        if self._answer_round_trip is None:
+        if self._cached_read_round_trip is None:
             link_s = self._transfers.round_trip.smoothed_s
-            self._answer_round_trip = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
-        return self._answer_round_trip
+            self._cached_read_round_trip = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
+        return self._cached_read_round_trip
 
     @property
     def has_upper_case_names(self) -> bool:
@@ -113,6 +113,7 @@ class ParameterAccess:
             return self.store.table
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
+        """Download the list as a file if possible, otherwise as one message for each parameter."""
         if method == "ftp" or (method == "auto" and await self.has_pack()):
             # With "auto", the probe ends the attempt early, so that the list can be downloaded instead.
             probe = nullcontext() if method == "ftp" else self._ftp_probe()
@@ -169,7 +170,7 @@ class ParameterAccess:
         from aerokit.parameters.pack import PACK_PATH, PACK_PATH_WITH_DEFAULTS, unpack_parameters
 
         for path in (PACK_PATH_WITH_DEFAULTS, PACK_PATH_WITH_DEFAULTS, PACK_PATH):
-            since = self.store.updates
+            updates_before = self.store.updates
             data = await self._files.read(path, idle_timeout_s=idle_timeout_s, on_progress=on_progress)
             try:
                 table = unpack_parameters(data)
@@ -177,7 +178,7 @@ class ParameterAccess:
                 if path == PACK_PATH:
                     raise
             else:
-                self.store.replace(self._with_known_defaults(table), since=since)
+                self.store.replace(self._with_known_defaults(table), updates_before=updates_before)
                 self._has_pack = True
                 return
 
@@ -199,14 +200,14 @@ class ParameterAccess:
             transfers.system_id,
             transfers.component_id,
             bytewise=self.store.bytewise,
-            round_trip=self._reply_round_trip,
+            round_trip=self._read_round_trip,
             idle_timeout_s=idle_timeout_s,
             on_progress=on_progress,
         )
-        since = self.store.updates
+        updates_before = self.store.updates
         with self._boosted():
             table = await transfers.run(exchange)
-        self.store.replace(self._with_known_defaults(table), since=since)
+        self.store.replace(self._with_known_defaults(table), updates_before=updates_before)
 
     async def read(
         self, names: Iterable[str], idle_timeout_s: float, *, probe: bool = False
@@ -229,7 +230,7 @@ class ParameterAccess:
             alternatives={name: other_names(name) for name in names} if probe else {},
             possibly_stale={name: value for name, value in replaced_values.items() if value is not None},
             own_system=transfers.connection.source_system,
-            round_trip=self._reply_round_trip,
+            round_trip=self._read_round_trip,
             idle_timeout_s=idle_timeout_s,
         )
         if len(names) > MAX_READS_UNBOOSTED:
@@ -301,7 +302,7 @@ class ParameterAccess:
                 before=old_values,
                 recent=recent,
                 own_system=transfers.connection.source_system,
-                round_trip=self._reply_round_trip if recent else transfers.round_trip,
+                round_trip=self._read_round_trip if recent else transfers.round_trip,
                 idle_timeout_s=idle_timeout_s,
                 on_progress=on_progress,
             )
@@ -388,14 +389,14 @@ class _CachedList:
         """Load the cached list into the store if its hash is the vehicle's; return True if it was loaded."""
         store = self._access.store
         key = await self._key()
-        since = store.updates
+        updates_before = store.updates
         self._hash = await self._read_hash()  # The hash is also read with `refresh`, because `save` needs it.
         if refresh or self._hash is None:
             return False
         table = self._cache.load(key, self._hash)
         if table is None:
             return False
-        store.replace(table, since=since)
+        store.replace(table, updates_before=updates_before)
         return True
 
     async def save(self) -> None:

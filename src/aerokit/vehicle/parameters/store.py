@@ -29,8 +29,6 @@ IN_FLIGHT_S = 1.0
 class ParameterStore:
     """The known parameters by name. Publishes :class:`ParameterChanged` when a known value changes."""
 
-    updates: int
-
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._known: dict[str, Parameter] = {}
@@ -38,11 +36,11 @@ class ParameterStore:
         # True once the whole list has arrived since the vehicle started.
         self.is_complete: bool = False
         # Number of values that have arrived in messages.
-        self.updates = 0
+        self.updates: int = 0
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
-        # Maps each name to the value of `updates` at the last message with this parameter.
-        self._updated_at: dict[str, int] = {}
+        # Maps each name to the value of `updates` after the last message with this parameter.
+        self._last_updates: dict[str, int] = {}
         # Maps each written name to the previous value, and the time until which messages with this value are ignored.
         self._replaced: dict[str, tuple[int | float, float]] = {}
 
@@ -89,16 +87,19 @@ class ParameterStore:
 
     def forget(self) -> None:
         self._known.clear()
-        self._updated_at.clear()
+        self._last_updates.clear()
         self._replaced.clear()
-        self._table, self.is_complete, self.count = None, False, None
+        self._table = None
+        self.is_complete = False
+        self.count = None
 
-    def replace(self, table: ParameterTable, *, since: int) -> None:
+    def replace(self, table: ParameterTable, *, updates_before: int) -> None:
         """Replace all parameters by a downloaded list.
 
-        ``since`` is the value of ``updates`` when the list was requested. Messages since then take precedence.
+        ``updates_before`` is the value of ``updates`` when the list was requested. Messages that have arrived after
+        that take precedence over the list.
         """
-        newer_names = {name for name, updated_at in self._updated_at.items() if updated_at > since}
+        newer_names = {name for name, last_update in self._last_updates.items() if last_update > updates_before}
         old, self._known = self._known, {}
         for name, parameter in table.items():
             if name in old and name in newer_names:
@@ -125,10 +126,11 @@ class ParameterStore:
         if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
             return  # This message is from before the last write.
         new = received if old is None else merge_update(old, received, self.bytewise)
-        self._known[name], self._table = new, None
+        self._known[name] = new
+        self._table = None
         self.updates += 1
         self.count = message.param_count
-        self._updated_at[name] = self.updates
+        self._last_updates[name] = self.updates
         self._publish(old, new)
 
     def _publish(self, old: Parameter | None, new: Parameter) -> None:

@@ -64,12 +64,12 @@ class _Block:
         return await self._writing.write(values, idle_timeout_s=self._idle_timeout_s)
 
     async def _save_previous(self, values: Mapping[str, float]) -> None:
-        # Read the values again, because those in the store may be outdated.
+        """Save the parameters before their first write. They are read again, because the store may be outdated."""
         answers_by_name = await self._writing.names.resolve(values, self._idle_timeout_s)
         resolved = [answer for answer in answers_by_name.values() if isinstance(answer, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
-        all_names = {answer.name for answer in resolved}
-        answers = await self._access.read(all_names - fresh.keys() - self._saved.keys(), self._idle_timeout_s)
+        unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
+        answers = await self._access.read(unread_names, self._idle_timeout_s)
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
@@ -105,6 +105,7 @@ class _Block:
         await run_shielded(self._write_previous(self._take_saved(), cause))
 
     async def _write_previous(self, saved: list[Parameter], cause: BaseException | None) -> None:
+        """Write the saved parameters back; raise RollbackFailed for those that could not be restored."""
         answers: Mapping[str, object] = {}
         reason = ""
         with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
@@ -118,8 +119,8 @@ class _Block:
                 reason = f" ({error})"
         not_restored = {param.name: param.value for param in saved if not _is_restored(param, answers.get(param.name))}
         if not_restored:
-            names = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
-            raise RollbackFailed(f"could not restore{reason}: {names}", not_restored=not_restored) from cause
+            values = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
+            raise RollbackFailed(f"could not restore{reason}: {values}", not_restored=not_restored) from cause
 
     async def _changed_by_others(self, saved: list[Parameter]) -> dict[str, object]:
         """Return the parameters that cannot be read, and those that another station has changed since the write.

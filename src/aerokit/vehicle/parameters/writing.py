@@ -233,7 +233,8 @@ class _PlannedWrite(Snapshot):
         return self.resolved.parameter
 
     @property
-    def is_done(self) -> bool:
+    def is_unchanged(self) -> bool:
+        """True if the vehicle has this value already."""
         return same_value(self.old.value, self.to_send.value)
 
 
@@ -282,8 +283,8 @@ class ParameterWriter:
     ) -> dict[str, ParameterAnswer]:
         if upload is None:
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
-        changed = [plan.to_send for plan in plans if not plan.is_done]
-        unchanged: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_done}
+        changed = [plan.to_send for plan in plans if not plan.is_unchanged]
+        unchanged: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_unchanged}
         return unchanged | await self._access.write_pack(changed, upload, idle_timeout_s, on_progress)
 
     def _plan_writes(
@@ -304,7 +305,8 @@ class ParameterWriter:
             try:
                 plan = _plan_write(answer, values[name])
                 # Two requested names may mean the same parameter.
-                _check_same_value(plan, first_plans.setdefault(plan.to_send.name, plan))
+                first_plan = first_plans.setdefault(plan.to_send.name, plan)
+                _check_same_value(plan, first_plan)
                 plans.append(plan)
             except InvalidArgument as error:
                 if is_first:
@@ -313,7 +315,9 @@ class ParameterWriter:
         return plans, errors
 
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
-        name, requested, answer = plan.resolved.requested, plan.requested, answers[plan.to_send.name]
+        """Compare a plan with the vehicle's answer, and convert the result to the name and unit of the program."""
+        name, requested = plan.resolved.requested, plan.requested
+        answer = answers[plan.to_send.name]
         outcome = outcome_of(plan.to_send, plan.old, answer)
         if isinstance(outcome, AerokitError):
             return _failed_write(name, requested, plan.resolved.as_requested(plan.old), outcome)

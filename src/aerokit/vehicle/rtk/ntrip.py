@@ -65,9 +65,7 @@ class Caster:
 
     @classmethod
     def parse(cls, url: str) -> Caster:
-        """Parse ``ntrip://user:password@host:port/MOUNT``. Error texts show the expected format, but never the URL
-        itself.
-        """
+        """Parse ``ntrip://user:password@host:port/MOUNT``. Error texts do not contain the URL or its password."""
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
@@ -136,10 +134,10 @@ class _Response:
             return
         while line := await self._reader.readline():
             size_text, _, _ = line.partition(b";")  # Extensions of the chunk may follow the size.
-            size = int(size_text or b"0", 16)
-            if not 0 < size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
+            chunk_size = int(size_text or b"0", 16)
+            if not 0 < chunk_size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
                 return
-            yield await self._reader.readexactly(size)
+            yield await self._reader.readexactly(chunk_size)
             await self._reader.readline()  # Skip the line break after the chunk.
 
 
@@ -255,7 +253,8 @@ class NtripClient:
 
     async def _forward(self, response: _Response) -> int:
         """Send the corrections from one connection to the vehicle; return the number of messages."""
-        reader, count = RtcmReader(), 0
+        reader = RtcmReader()
+        message_count = 0
         reason = "the caster closed the connection"
         position_task = asyncio.ensure_future(self._report_position()) if self._sends_position else None
         body = response.body()
@@ -263,7 +262,7 @@ class NtripClient:
             while True:
                 data = await asyncio.wait_for(body.__anext__(), MAX_SILENCE_S)
                 for message in reader.feed(data):
-                    count += 1
+                    message_count += 1
                     if len(message) <= MAX_MESSAGE_SIZE:
                         self._send(message)
                     else:
@@ -279,8 +278,8 @@ class NtripClient:
                 position_task.cancel()
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
-        self._report(f"{self._name}: {reason} after {count} messages")
-        return count
+        self._report(f"{self._name}: {reason} after {message_count} messages")
+        return message_count
 
     def _report(self, problem: str) -> None:
         self._problem = problem

@@ -45,7 +45,8 @@ def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
 
     Sends nothing if another sender has just sent the same message. Returns the number of MAVLink messages sent.
     """
-    sent, now = _SENT.setdefault(connection, _SentMessages()), connection.now()
+    sent = _SENT.setdefault(connection, _SentMessages())
+    now = connection.now()
     if message in sent.recent:
         sent_at, sender_ids = sent.recent[message]
         # A message that the same sender passes again is sent again, because base stations repeat their position.
@@ -142,7 +143,10 @@ class Rtk:
         self._messages += 1
         self._bytes += len(message)
         self._recent.append((now, len(message)))
-        while self._recent[0][0] <= now - BANDWIDTH_WINDOW_S:
+        while self._recent:
+            oldest_at, _ = self._recent[0]
+            if oldest_at > now - BANDWIDTH_WINDOW_S:
+                break
             self._recent.popleft()
         bandwidth = sum(size for _, size in self._recent) / BANDWIDTH_WINDOW_S
         value = Corrections(message_number(message), self._messages, self._bytes, bandwidth)

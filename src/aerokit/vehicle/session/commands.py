@@ -29,6 +29,7 @@ PENDING_ACK_TIMEOUT_S = 2.0
 """An ack that has not arrived this many seconds after the call for its command ended is considered lost."""
 
 _Key = tuple[int, int]
+"""Component id and MAV_CMD."""
 
 
 class CommandSender:
@@ -83,16 +84,17 @@ class CommandSender:
         progress_timeout: float = 10.0,
         on_progress: Callable[[int | None], None] | None = None,
         order_status: OrderStatus | None = None,
-        is_sent: bool = False,
+        was_just_sent: bool = False,
     ) -> CommandAck:
         """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`.
 
-        Pass ``is_sent=True`` if `send_unconfirmed` has just sent the command. Then this call only repeats the command.
+        Pass ``was_just_sent=True`` if `send_unconfirmed` has just sent the command. This call then waits for the ack
+        first, and sends the command only to repeat it.
         """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
-        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status, is_sent)
-        return await self._run(message, *options)
+        options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status)
+        return await self._run(message, *options, was_just_sent=was_just_sent)
 
     async def send_int(
         self,
@@ -113,7 +115,7 @@ class CommandSender:
         target = self._component_id if component_id is None else component_id
         message = command_int(self._system_id, target, command, params, frame=frame, x=x, y=y, z=z)
         options = (attempts, attempt_timeout, progress_timeout, on_progress, order_status)
-        return await self._run(message, *options, is_sent=False)
+        return await self._run(message, *options)
 
     async def send_place(
         self,
@@ -184,8 +186,9 @@ class CommandSender:
         progress_timeout: float,
         on_progress: Callable[[int | None], None] | None,
         order_status: OrderStatus | None,
-        is_sent: bool,
+        was_just_sent: bool = False,
     ) -> CommandAck:
+        """Send a command after the earlier commands with the same key, and return its ACCEPTED ack."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_if_ended(key)
@@ -195,12 +198,12 @@ class CommandSender:
         async with self._locks[key]:
             if self._is_closed:
                 raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
-            if order_status is not None and order_status.end != earlier_end and not is_sent:
+            if order_status is not None and order_status.end != earlier_end and not was_just_sent:
                 # The order ended while this call waited for an earlier command to complete.
                 raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
-            if is_sent:  # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command.
+            if was_just_sent:  # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
@@ -214,7 +217,7 @@ class CommandSender:
                 earlier_answers=len(pending_acks),
                 acks_per_sending=acks_per_sending,
                 order_status=order_status,
-                is_sent=is_sent,
+                is_sent=was_just_sent,
             )
             run = self._runs[key] = ExchangeRun(self._connection, exchange)
             self._order_statuses[key] = order_status
@@ -224,7 +227,9 @@ class CommandSender:
                 raise CommandTimeout(f"{error}; {self._describe()}") from None
             finally:
                 del self._runs[key], self._order_statuses[key]
-                self._expect_acks(key, exchange.pending_answers, pending_acks[exchange.answers :])
+                # Acks arrive in the order of their commands, so those received now belong to the oldest records.
+                still_pending = pending_acks[exchange.answers :]
+                self._expect_acks(key, exchange.pending_answers, still_pending)
 
     def _abort_if_ended(self, key: _Key) -> None:
         """Abort the running command with this key if its order has ended, so that a newer command need not wait."""
@@ -249,13 +254,14 @@ class CommandSender:
 
         These are ``earlier_acks``, which were recorded before, and ``count`` acks that are recorded now.
         """
-        if recorded_at := [*earlier_acks, *[self._connection.now()] * count]:
-            self._pending_acks.setdefault(key, []).extend(recorded_at)
+        new_acks = [self._connection.now()] * count
+        if earlier_acks or new_acks:
+            self._pending_acks.setdefault(key, []).extend([*earlier_acks, *new_acks])
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
         """Remove and return the recorded acks with this key, without those that are considered lost."""
-        oldest = self._connection.now() - PENDING_ACK_TIMEOUT_S
-        return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= oldest]
+        lost_before = self._connection.now() - PENDING_ACK_TIMEOUT_S
+        return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= lost_before]
 
     def _abort(self, error: Exception) -> None:
         for run in tuple(self._runs.values()):

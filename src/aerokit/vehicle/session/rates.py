@@ -42,8 +42,11 @@ The interval doubles with each further request of the stream, up to ``MAX_RETRY_
 
 MAX_RETRY_INTERVAL_S = 60.0
 
-# The number in place of a rate in Hz that lets the autopilot return to its own default rate.
+# This number in place of a rate in Hz restores the autopilot's own default rate.
 AUTOPILOT_DEFAULT = 0.0
+
+# Value of REQUEST_DATA_STREAM.start_stop.
+START_STREAM = 1
 
 
 def check_rate(message_type: type[Message], hz: float) -> None:
@@ -63,8 +66,8 @@ class _Stream:
         self.is_refused = False
         self.is_slow = False
         # Number of messages received so far, and this number at each of the last checks.
-        self.count = 0
-        self.counts: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
+        self.received = 0
+        self.received_at_checks: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
         # The stream is requested again at `retry_at` if none of its messages has arrived by then.
         self.retry_interval_s = RETRY_INTERVAL_S
         self.retry_at = math.inf
@@ -84,20 +87,21 @@ class _Stream:
         return not self.is_refused and self.requested_hz != self.needed_hz
 
     def achieved_hz(self) -> float:
-        return (self.counts[-1] - self.counts[0]) / ((len(self.counts) - 1) * WATCH_PERIOD_S)
+        received_in_window = self.received_at_checks[-1] - self.received_at_checks[0]
+        return received_in_window / ((len(self.received_at_checks) - 1) * WATCH_PERIOD_S)
 
     def mark_requested(self, now: float, hz: float) -> None:
         self.requested_hz = hz
-        self.counts = deque([self.count], maxlen=WATCH_WINDOW + 1)
+        self.received_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
         self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
 
     def on_frame(self, frame: Frame) -> None:
         if frame.component_id == self._component_id:
-            self.count += 1
+            self.received += 1
 
 
 class MessageRates:
-    """Keeps one component sending the requested messages, each at the highest requested rate.
+    """Makes one component send the requested messages, each at the highest requested rate.
 
     Uses MAV_CMD_SET_MESSAGE_INTERVAL, or REQUEST_DATA_STREAM if the vehicle does not support that command
     (https://mavlink.io/en/mavgen_python/howto_requestmessages.html). A stream that does not arrive, for example after a
@@ -197,6 +201,7 @@ class MessageRates:
         return min(due, key=lambda stream: (stream.failures, stream.is_optional), default=None)
 
     async def _request_by_command(self, stream: _Stream) -> None:
+        """Request the rate that a stream needs by MAV_CMD_SET_MESSAGE_INTERVAL."""
         hz = stream.needed_hz
         interval_us = 0.0 if hz == AUTOPILOT_DEFAULT else 1e6 / hz
         reset_count = self._reset_count
@@ -252,8 +257,14 @@ class MessageRates:
             stream.mark_requested(self._connection.now(), stream.needed_hz)
         for group, hz in rates_by_group.items():
             if hz > 0:  # A rate of 0 would stop a group that another ground station may use.
-                rate = math.ceil(hz)
-                self._connection.send(RequestDataStream(self._system_id, self._component_id, group, rate, 1))
+                request = RequestDataStream(
+                    target_system=self._system_id,
+                    target_component=self._component_id,
+                    req_stream_id=group,
+                    req_message_rate=math.ceil(hz),
+                    start_stop=START_STREAM,
+                )
+                self._connection.send(request)
 
     def _rate_of_group(self, group: int) -> float:
         needed_rates_hz = (
@@ -273,10 +284,10 @@ class MessageRates:
 
     def _watch(self, stream: _Stream) -> None:
         """Record how many messages have arrived. If necessary, request the stream again, or report it as slow."""
-        stream.counts.append(stream.count)
+        stream.received_at_checks.append(stream.received)
         if stream.requested_hz is None or stream.requested_hz <= 0 or stream.is_refused:
             return
-        if stream.counts[-1] == stream.counts[0]:  # No message has arrived in the window.
+        if stream.received_at_checks[-1] == stream.received_at_checks[0]:  # No message has arrived in the window.
             self._retry_if_due(stream)
         else:
             stream.retry_interval_s = RETRY_INTERVAL_S
@@ -290,17 +301,19 @@ class MessageRates:
             self._has_due_streams.set()
 
     def _check_rate(self, stream: _Stream) -> None:
-        if stream.requested_hz is None or len(stream.counts) <= WATCH_WINDOW:
+        """Publish StreamSlow when a stream becomes slow."""
+        if stream.requested_hz is None or len(stream.received_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
         # If no message arrived in the first period of the window, the stream began later, so its average is too low.
-        has_just_started = achieved_hz > 0 and stream.counts[0] == stream.counts[1]
+        has_just_started = achieved_hz > 0 and stream.received_at_checks[0] == stream.received_at_checks[1]
         if has_just_started and not stream.is_slow:
             return
         # A stream that lacks only one message is not slow, because that message may have arrived just outside the
         # window.
-        min_messages = SLOW_FACTOR * stream.requested_hz * WATCH_WINDOW * WATCH_PERIOD_S - 1
-        received_messages = achieved_hz * WATCH_WINDOW * WATCH_PERIOD_S
+        window_s = WATCH_WINDOW * WATCH_PERIOD_S
+        min_messages = SLOW_FACTOR * stream.requested_hz * window_s - 1
+        received_messages = achieved_hz * window_s
         was_slow = stream.is_slow
         stream.is_slow = received_messages < min_messages
         if achieved_hz == 0 and stream.is_optional:  # An optional stream may be missing altogether.

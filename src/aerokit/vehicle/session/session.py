@@ -134,9 +134,9 @@ class VehicleSession:
             connection,
             system_id,
             component_id,
-            self.describe_link,
-            lambda: self.link_watch.round_trip_s,
-            self.autopilot.acks_per_command,
+            describe=self.describe_link,
+            round_trip_s=lambda: self.link_watch.round_trip_s,
+            acks_per_command=self.autopilot.acks_per_command,
         )
         self.rates: MessageRates = MessageRates(
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups
@@ -339,6 +339,7 @@ class VehicleSession:
         self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
 
     def _attach_telemetry(self) -> None:
+        """Let messages update the state cells, and publish some changes of the cells as events."""
         bus, streams = self.connection.bus, self.telemetry.streams
         for message_id, handler in self.telemetry.handles.items():
             message_type = bus.dialect.get(message_id)

@@ -80,7 +80,7 @@ class ComponentSubscriber:
             for message_type in message_types:
                 check_rate(message_type, rate_hz)
 
-        # Called when the program enters the subscription by `async with`.
+        # Called when the program enters the `with` block of the subscription.
         def attach(sink: Sink) -> list[Detach]:
             filtered_sink = sink if entire_system else self._of_component(sink)
             detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)

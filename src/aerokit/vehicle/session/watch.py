@@ -50,9 +50,7 @@ MAX_OPEN_REQUESTS = 64
 
 
 class VehicleWatch:
-    """Detects when one vehicle falls silent, is heard again, or reboots."""
-
-    reboots: int
+    """Detects when one vehicle falls silent, ends its silence, or reboots."""
 
     def __init__(
         self,
@@ -71,7 +69,8 @@ class VehicleWatch:
         )
         self._state_tracker.record_activity(connection.now())
         self._is_reported_silent = self._has_ended = False
-        self.reboots = 0
+        self.reboots: int = 0
+        """Number of reboots detected."""
         # For each clock of the vehicle: its last reported time in milliseconds, and when the report was processed.
         self._last_times: dict[str, tuple[int, float]] = {}
         # The first ``time_boot_ms`` after a boot, and when its message was processed.
@@ -169,12 +168,13 @@ class VehicleWatch:
         if frame is None or frame.component_id != self._component_id:
             return
         now = self._connection.now()
-        silent_for, self._heartbeat_read_at = self.silent_for_s, now
+        silent_for_s = self.silent_for_s  # It restarts at 0 with the next line.
+        self._heartbeat_read_at = now
         self.last_heartbeat_at = frame.received_at
         self._state_tracker.record_activity(now)
         if self._is_reported_silent:
             self._is_reported_silent = False
-            self._connection.bus.publish(VehicleRecovered(now, self._system_id, silent_for))
+            self._connection.bus.publish(VehicleRecovered(now, self._system_id, silent_for_s))
 
     def _on_link_interrupted(self, event: LinkInterrupted) -> None:
         self._state_tracker.mark_lost(event.at)
@@ -227,7 +227,9 @@ class VehicleWatch:
         # The times from before the reboot are discarded. Compared with them, later messages would show the same reboot
         # again.
         self._last_times = {clock: (milliseconds, now)}
-        self._decreased_times, self._first_time, self._last_answer = {}, None, (now, 0)
+        self._decreased_times = {}
+        self._first_time = None
+        self._last_answer = (now, 0)
         self._expects_reboot = False
         self.reboots += 1
         self._on_reboot()
@@ -285,8 +287,9 @@ class LinkWatch:
         """Request the vehicle's time now, in addition to the requests that are sent every two seconds."""
         now = self._connection.now()
         self._next_request_at = now + TIMESYNC_PERIOD_S
-        self._open_requests.append(int(now * 1e9))
-        self._connection.send(Timesync(0, self._open_requests[-1]), to=self._system_id)
+        sent_at_ns = int(now * 1e9)
+        self._open_requests.append(sent_at_ns)
+        self._connection.send(Timesync(tc1=0, ts1=sent_at_ns), to=self._system_id)  # tc1 = 0 marks a request.
 
     def _on_timesync(self, message: Timesync) -> None:
         """Process the autopilot's answer to our request.
@@ -315,10 +318,10 @@ class LinkWatch:
         report = LinkReport(
             now,
             self._system_id,
-            100 * missing / (frames + missing) if frames + missing else None,
-            self._round_trip_s,
-            frames / seconds,
-            (total_bytes - total_bytes_before) / seconds,
+            loss_percent=100 * missing / (frames + missing) if frames + missing else None,
+            round_trip_s=self._round_trip_s,
+            frames_per_s=frames / seconds,
+            bytes_per_s=(total_bytes - total_bytes_before) / seconds,
         )
         self._on_report(report)
         self._connection.bus.publish(report)

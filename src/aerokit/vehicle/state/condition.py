@@ -215,16 +215,16 @@ def system_time(message: messages.SystemTime) -> SystemTime:
 
 def sensor_health(message: messages.SysStatus, context: Context) -> SensorHealth:
     """Return the sensor health. The meaning of the bits depends on the autopilot."""
-    present_enabled_healthy = (
-        message.onboard_control_sensors_present,
-        message.onboard_control_sensors_enabled,
-        message.onboard_control_sensors_health,
-    )
+    present = message.onboard_control_sensors_present
+    enabled = message.onboard_control_sensors_enabled
+    healthy = message.onboard_control_sensors_health
     return SensorHealth(
-        *present_enabled_healthy,
-        context.autopilot.failing_sensors(*present_enabled_healthy),
-        context.autopilot.prearm_checks_pass(*present_enabled_healthy),
-        message.load / 10,
+        present=present,
+        enabled=enabled,
+        healthy=healthy,
+        failing=context.autopilot.failing_sensors(present, enabled, healthy),
+        prearm_checks_pass=context.autopilot.prearm_checks_pass(present, enabled, healthy),
+        load_percent=message.load / 10,
     )
 
 
@@ -232,32 +232,32 @@ def ekf_health(message: messages.EkfStatusReport, context: Context) -> Estimator
     """Return the health of ArduPilot's estimator from EKF_STATUS_REPORT."""
     # The fields called variances are ratios of innovations to their limits (NavEKF3_core::getVariances).
     return EstimatorHealth(
-        message.NAME,
-        message.flags,
-        context.autopilot.missing_estimates(message.flags),
-        finite(message.velocity_variance),
-        finite(message.pos_horiz_variance),
-        finite(message.pos_vert_variance),
-        finite(message.compass_variance),
-        finite(message.terrain_alt_variance),
-        finite(message.airspeed_variance),
+        message=message.NAME,
+        flags=message.flags,
+        missing=context.autopilot.missing_estimates(message.flags),
+        velocity_ratio=finite(message.velocity_variance),
+        horizontal_position_ratio=finite(message.pos_horiz_variance),
+        vertical_position_ratio=finite(message.pos_vert_variance),
+        compass_ratio=finite(message.compass_variance),
+        terrain_ratio=finite(message.terrain_alt_variance),
+        airspeed_ratio=finite(message.airspeed_variance),
     )
 
 
 def estimator_health(message: messages.EstimatorStatus, context: Context) -> EstimatorHealth:
     """Return the health of PX4's estimator from ESTIMATOR_STATUS."""
     return EstimatorHealth(
-        message.NAME,
-        message.flags,
-        context.autopilot.missing_estimates(message.flags),
-        finite(message.vel_ratio),
-        finite(message.pos_horiz_ratio),
-        finite(message.pos_vert_ratio),
-        finite(message.mag_ratio),
-        finite(message.hagl_ratio),
-        finite(message.tas_ratio),
-        finite(message.pos_horiz_accuracy),
-        finite(message.pos_vert_accuracy),
+        message=message.NAME,
+        flags=message.flags,
+        missing=context.autopilot.missing_estimates(message.flags),
+        velocity_ratio=finite(message.vel_ratio),
+        horizontal_position_ratio=finite(message.pos_horiz_ratio),
+        vertical_position_ratio=finite(message.pos_vert_ratio),
+        compass_ratio=finite(message.mag_ratio),
+        terrain_ratio=finite(message.hagl_ratio),
+        airspeed_ratio=finite(message.tas_ratio),
+        horizontal_accuracy_m=finite(message.pos_horiz_accuracy),
+        vertical_accuracy_m=finite(message.pos_vert_accuracy),
     )
 
 

@@ -160,12 +160,12 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
     quality = message.signal_quality
     is_valid = quality != INVALID_QUALITY
     sensor = RangeFinder(
-        message.id,
-        message.current_distance / 100 if is_valid else None,
-        message.orientation,
-        message.min_distance / 100,
-        message.max_distance / 100,
-        quality if quality > INVALID_QUALITY else None,  # 0 means "unknown", 1 "invalid"
+        id=message.id,
+        distance_m=message.current_distance / 100 if is_valid else None,
+        orientation=message.orientation,
+        min_distance_m=message.min_distance / 100,
+        max_distance_m=message.max_distance / 100,
+        quality_percent=quality if quality > INVALID_QUALITY else None,  # 0 means "unknown", 1 "invalid"
     )
     return _replaced(context.before, sensor, _id_of)
 
@@ -193,20 +193,20 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
     # present.
     yaw_deg = None if message.yaw in (0, U16) else message.yaw % NORTH_CDEG / 100
     return GpsReceiver(
-        index,
-        enum_member(GpsFixType, message.fix_type),
-        known(message.satellites_visible, unknown=U8),
-        divided(message.eph, 100, unknown=U16),
-        divided(message.epv, 100, unknown=U16),
-        latitude,
-        longitude,
-        message.alt / 1e3 if coordinates else None,
-        divided(message.vel, 100, unknown=U16),
-        divided(message.cog, 100, unknown=U16),
-        divided(message.h_acc, 1000, unknown=0),
-        divided(message.v_acc, 1000, unknown=0),
-        divided(message.vel_acc, 1000, unknown=0),
-        yaw_deg,
+        index=index,
+        fix_type=enum_member(GpsFixType, message.fix_type),
+        satellites=known(message.satellites_visible, unknown=U8),
+        hdop=divided(message.eph, 100, unknown=U16),
+        vdop=divided(message.epv, 100, unknown=U16),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_amsl_m=message.alt / 1e3 if coordinates else None,
+        ground_speed_m_s=divided(message.vel, 100, unknown=U16),
+        course_deg=divided(message.cog, 100, unknown=U16),
+        horizontal_accuracy_m=divided(message.h_acc, 1000, unknown=0),
+        vertical_accuracy_m=divided(message.v_acc, 1000, unknown=0),
+        speed_accuracy_m_s=divided(message.vel_acc, 1000, unknown=0),
+        yaw_deg=yaw_deg,
     )
 
 
@@ -218,16 +218,16 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
     # If the cells are not measured one by one, the message reports the total as one "cell" or several (see FULL_CELL).
     is_only_total = len(cells_mv) == 1 or FULL_CELL in cells_mv
     battery = Battery(
-        message.id,
-        sum(cells_mv) / 1e3 if cells_mv else None,
-        current(message.current_battery, context.autopilot),
-        known(message.battery_remaining, unknown=-1),
-        () if is_only_total else tuple(millivolts / 1e3 for millivolts in cells_mv),
-        divided(message.temperature, 100, unknown=I16),
-        message.current_consumed if message.current_consumed >= 0 else None,
-        message.energy_consumed / 36 if message.energy_consumed >= 0 else None,  # hectojoules to watt-hours
-        known(message.time_remaining, unknown=0),
-        enum_member(MavBatteryChargeState, message.charge_state),
+        id=message.id,
+        voltage_v=sum(cells_mv) / 1e3 if cells_mv else None,
+        current_a=current(message.current_battery, context.autopilot),
+        remaining_percent=known(message.battery_remaining, unknown=-1),
+        cell_voltages_v=() if is_only_total else tuple(millivolts / 1e3 for millivolts in cells_mv),
+        temperature_c=divided(message.temperature, 100, unknown=I16),
+        consumed_mah=message.current_consumed if message.current_consumed >= 0 else None,
+        consumed_wh=message.energy_consumed / 36 if message.energy_consumed >= 0 else None,  # from hectojoules
+        time_remaining_s=known(message.time_remaining, unknown=0),
+        charge_state=enum_member(MavBatteryChargeState, message.charge_state),
     )
     return _replaced(context.before, battery, _id_of)
 

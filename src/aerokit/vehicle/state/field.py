@@ -115,7 +115,7 @@ class StateField(Generic[T]):
         return [message_class for message_class in map(message_type, names) if autopilot.sends(message_class)]
 
     def waits_for(self, autopilot: Autopilot) -> str:
-        """Return the messages that report the state, for error texts."""
+        """Return the messages that report the state, as a part of error texts: "no … was received"."""
         if self._waits_for:
             return self._waits_for
         names = " or ".join(message_class.NAME for message_class in self.requested_from(autopilot))
@@ -215,10 +215,10 @@ class StreamedMessage:
                     self.catch_up()  # Frames that arrived earlier must be applied first.
                 self._apply(frame, message)
             return
-        instance, instance_at = 0, self._instance_at
+        instance = 0
         # MAVLink 2 truncates zeros at the end of the payload, so a missing byte is 0.
-        if instance_at is not None and len(frame.body) > instance_at:
-            instance = frame.body[instance_at]
+        if self._instance_at is not None and len(frame.body) > self._instance_at:
+            instance = frame.body[self._instance_at]
         self.pending[instance] = message or frame
 
     def catch_up(self) -> None:

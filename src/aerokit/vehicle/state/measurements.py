@@ -147,47 +147,47 @@ def _scaled(factor: float, x: float, y: float, z: float) -> tuple[float, float, 
 
 def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
     return Imu(
-        (message.xacc, message.yacc, message.zacc),
-        _scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),
-        _scaled(context.autopilot.highres_imu_field_ut, message.xmag, message.ymag, message.zmag),
-        finite(message.temperature),
-        message.abs_pressure * HPA_PA,
-        message.diff_pressure * HPA_PA,
-        finite(message.pressure_alt),
+        acceleration_m_s2=(message.xacc, message.yacc, message.zacc),
+        rate_deg_s=_scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),
+        field_ut=_scaled(context.autopilot.highres_imu_field_ut, message.xmag, message.ymag, message.zmag),
+        temperature_c=finite(message.temperature),
+        pressure_pa=message.abs_pressure * HPA_PA,
+        differential_pressure_pa=message.diff_pressure * HPA_PA,
+        pressure_altitude_m=finite(message.pressure_alt),
     )
 
 
 def scaled_imu(message: messages.ScaledImu) -> Imu:
     """Return the readings in SCALED_IMU, whose units are thousandths of g, of rad/s and of gauss."""
     return Imu(
-        _scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
-        _scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
-        _scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
-        divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
+        acceleration_m_s2=_scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
+        rate_deg_s=_scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
+        field_ut=_scaled(MGAUSS_UT, message.xmag, message.ymag, message.zmag),
+        temperature_c=divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
 def raw_imu(message: messages.RawImu) -> RawImu:
     return RawImu(
-        (message.xacc, message.yacc, message.zacc),
-        (message.xgyro, message.ygyro, message.zgyro),
-        (message.xmag, message.ymag, message.zmag),
-        divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
+        acceleration=(message.xacc, message.yacc, message.zacc),
+        rate=(message.xgyro, message.ygyro, message.zgyro),
+        field=(message.xmag, message.ymag, message.zmag),
+        temperature_c=divided(message.temperature, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
 def odometry(message: messages.Odometry) -> Odometry:
     w, x, y, z = message.q
     return Odometry(
-        enum_member(MavFrame, message.frame_id),
-        enum_member(MavFrame, message.child_frame_id),
-        (message.x, message.y, message.z),
-        (w, x, y, z),
-        (message.vx, message.vy, message.vz),
-        _scaled(RAD_DEG, message.rollspeed, message.pitchspeed, message.yawspeed),
-        _covariance(message.pose_covariance),
-        _covariance(message.velocity_covariance),
-        message.quality or None,  # 0 means "unknown"
+        frame=enum_member(MavFrame, message.frame_id),
+        child_frame=enum_member(MavFrame, message.child_frame_id),
+        position_m=(message.x, message.y, message.z),
+        quaternion=(w, x, y, z),
+        velocity_m_s=(message.vx, message.vy, message.vz),
+        rate_deg_s=_scaled(RAD_DEG, message.rollspeed, message.pitchspeed, message.yawspeed),
+        pose_covariance=_covariance(message.pose_covariance),
+        velocity_covariance=_covariance(message.velocity_covariance),
+        quality_percent=message.quality or None,  # 0 means "unknown"
     )
 
 
@@ -198,10 +198,10 @@ def _covariance(values: tuple[float, ...]) -> tuple[float, ...] | None:
 
 def air_pressure(message: messages.ScaledPressure) -> AirPressure:
     return AirPressure(
-        message.press_abs * HPA_PA,
-        message.press_diff * HPA_PA,
-        message.temperature / 100,
-        divided(message.temperature_press_diff, 100, unknown=UNKNOWN_TEMPERATURE),
+        absolute_pa=message.press_abs * HPA_PA,
+        differential_pa=message.press_diff * HPA_PA,
+        temperature_c=message.temperature / 100,
+        differential_temperature_c=divided(message.temperature_press_diff, 100, unknown=UNKNOWN_TEMPERATURE),
     )
 
 
@@ -224,12 +224,13 @@ def simulation_state(message: messages.SimState) -> Position | None:
 def altitude(message: messages.Altitude) -> Altitude:
     terrain, clearance = finite(message.altitude_terrain), finite(message.bottom_clearance)
     return Altitude(
-        finite(message.altitude_monotonic),
-        finite(message.altitude_amsl),
-        finite(message.altitude_local),
-        finite(message.altitude_relative),
-        None if terrain is None or terrain < NO_TERRAIN_M else terrain,
-        None if clearance is None or clearance < 0 else clearance,  # A negative value means "not measured".
+        monotonic_m=finite(message.altitude_monotonic),
+        amsl_m=finite(message.altitude_amsl),
+        local_m=finite(message.altitude_local),
+        relative_m=finite(message.altitude_relative),
+        terrain_m=None if terrain is None or terrain < NO_TERRAIN_M else terrain,
+        # A negative value means "not measured".
+        bottom_clearance_m=None if clearance is None or clearance < 0 else clearance,
     )
 
 
@@ -245,29 +246,29 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
 
     others = [other for other in context.before or () if other.icao != message.ICAO_address]
     reported = Aircraft(
-        message.ICAO_address,
-        message.callsign.strip() if message.flags & AdsbFlags.VALID_CALLSIGN else "",
-        if_valid(AdsbFlags.VALID_COORDS, message.lat * 1e-7),
-        if_valid(AdsbFlags.VALID_COORDS, message.lon * 1e-7),
-        if_valid(AdsbFlags.VALID_ALTITUDE, message.altitude / 1000),
-        message.altitude_type == AdsbAltitudeType.GEOMETRIC,
-        if_valid(AdsbFlags.VALID_HEADING, message.heading / 100),
-        if_valid(AdsbFlags.VALID_VELOCITY, message.hor_velocity / 100),
-        if_valid(AdsbFlags.VALID_VELOCITY, message.ver_velocity / 100),
-        message.squawk if message.flags & AdsbFlags.VALID_SQUAWK else None,
-        enum_member(AdsbEmitterType, message.emitter_type),
-        message.tslc,
+        icao=message.ICAO_address,
+        callsign=message.callsign.strip() if message.flags & AdsbFlags.VALID_CALLSIGN else "",
+        latitude_deg=if_valid(AdsbFlags.VALID_COORDS, message.lat * 1e-7),
+        longitude_deg=if_valid(AdsbFlags.VALID_COORDS, message.lon * 1e-7),
+        altitude_m=if_valid(AdsbFlags.VALID_ALTITUDE, message.altitude / 1000),
+        altitude_is_geometric=message.altitude_type == AdsbAltitudeType.GEOMETRIC,
+        course_deg=if_valid(AdsbFlags.VALID_HEADING, message.heading / 100),
+        ground_speed_m_s=if_valid(AdsbFlags.VALID_VELOCITY, message.hor_velocity / 100),
+        climb_m_s=if_valid(AdsbFlags.VALID_VELOCITY, message.ver_velocity / 100),
+        squawk=message.squawk if message.flags & AdsbFlags.VALID_SQUAWK else None,
+        emitter=enum_member(AdsbEmitterType, message.emitter_type),
+        silent_for_s=message.tslc,
     )
     return (*others[-(MAX_AIRCRAFT - 1) :], reported)
 
 
 def winch(message: messages.WinchStatus) -> WinchStatus:
     return WinchStatus(
-        finite(message.line_length),
-        finite(message.speed),
-        finite(message.tension),
-        finite(message.voltage),
-        finite(message.current),
-        known(message.temperature, unknown=I16),
-        message.status,
+        length_m=finite(message.line_length),
+        speed_m_s=finite(message.speed),
+        tension_kg=finite(message.tension),
+        voltage_v=finite(message.voltage),
+        current_a=finite(message.current),
+        temperature_c=known(message.temperature, unknown=I16),
+        flags=message.status,
     )

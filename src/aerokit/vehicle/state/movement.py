@@ -197,12 +197,12 @@ def attitude(message: messages.Attitude) -> Attitude:
     """Return the attitude in ATTITUDE as Euler angles and rates in degrees."""
     degrees = math.degrees
     return Attitude(
-        degrees(message.roll),
-        degrees(message.pitch),
-        degrees(message.yaw),
-        degrees(message.rollspeed),
-        degrees(message.pitchspeed),
-        degrees(message.yawspeed),
+        roll_deg=degrees(message.roll),
+        pitch_deg=degrees(message.pitch),
+        yaw_deg=degrees(message.yaw),
+        roll_rate_deg_s=degrees(message.rollspeed),
+        pitch_rate_deg_s=degrees(message.pitchspeed),
+        yaw_rate_deg_s=degrees(message.yawspeed),
     )
 
 

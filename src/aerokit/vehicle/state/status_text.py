@@ -70,7 +70,7 @@ class StatusTextAssembler:
         self._recent.clear()
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
-        """Add a chunk to its text. Yield the text if it is now complete, and an earlier text that remains truncated."""
+        """Add a chunk to its text. Yield the text if it is complete, and before it a text whose end was lost."""
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:

@@ -215,7 +215,7 @@ class Telemetry(States):
 
         # A ground station or companion may send heartbeats with the autopilot's ids; these update no cell.
         def on_heartbeat(message: Any, source: Source) -> None:
-            if self._is_of_autopilot(message):
+            if self._accept_heartbeat(message):
                 update_all(message, source)
 
         if class_name == "Heartbeat":
@@ -275,8 +275,8 @@ class Telemetry(States):
 
     # --------------------------------------------------------- messages with special handling
 
-    def _is_of_autopilot(self, heartbeat: messages.Heartbeat) -> bool:
-        """Return False for the heartbeat of a ground station or companion that uses the autopilot's ids."""
+    def _accept_heartbeat(self, heartbeat: messages.Heartbeat) -> bool:
+        """Learn from a heartbeat; return False if a ground station or companion sent it with the autopilot's ids."""
         if not is_autopilot(heartbeat):
             return False
         if not self._knows_autopilot:
