@@ -57,7 +57,7 @@ class StateCell(Generic[T]):
         "_arrivals",
         "_changes",
         "_clock",
-        "_closed_by",
+        "_close_error",
         "_explain_timeout",
         "_feeds",
         "_followers",
@@ -96,7 +96,7 @@ class StateCell(Generic[T]):
         self._sinks: list[_Sink[T]] = []
         self._followers = 0
         self._feeds: tuple[Feed, ...] = ()
-        self._closed_by: BaseException | None = None
+        self._close_error: BaseException | None = None
 
     # ------------------------------------------------------------------------------ reading
 
@@ -245,14 +245,14 @@ class StateCell(Generic[T]):
 
     def close(self, error: BaseException) -> None:
         """Raise ``error`` in current and later waiters, because no more values will arrive. Reading still works."""
-        if self._closed_by is None:
-            self._closed_by = error
+        if self._close_error is None:
+            self._close_error = error
             for sink in tuple(self._sinks):
                 sink.fail(copy_exception(error))
 
     def _raise_if_closed(self) -> None:
-        if self._closed_by is not None:
-            raise copy_exception(self._closed_by)
+        if self._close_error is not None:
+            raise copy_exception(self._close_error)
 
     def _catch_up(self) -> None:
         for feed in self._feeds:
@@ -344,7 +344,7 @@ class Changes(AsyncIterator[T]):
         return self._cell.value
 
     def _total(self) -> int:
-        """Return how many values there were so far: changed ones for `changes`, received ones for `updates`."""
+        """Return the number of received values so far; for `changes()`, only values that differ from the one before."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:

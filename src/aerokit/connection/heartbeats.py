@@ -145,13 +145,13 @@ class HeartbeatWatchdog:
         now = self._clock()
         if idle_s <= limit_s:
             if self._paused_at is not None:
-                self._publish(HeartbeatResumed(now, 0, now - self._paused_at))
+                self._publish(HeartbeatResumed(now, system_id=0, paused_s=now - self._paused_at))
                 logger.warning("the program is active again: heartbeats are sent again")
                 self._paused_at = None
             return True
         if self._paused_at is None:
             self._paused_at = now
-            self._publish(HeartbeatPaused(now, 0, idle_s))
+            self._publish(HeartbeatPaused(now, system_id=0, idle_s=idle_s))
             logger.warning(
                 "the program has not called aerokit for %.0f s: heartbeats are paused, so that the vehicle's ground"
                 " station failsafe can act (set the limit by connect(heartbeat=OwnHeartbeat(fed_within_s=…)))",

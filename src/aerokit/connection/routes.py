@@ -122,7 +122,7 @@ class _Route:
 
     peer: Peer
     heartbeat_at: float
-    silent_since: float  # `heartbeat_at`, or later if the event loop was blocked since then
+    silent_since: float  # `heartbeat_at`, or later if the event loop was blocked after that time
     sequence: int  # sequence number of the last heartbeat
     expected: int  # `counters.expected` at the last heartbeat, from which `rate` is computed
 
@@ -259,7 +259,7 @@ class Routes:
         evicted = next((peer for peer in peers if peer not in live), None)
         if evicted is None:
             return []
-        self._claims = {key: claim for key, claim in self._claims.items() if key[1] != evicted}
+        self._claims = {(source, peer): claim for (source, peer), claim in self._claims.items() if peer != evicted}
         return [evicted]
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
@@ -285,8 +285,8 @@ class Routes:
     ) -> tuple[int, bool | None, bool | None]:
         """Return the evidence for :meth:`RouteClaim.add`.
 
-        It is the frame count that is expected of the owner, and whether the frame's sequence number and time since boot
-        continue the owner's stream (None: unknown).
+        The evidence is the owner's next frame number, and whether the sequence number and the time since boot of the
+        frame continue the owner's stream (None: unknown).
         """
         sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
@@ -316,7 +316,8 @@ class Routes:
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        self._claims = {key: claim for key, claim in self._claims.items() if key[0] != source}
+        for claim_key in [key for key in self._claims if key[0] == source]:
+            del self._claims[claim_key]
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
@@ -340,9 +341,9 @@ class Routes:
         if now - self._swept_at >= SWEEP_INTERVAL_S:
             self._swept_at = now
             self._routes = {
-                source: route
-                for source, route in self._routes.items()
-                if source[0] in self._attached or now - route.heartbeat_at <= PEER_TTL_S
+                (system_id, component_id): route
+                for (system_id, component_id), route in self._routes.items()
+                if system_id in self._attached or now - route.heartbeat_at <= PEER_TTL_S
             }
         return len(self._routes) < MAX_ROUTES
 

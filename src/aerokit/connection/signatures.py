@@ -44,7 +44,7 @@ class SignatureGate:
         self._logged_keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
-        self.on_change: Callable[[], object] = bool  # The default, `bool`, does nothing.
+        self.on_change: Callable[[], object] = lambda: None
         """Called when :attr:`is_open` may have changed."""
 
     def use(self, signing: Signing | None) -> None:
@@ -160,7 +160,7 @@ class _Handover:
         return (frame.system_id, frame.component_id) == self._source
 
     def is_completed_by(self, frame: Frame, unix_time_s: float) -> bool:
-        """Return True if this frame and the earlier ones show that the component uses the new key, or no key."""
+        """Return True once the frames up to this one show that the component uses the new key, or no key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _has_key(frame):

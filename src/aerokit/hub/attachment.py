@@ -62,7 +62,7 @@ class Attachment:
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
-        self._is_on_link = False  # True once this object has opened the link, and therefore must close it
+        self._owns_link = False  # True once this object has opened the link, and therefore must close it
         self._reports_bursts = False
         # True if the link has a single remote end, e.g. a serial port. Its `Port` has the key None.
         self._is_single = False
@@ -83,17 +83,17 @@ class Attachment:
 
     async def open(self) -> None:
         await self.link.open(self)
-        self._is_on_link = True
+        self._owns_link = True
         self._on_up()
         self._report(self, "opened", f"{self.link.address} is open")
 
     def close(self) -> None:
         self._on_down()
-        if self._is_on_link:
+        if self._owns_link:
             self.link.close()
 
     async def wait_closed(self) -> None:
-        if self._is_on_link:
+        if self._owns_link:
             await self.link.wait_closed()
 
     def statistics(self) -> EndpointStatistics:
@@ -102,7 +102,10 @@ class Attachment:
         for framer in self._peers:
             totals = [total + count for total, count in zip(totals, _totals(framer), strict=True)]
         frames_in, bytes_in, lost, bad_bytes = totals
-        systems = {source for port in ports if port.node is not None for source in router.senders_at(port.node)}
+        systems: set[tuple[int, int]] = set()
+        for port in ports:
+            if port.node is not None:
+                systems.update(router.senders_at(port.node))
         dropped = {reason: count for reason, count in self.counters.dropped.items() if count}
         if self.link.dropped_writes:
             dropped["link"] = self.link.dropped_writes
@@ -238,7 +241,7 @@ class Attachment:
         kind = self.link.address.partition(":")[0]
         if kind in UNBUFFERED_KINDS and isinstance(self.endpoint.address, str):
             return UNLIMITED
-        return _queue_above_bytes(self.link.address)
+        return _min_queue_above_bytes(self.link.address)
 
     def _forget(self, peer: Peer) -> None:
         self._forget_port(peer)
@@ -280,9 +283,10 @@ class Attachment:
         if frame.kind is not MessageKind.ORDER:  # Only dropped commands are reported; other frames are just counted.
             return
         name = self._dialect[frame.message_id].NAME
-        waited_s = self._now() - frame.since
+        waited_s = self._now() - frame.waiting_since
         explanation = {"late": "it waited too long", "queue_full": "the queue is full"}.get(reason, "the link was lost")
-        target = f"{frame.target[0]}/{frame.target[1]}"
+        system_id, component_id = frame.target
+        target = f"{system_id}/{component_id}"
         self._report(self, "order_dropped", f"{name} for {target} was dropped after {waited_s:.1f} s: {explanation}")
 
 
@@ -296,7 +300,8 @@ def filters_of(endpoint: Endpoint, dialect: Dialect) -> Filters:
     return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
 
 
-def _queue_above_bytes(address: str) -> int:
+def _min_queue_above_bytes(address: str) -> int:
+    """Return the smallest limit of the links in an address, which may name several links."""
     kinds = (part.split(":")[0] for part in address.removeprefix("shared:").split(" + "))
     return min(QUEUE_ABOVE_BYTES.get(kind, DEFAULT_QUEUE_ABOVE_BYTES) for kind in kinds)
 

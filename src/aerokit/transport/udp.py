@@ -22,7 +22,7 @@ from aerokit.transport.sockets import (
     SocketAddress,
     bind_to,
     bound_socket,
-    has_more,
+    readable_check,
     resolve,
 )
 
@@ -57,8 +57,7 @@ class _UdpLink(BaseLink):
         self._socket: socket.socket | None = None
         self._transport: asyncio.DatagramTransport | None = None  # used only on loops without add_reader
         self._transport_owns_socket = False
-        # Function that returns whether another datagram can be read. The default, `bool`, returns False: no socket yet.
-        self._has_more: Callable[[], object] = bool
+        self._has_more: Callable[[], object] = lambda: False  # returns a true value if a datagram can be read
         self._burst_listener: BurstListener | None = None
 
     @property
@@ -77,7 +76,7 @@ class _UdpLink(BaseLink):
         self._transport_owns_socket = False
         self._burst_listener = self._receiver if isinstance(self._receiver, BurstListener) else None
         self._socket = sock = await self._make_socket()
-        self._has_more = has_more(sock)
+        self._has_more = readable_check(sock)
         _enlarge_buffer(sock)
         try:
             self._loop.add_reader(sock, self._on_readable)

@@ -22,7 +22,7 @@ MIN_CLOCK_MATCHES = 3
 
 # A vehicle that answers this many TIMESYNC probes after the request for its hardware id, but not the request itself,
 # has no hardware id to report.
-MAX_TIMES_WITHOUT_HARDWARE = 3
+MAX_ANSWERS_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
@@ -124,7 +124,7 @@ class Candidate:
     @property
     def is_hardware_pending(self) -> bool:
         """True while an answer to a request for the hardware id can still be expected."""
-        return self._hardware_requests > 0 and self._answers_since_request < MAX_TIMES_WITHOUT_HARDWARE
+        return self._hardware_requests > 0 and self._answers_since_request < MAX_ANSWERS_WITHOUT_HARDWARE
 
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
@@ -135,7 +135,7 @@ class Candidate:
             self.is_doubted = False
         self.is_other_hardware = is_other
 
-    def record_time(self) -> None:
+    def count_answer(self) -> None:
         """Count a TIMESYNC answer after a request for the hardware id."""
         if self._hardware_requests:
             self._answers_since_request += 1
@@ -164,7 +164,7 @@ class Candidate:
     @property
     def cost_s(self) -> float:
         """Expected seconds for a command and its answer, including retries after losses."""
-        loss = min(0.9, self.loss or 0.0)
+        loss = min(0.9, self.loss or 0.0)  # A loss of 1 would make the cost infinite.
         round_trip_s = 0.1 if self.round_trip_s is None else self.round_trip_s
         # Adding 0.05 s makes links with round trips of a few milliseconds cost about the same. The exponent is 2,
         # because both the command and its answer must arrive.
@@ -244,7 +244,7 @@ class LinkChoice:
                 for affected in self.candidates.values():
                     affected.reset_mismatches()
         else:
-            candidate.record_time()
+            candidate.count_answer()
             matches = self.clock.matches(at, vehicle_s, round_trip_s)
             if not matches and is_used_silent:
                 # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove

@@ -83,16 +83,17 @@ class LinkProbes:
         # The answer contains `ts1`, which identifies the probe. It is our time in nanoseconds. The last three digits
         # are a number of the system and the link, because several probes may be sent at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
-        # `ts1` is invalid, or belongs to another pending probe. The next call tries again.
         if ts1 <= 0 or ts1 in self._pending:
-            return
+            return  # The number is invalid, or belongs to another pending probe. The next call tries again.
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = system_id, candidate.link, now
         self._send(m.Timesync(0, ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
         if choice.should_request_hardware(candidate, is_attached=is_attached):
-            message_id = float(m.AutopilotVersion.ID)
-            request = m.CommandLong(system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, 0, message_id, 0, 0, 0, 0, 0, 0)
+            request = m.CommandLong(
+                system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
+                param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
+            )  # fmt: skip
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:

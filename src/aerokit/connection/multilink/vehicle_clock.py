@@ -82,7 +82,8 @@ class VehicleClock:
         return min_advance_s - tolerance_s <= advance_s <= expected_s + tolerance_s
 
     def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
-        drift_s = min(MAX_SPEED_ERROR * abs(at - self._samples[-1][0]), MAX_DRIFT_S)
+        last_at, _ = self._samples[-1]
+        drift_s = min(MAX_SPEED_ERROR * abs(at - last_at), MAX_DRIFT_S)
         return (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
 
     @property
@@ -93,7 +94,8 @@ class VehicleClock:
         if self._former_speed is None:
             return None
         speed, measured_at = self._former_speed
-        return speed if self._samples[-1][0] - measured_at <= SPEED_MAX_AGE_S else None
+        last_at, _ = self._samples[-1]
+        return speed if last_at - measured_at <= SPEED_MAX_AGE_S else None
 
     @property
     def _measured_speed(self) -> float | None:
