@@ -99,7 +99,7 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce("location")
 
     def _announce(self, frame: str) -> None:
-        """Notify this object's listeners of ``name``, then the vehicle's listeners of ``location.name``."""
+        """Notify this object's listeners of ``frame``, then the vehicle's listeners of ``location.frame``."""
         self._dk_listeners.announce(frame)
         self._core.listeners.announce(f"location.{frame}")
 
@@ -181,7 +181,8 @@ class VehicleAttributes(VehicleCore):
     @property
     def heading(self) -> int | Any:
         """Heading in degrees, 0 to 360 clockwise from north (VFR_HUD)."""
-        return self._dk_vfr_hud.values("heading")[0]
+        (heading,) = self._dk_vfr_hud.values("heading")
+        return heading
 
     @property
     def gps_0(self) -> GPSInfo:

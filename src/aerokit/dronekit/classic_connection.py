@@ -125,8 +125,8 @@ class ClassicConnection:
     def is_of_another_vehicle(self, system_id: int) -> bool:
         """Return True if the system with this id has an autopilot but is not the connected vehicle."""
         return system_id != self.target_system and any(
-            source[0] == system_id and is_autopilot(heartbeat)
-            for source, heartbeat in self.connection.heartbeats.items()
+            sender_system == system_id and is_autopilot(heartbeat)
+            for (sender_system, _), heartbeat in self.connection.heartbeats.items()
         )
 
     def match_mavlink_version(self, heartbeat: Message) -> None:

@@ -197,7 +197,7 @@ class CommandSequence:
 
     @next.setter  # noqa: A003 - DroneKit's name
     def next(self, index: int) -> None:
-        self._current.choose(index)
+        self._current.set_next(index)
 
     # ---------------------------------------------------------------------------------- a list
 
@@ -363,7 +363,8 @@ def _content_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
 
 
 def _comparable(value: Any) -> Any:
-    return "NaN" if value != value else value
+    is_nan = value != value  # Only NaN differs from itself; math.isnan() would refuse values of other types.
+    return "NaN" if is_nan else value
 
 
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
@@ -425,5 +426,6 @@ def _wire_number(value: Any, command: int, frame: int) -> int | float:
 def _command_of(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
     # DroneKit's commands have the frames of MISSION_ITEM, which differ from those of MISSION_ITEM_INT.
     item = item.replace(frame=int(canonical_frame(item.frame)))
-    message = to_wire_float(item, seq, target_system=own_ids[0], target_component=own_ids[1])
+    own_system, own_component = own_ids
+    message = to_wire_float(item, seq, target_system=own_system, target_component=own_component)
     return Command(*(getattr(message, name) for name in FIELDS))

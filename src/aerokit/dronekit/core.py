@@ -69,7 +69,10 @@ class Readiness:
 
     def failure_of(self, names: set[str]) -> APIException | None:
         """Return the error with which reading one of these attributes has failed, or None."""
-        return next(filter(None, map(self._failures.get, names)), None)
+        for name in names:
+            if name in self._failures:
+                return self._failures[name]
+        return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
         """Wait for a change if one of these attributes is missing, at most ``max_wait_s`` and at most 0.2 s."""
@@ -249,13 +252,13 @@ class Core:
         if is_silent != self._is_silent:
             self._is_silent = is_silent
             post = self.handler.listener_thread.post  # not on the loop, because the program's log handlers may block
-            if self._is_silent:
+            if is_silent:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:
                 post(self.logger.info, "...link restored.")
         wait_s = TICK_INTERVAL_S
         # Each wake-up costs as much as a few messages, so the wait is longer if no listener needs `last_heartbeat`.
-        if not self._is_silent and not self.listeners.has_listener("last_heartbeat"):
+        if not is_silent and not self.listeners.has_listener("last_heartbeat"):
             wait_s = max(wait_s, min(IDLE_TICK_INTERVAL_S, SILENCE_WARNING_S - age))
         asyncio.get_running_loop().call_later(wait_s, weak_callback(self.watch_link))
 

@@ -144,7 +144,8 @@ class Master:
 
     def _command(self, command: int, *params: float) -> None:
         seven_params = (*params, *(0,) * (7 - len(params)))
-        self.mav.command_long_send(self.target_system, self.target_component, command, 0, *seven_params)
+        confirmation = 0
+        self.mav.command_long_send(self.target_system, self.target_component, command, confirmation, *seven_params)
 
     # ------------------------------------------------------------ raw parameter and mission messages
 
@@ -239,9 +240,9 @@ class Master:
 
     def _autopilot(self) -> tuple[int, Heartbeat | None]:
         """Return the component id and the last HEARTBEAT of the vehicle's autopilot."""
-        for source, heartbeat in self._connection.connection.heartbeats.copy().items():
-            if source[0] == self.target_system and is_autopilot(heartbeat):
-                return source[1], heartbeat
+        for (system_id, component_id), heartbeat in self._connection.connection.heartbeats.copy().items():
+            if system_id == self.target_system and is_autopilot(heartbeat):
+                return component_id, heartbeat
         return 0, None
 
 

@@ -96,10 +96,10 @@ class Listeners:
             self.deliver(name, value)
         elif waits:
             self._thread.call(self.deliver, name, value)
-        elif cache:  # offer() could drop the call, but a change must not be lost
+        elif cache:  # post_or_drop() could drop the call, but a change must not be lost
             self._thread.post(self.deliver, name, value)
         else:
-            self._thread.offer(self.deliver, name, value)
+            self._thread.post_or_drop(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
         """Call :meth:`notify` with the owner's attribute of this name. Reads the attribute only if it has listeners."""
@@ -120,7 +120,7 @@ class Listeners:
     def _keep_owner(self) -> None:
         # Listeners get the owner as an argument, so they keep the owner alive even if the program has dropped it.
         if self._thread is not None:
-            self._thread.keep(self, has_listeners=bool(self.by_name))
+            self._thread.keep_alive(self, has_listeners=bool(self.by_name))
 
 
 def listener_decorator(
@@ -243,7 +243,7 @@ class MessageListeners(Listeners):
 
     def _on_frame(self, frame: Frame, peer: Peer = None) -> None:
         if not self._handler.is_of_another_vehicle(frame.system_id):
-            self._handler.listener_thread.offer(self._deliver, frame)
+            self._handler.listener_thread.post_or_drop(self._deliver, frame)
 
     def _deliver(self, frame: Frame) -> None:
         message = message_of(frame)

@@ -130,7 +130,7 @@ async def _download(
 ) -> None:
     """Download all parameters on the loop, without a reference that keeps the classic vehicle alive."""
     try:
-        on_success(await vehicle.parameters.download(method=await _method(vehicle)))
+        on_success(await vehicle.parameters.download(method=await _download_method(vehicle)))
     except ConnectionClosed:
         return
     except AerokitError as error:
@@ -141,7 +141,7 @@ async def _download(
         on_ended()
 
 
-async def _method(vehicle: AsyncVehicle) -> DownloadMethod:
+async def _download_method(vehicle: AsyncVehicle) -> DownloadMethod:
     """Return the method of the download. Waits briefly for AUTOPILOT_VERSION, which shows if a file is available."""
     version = vehicle.telemetry.version
     with anyio.move_on_after(VERSION_TIMEOUT_S):

@@ -109,8 +109,9 @@ def serve_for_program(kind: str, home: tuple[float, float, float], speedup: floa
         _vehicle_for_program = ServedVehicle(kind, USUAL_ADDRESSES, home=home, speedup=speedup)
     except LinkOpenError as error:
         errprinter(f"{error}; using another port")
-        any_port = ("tcpin:127.0.0.1:0", *USUAL_ADDRESSES[1:])
-        _vehicle_for_program = ServedVehicle(kind, any_port, home=home, speedup=speedup)
+        _, udp_address = USUAL_ADDRESSES
+        addresses = ("tcpin:127.0.0.1:0", udp_address)  # The system chooses the TCP port.
+        _vehicle_for_program = ServedVehicle(kind, addresses, home=home, speedup=speedup)
     return _vehicle_for_program
 
 
@@ -121,7 +122,8 @@ class SITL:
         global _next_instance
         self.path = path
         if instance is None:
-            instance, _next_instance = _next_instance, _next_instance + 1
+            instance = _next_instance
+            _next_instance += 1
         self.instance: int = instance
         self._kind: str | None = None
         self._served: ServedVehicle | None = None
@@ -155,15 +157,18 @@ class SITL:
             if not restart:
                 raise ChildProcessError("SITL is already running in this process, please use .stop() to kill it")
             self.stop()
-        options = _sitl_options().parse_known_args(list(initial_args))[0]
+        options, _ = _sitl_options().parse_known_args(list(initial_args))
         if options.instance is not None:
             self.instance = options.instance
-        kind, speedup, addresses = self._kind, speedup or options.speedup, [self._address()]
+        kind = self._kind
+        speedup = speedup or options.speedup
+        addresses = [self._address()]
         # The new vehicle replaces that of --sim, whose kind and speed are the defaults.
         if _vehicle_for_program is not None:
             kind = kind or _vehicle_for_program.kind
             speedup = speedup or _vehicle_for_program.speedup
-            addresses += USUAL_ADDRESSES[1:]  # the UDP address; `_address` is the TCP address
+            _, udp_address = USUAL_ADDRESSES
+            addresses.append(udp_address)
             _vehicle_for_program.stop()
             _vehicle_for_program = None
         kind = kind or KINDS.get(options.model or "", "copter")

@@ -27,7 +27,7 @@ from aerokit.dronekit.privates import OverridableProperty, VehiclePrivates
 from aerokit.dronekit.util import ErrprinterHandler
 from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.enums import MavCmd
-from aerokit.mavlink.messages import CommandLong
+from aerokit.protocols.command import command_long
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
@@ -325,7 +325,7 @@ async def _request_capabilities(aio: AsyncVehicle) -> None:
     for _ in range(5):
         if aio.telemetry.version.is_known:
             return
-        aio.send(CommandLong(aio.system_id, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
+        aio.send(command_long(aio.system_id, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
         await anyio.sleep(1.0)
 
 
@@ -362,7 +362,8 @@ def connect(
         timeout: seconds for ``wait_ready``.
         still_waiting_callback: called with the set of missing names.
         still_waiting_interval: seconds between these calls.
-        status_printer: called with every text of the autopilot, on the listener thread, until the vehicle is closed.
+        status_printer: called with every STATUSTEXT of the autopilot, on the listener thread, until the vehicle is
+            closed.
         vehicle_class: a subclass of :class:`Vehicle`.
         rate: Hz of the requested data streams; None requests none.
         baud: bits per second, for a serial port whose string has no baud rate.
@@ -400,7 +401,7 @@ def connect(
         vehicle = cast("VehicleT", Vehicle(handler)) if vehicle_class is None else vehicle_class(handler)
         if status_printer is not None:
             _print_texts(handler, status_printer)
-            handler.listener_thread.keep(vehicle, has_listeners=True)
+            handler.listener_thread.keep_alive(vehicle, has_listeners=True)
         if _initialize:
             vehicle.initialize(rate=rate, heartbeat_timeout=heartbeat_timeout)
         if wait_ready:

@@ -317,9 +317,11 @@ class _Received:
         return _restored, (self._decoded_class, state)
 
     def create_header(self) -> Any:
-        frame, body = self._frame, self._frame.body
+        frame = self._frame
+        flags = frame.incompat_flags, frame.compat_flags
+        payload_length = frame.body[0]
         source = frame.system_id, frame.component_id
-        return self._header_class(frame.message_id, body[1], body[2], body[0], body[3], *source)
+        return self._header_class(frame.message_id, *flags, payload_length, frame.sequence, *source)
 
     def create_msgbuf(self) -> bytearray:
         return bytearray(self._frame.raw)

@@ -45,9 +45,11 @@ _compiled: Any = None if wire is None else wire.tlog_records
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
-    begin: int
-    data, begin, is_at_end, min_time = b"", 0, False, 0
+    data = b""
+    begin: int = 0  # position of the next record in `data`
     end: int | None
+    is_at_end = False  # True if the whole file has been read
+    min_time = 0  # A record with an earlier time is garbage; see _FIRST_TIME.
     while True:
         # `data` must contain a whole record and the header of the next one, so that the record can be verified.
         if not is_at_end and len(data) - begin < 2 * _MAX_RECORD:
@@ -95,7 +97,7 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if this record is an error: inside it, a record begins that another one follows directly."""
+    """Return True if a true record begins inside this one. A true record is followed directly by the next record."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:

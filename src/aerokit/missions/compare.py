@@ -130,9 +130,9 @@ _PX4: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: ("f",),
 }
 
-_PX4_JUMP = ("sUfffff",)
+_PX4_JUMP = "sUfffff"
 
-_PX4_OTHERS = ("fffffff",)
+_PX4_OTHERS = "fffffff"
 
 _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000, 0x7FFF)}
 
@@ -149,9 +149,10 @@ def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Itera
 
 
 def _px4_letters(item: MissionItem) -> str:
-    if item.frame != MavFrame.MISSION:
-        return _PX4.get(item.command, ("",))[0]
-    return (_PX4_JUMP if item.command == MavCmd.DO_JUMP else _PX4_OTHERS)[0]
+    if item.frame == MavFrame.MISSION:
+        return _PX4_JUMP if item.command == MavCmd.DO_JUMP else _PX4_OTHERS
+    (letters,) = _PX4.get(item.command, ("",))
+    return letters
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
@@ -323,7 +324,8 @@ def _same_place(
 def _float_step(value: float) -> float:
     """Return the distance between a 32-bit float and its neighbour."""
     significant_bits = 24
-    return math.ldexp(1.0, math.frexp(value)[1] - significant_bits)
+    _, exponent = math.frexp(value)
+    return math.ldexp(1.0, exponent - significant_bits)
 
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
