@@ -140,7 +140,7 @@ class _Rules:
 
 
 def _is_time(parameter: inspect.Parameter) -> bool:
-    """Return True if the parameter is a time in seconds, and not a speed, whose name ends in ``_s``, too."""
+    """Return True if the parameter is a time in seconds. A speed is not a time, although its name ends in ``_s``."""
     name = parameter.name
     is_speed = name.endswith(("m_s", "deg_s"))
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed

@@ -334,8 +334,8 @@ class Subscription(Generic[ItemT]):
             raise InvalidArgument(
                 f"overflow = {overflow!r} is not allowed: it must be 'drop_oldest', 'drop_newest' or 'error'"
             )
-        # Function that explains in time-out errors why no items arrive. The default, `str`, returns "": no explanation.
-        self._explain_timeout: Callable[[], str] = str
+        # Returns why no items arrive, for time-out errors; "" if unknown.
+        self._explain_timeout: Callable[[], str] = lambda: ""
         self.missed: int = 0
         """Number of items that were dropped because the reader was too slow."""
         self._attach = attach

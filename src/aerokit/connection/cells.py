@@ -45,6 +45,10 @@ class Source(Snapshot):
     message: str
 
 
+def _no_explanation() -> str:
+    return ""
+
+
 class StateCell(Generic[T]):
     """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
@@ -85,8 +89,8 @@ class StateCell(Generic[T]):
         self._stamp = clock if stamp is None else stamp  # returns the receive time for a value that is set now
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
-        # Function that explains in time-out errors why no values arrive. The default, `str`, returns "" (unknown).
-        self._explain_timeout: Callable[[], str] = str
+        # Returns why no values arrive, for time-out errors; "" if unknown.
+        self._explain_timeout: Callable[[], str] = _no_explanation
         self._known = False
         self._latest: T | None = None
         self._source: Source | None = None

@@ -198,7 +198,7 @@ class Connection:
     def _use_activity_monitor(self, activity: ActivityMonitor) -> None:
         """Pause our heartbeat when the program's own threads hang, although the loop's thread keeps running."""
         if self._heartbeat is not None:
-            self._heartbeat.require(activity, BLOCKING_MAX_IDLE_S)
+            self._heartbeat.watch(activity, BLOCKING_MAX_IDLE_S)
 
     @property
     def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
@@ -247,7 +247,7 @@ class Connection:
 
     @signing.setter
     def signing(self, signing: Signing | None) -> None:
-        self._gate.use(signing)
+        self._gate.set_signing(signing)
 
     @checked
     def subscribe(

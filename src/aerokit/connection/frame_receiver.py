@@ -186,12 +186,13 @@ class FrameReceiver:
         if self._bus.one_at_a_time or framer.late or framer.foreign:
             self._check_and_deliver(frames, framer, peer)
             return
-        last = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
-        if last is not None:
-            # The delivery stopped after the frame `last`, because one of its sinks closed the connection, set a signing
-            # key or added an observer. The other frames now need checks; `last` was not yet passed to the observers.
-            self.observers.notify_received(last, peer)
-            self._check_and_deliver(frames[frames.index(last) + 1 :], framer, peer)
+        last_delivered = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
+        if last_delivered is not None:
+            # The delivery stopped after this frame, because one of its sinks closed the connection, set a signing key
+            # or added an observer. The other frames now need checks. This frame was not yet passed to the observers.
+            self.observers.notify_received(last_delivered, peer)
+            remaining = frames[frames.index(last_delivered) + 1 :]
+            self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
         """Deliver the frames that pass all checks, and pass them to the recording and the observers."""

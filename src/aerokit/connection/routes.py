@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.events import DuplicateSender, RouteChanged, RouteChangeRefused
 from aerokit.mavlink.enums import MavComponent
@@ -25,6 +25,14 @@ if TYPE_CHECKING:
 _BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 
 CLAIM_MIN_FRAMES = 3
+
+
+class _Evidence(NamedTuple):
+    """What a frame of another peer proves. True if it continues the owner's stream, None if unknown."""
+
+    expected: int  # the owner's next frame number
+    sequence_matches: bool | None
+    clock_matches: bool | None
 
 
 class RouteClaim:
@@ -55,8 +63,8 @@ class RouteClaim:
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
 
-    def add(self, frame: Frame, evidence: tuple[int, bool | None, bool | None]) -> None:
-        """Add a frame and its evidence, the result of ``Routes._evidence``."""
+    def add(self, frame: Frame, evidence: _Evidence) -> None:
+        """Add a frame of the peer, and what it proves."""
         expected, sequence_matches, clock_matches = evidence
         if expected != self._expected:  # The owner has sent frames since the last call, so the claim starts again.
             self._expected = expected
@@ -223,7 +231,7 @@ class Routes:
         is_same_host = self._link.host_of(peer) == self._link.host_of(route.peer)
         needs_no_evidence = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
         claim = self._claim(source, peer)
-        claim.add(frame, self._evidence(route, frame, counters))
+        claim.add(frame, self._evidence(route, frame))
         has_replaced = is_same_host and claim.has_replaced(now, route.rate)
         if has_replaced or (is_silent and (needs_no_evidence or claim.continues_owner)):
             self._move_route(route, frame, peer)
@@ -280,14 +288,8 @@ class Routes:
             claim = self._claims[key] = RouteClaim()
         return claim
 
-    def _evidence(
-        self, route: _Route, frame: Frame, counters: SourceStatistics | None
-    ) -> tuple[int, bool | None, bool | None]:
-        """Return the evidence for :meth:`RouteClaim.add`.
-
-        The evidence is the owner's next frame number, and whether the sequence number and the time since boot of the
-        frame continue the owner's stream (None: unknown).
-        """
+    def _evidence(self, route: _Route, frame: Frame) -> _Evidence:
+        """Compare the sequence number and the time since boot of a frame with those expected of the route's owner."""
         sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0
@@ -309,15 +311,14 @@ class Routes:
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
             clock_matches = abs(boot_ms - expected_ms) <= tolerance_ms
-        return expected, sequence_matches, clock_matches
+        return _Evidence(expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         before, route.peer = route.peer, peer
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        for claim_key in [key for key in self._claims if key[0] == source]:
-            del self._claims[claim_key]
+        self._claims = {(claimed, by): claim for (claimed, by), claim in self._claims.items() if claimed != source}
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:

@@ -47,7 +47,7 @@ class SignatureGate:
         self.on_change: Callable[[], object] = lambda: None
         """Called when :attr:`is_open` may have changed."""
 
-    def use(self, signing: Signing | None) -> None:
+    def set_signing(self, signing: Signing | None) -> None:
         """Sign and verify with this key from now on (None: neither). Raises InvalidArgument with MAVLink 1."""
         check_signing(signing, self._encoder.version)
         self._encoder.signing = signing
@@ -90,7 +90,7 @@ class SignatureGate:
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
         if handover is not None and is_of_handover and handover.is_completed_by(frame, self._unix_time()):
             self._handover = None
-            self.use(handover.signing)
+            self.set_signing(handover.signing)
             handover.switched.set()
         signing = self._encoder.signing
         if signing is None:

@@ -229,7 +229,7 @@ class Core:
 
         return self.on(message_type, announce, *names)
 
-    def begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
+    def start_receiving(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving once the vehicle is connected (loop thread).
 
         The loop gets weak references only, so that a vehicle that the program drops can be garbage collected.

@@ -69,10 +69,10 @@ def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
     if not isinstance(mode, str) or not (mode.isupper() or mode == known_mode.name):
         raise KeyError(mode)
     # PX4 gets the base_mode that pymavlink would send.
-    return known_mode if autopilot.modes_are_numbered else known_mode.replace(base_mode=_px4_flags(known_mode.name))
+    return known_mode if autopilot.modes_are_numbered else known_mode.replace(base_mode=_px4_base_mode(known_mode.name))
 
 
-def _px4_flags(name: str) -> int:
+def _px4_base_mode(name: str) -> int:
     # pymavlink's MAV_MODE_FLAG for a mode. PX4 evaluates only the flag for custom modes.
     from pymavlink.mavutil import px4_map
 

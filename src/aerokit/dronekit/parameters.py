@@ -251,7 +251,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     def __getitem__(self, name: str) -> float:
         value = self.get(name)
         if value is None:
-            raise KeyError(_with_replacement(name.upper()) if isinstance(name, str) else name)
+            raise KeyError(_key_error_text(name.upper()) if isinstance(name, str) else name)
         return value
 
     def get(  # type: ignore[override]
@@ -401,7 +401,8 @@ def _upper_name(name: str) -> str:
     return name.upper()
 
 
-def _with_replacement(name: str) -> str:
+def _key_error_text(name: str) -> str:
+    """Return the name of an unknown parameter, and what has replaced the parameter, if known."""
     from aerokit.parameters.renames import replacement_of
 
     replacement = replacement_of(name)

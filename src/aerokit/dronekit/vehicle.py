@@ -259,7 +259,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving, in the same loop iteration in which the vehicle was found. Uses weak references only."""
         core = self._dk
-        core.begin(aio, tasks)
+        core.start_receiving(aio, tasks)
         self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
         self._handler.calls.describe = self._dk_describe
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
@@ -75,7 +75,7 @@ class Attachment:
         )
         self._is_full_reported = False
         self.counters: EndpointCounters = EndpointCounters(Counter())
-        self._former_totals = [0, 0, 0, 0]  # frames, bytes, lost frames and bad bytes from peers that are forgotten
+        self._totals_of_forgotten_peers = _Totals(0, 0, 0, 0)
         self._reported_refusals: set[str] = set()
         self._gateway: SigningGateway | None = None
         if endpoint.signing is not None:
@@ -98,10 +98,9 @@ class Attachment:
 
     def statistics(self) -> EndpointStatistics:
         router, ports = self._switch.router, tuple(self._ports.values())
-        totals = list(self._former_totals)
+        totals = self._totals_of_forgotten_peers
         for framer in self._peers:
-            totals = [total + count for total, count in zip(totals, _totals(framer), strict=True)]
-        frames_in, bytes_in, lost, bad_bytes = totals
+            totals = totals.plus(framer)
         systems: set[tuple[int, int]] = set()
         for port in ports:
             if port.node is not None:
@@ -114,12 +113,12 @@ class Attachment:
             address=self.link.address,
             is_open=self.is_open,
             peers=len(ports),
-            frames_in=frames_in,
-            bytes_in=bytes_in,
+            frames_in=totals.frames,
+            bytes_in=totals.bytes,
             frames_out=self.counters.frames_out,
             bytes_out=self.counters.bytes_out,
-            lost=lost,
-            bad_bytes=bad_bytes,
+            lost=totals.lost,
+            bad_bytes=totals.bad_bytes,
             waiting=sum(port.waiting for port in ports),
             dropped=dropped,
             systems=tuple(sorted(systems)),
@@ -251,9 +250,7 @@ class Attachment:
         """Remove the port of a peer. The counters of its framer stay in the endpoint's totals."""
         framer = self._peers.framers.get(peer)
         if framer is not None:
-            self._former_totals = [
-                total + count for total, count in zip(self._former_totals, _totals(framer), strict=True)
-            ]
+            self._totals_of_forgotten_peers = self._totals_of_forgotten_peers.plus(framer)
         self._guard.forget(peer)
         port = self._ports.pop(peer, None)
         self._guard.is_shared = len(self._ports) > 1
@@ -310,8 +307,19 @@ def _keep_unknown(framer: Framer) -> None:
     framer.keep_unknown = True
 
 
-def _totals(framer: Framer) -> tuple[int, int, int, int]:
-    """Return four counters of a framer: frames, bytes, lost frames and bad bytes."""
-    counters = framer.statistics
-    lost = sum(source.lost for source in counters.sources.values())
-    return counters.frames, counters.bytes, lost, counters.bad_bytes
+class _Totals(NamedTuple):
+    """Counters of received data, summed over framers."""
+
+    frames: int
+    bytes: int
+    lost: int
+    bad_bytes: int
+
+    def plus(self, framer: Framer) -> _Totals:
+        counters = framer.statistics
+        return _Totals(
+            self.frames + counters.frames,
+            self.bytes + counters.bytes,
+            self.lost + sum(source.lost for source in counters.sources.values()),
+            self.bad_bytes + counters.bad_bytes,
+        )

@@ -102,7 +102,7 @@ class MessageKind(Enum):
     TELEMETRY = "telemetry"
     """While it waits, newer telemetry with the same message id from the same sender replaces it."""
     TRANSFER = "transfer"
-    """Sent in order and never replaced, e.g. part of a transfer, an answer or a text."""
+    """Sent in order and never replaced, e.g. part of a transfer, an answer or a STATUSTEXT."""
     ORDER = "order"
     """A command: sent in order, but dropped after a second, so that it never arrives late."""
 

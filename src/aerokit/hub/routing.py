@@ -81,7 +81,7 @@ class RouterPort(Generic[PortT]):
         self.number: int = number
         """Unique number above 0."""
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
-        """Maps message id, target and sender (as one number) to the plan for such frames that arrive at this port."""
+        """Maps message id, target and sender (as one number) to the plan for frames that arrive at this port."""
         self.streams: dict[bytes, ForwardingPlan[PortT]] = {}
         """Maps sender and message, as bytes of a frame, to the plan for broadcasts of senders that this port reaches.
         """

@@ -111,9 +111,11 @@ def is_whole_frame(data: bytes) -> bool:
     """Return True if the bytes are one frame by their header and length. The checksum is not verified."""
     if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
         return False
-    if data[0] == MAGIC_V1:
-        return len(data) == data[1] + 8
-    return data[2] <= SIGNED and len(data) == data[1] + 12 + SIGNATURE_LENGTH * data[2]
+    magic, payload_length, flags = data[:3]
+    if magic == MAGIC_V1:
+        return len(data) == payload_length + 8
+    signature_length = SIGNATURE_LENGTH if flags == SIGNED else 0
+    return flags <= SIGNED and len(data) == payload_length + 12 + signature_length
 
 
 def x25_in_python() -> Callable[[bytes], int]:

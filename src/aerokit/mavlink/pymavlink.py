@@ -229,7 +229,7 @@ def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
         if message_class is None:
             continue
         if row is None:
-            return _checked(message_class, _decoder_for(message_class))
+            return _with_checksum_check(message_class, _decoder_for(message_class))
         crc_extra, *_ = row
         if message_class.crc_extra == crc_extra:
             return _decoder_for(message_class)
@@ -363,7 +363,7 @@ def _restored(message_class: Any, state: dict[str, Any]) -> Any:
 
 
 # -------------------------------------------------------------------------------- unknown messages
-def _checked(message_class: Any, decode: Decoder) -> Decoder:
+def _with_checksum_check(message_class: Any, decode: Decoder) -> Decoder:
     # The framer cannot verify the checksum of a message that the standard does not have. The program's dialect has the
     # message, so the checksum is verified here.
 

@@ -20,7 +20,7 @@ _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
 # After garbage, the search for the next record ignores times before the year 2000, because zeros in the header of a
-# frame look like such a time. Where a record is expected, such a time is accepted, because the computer's clock may
+# frame look like an early time. Where a record is expected, an early time is accepted, because the computer's clock may
 # have been wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp

@@ -140,12 +140,15 @@ _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000
 def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
     """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
-    # The slice of one letter is empty for a field that has none, and `_convert` takes the empty text for "not stored".
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         for letters in _ARDUPILOT.get(item.command, ("",)):
-            yield from _convert(letters[number : number + 1], value)
+            yield from _convert(_letter_at(letters, number), value)
     if storage in (ItemStorage.PX4, ItemStorage.ANY):
-        yield from _convert(_px4_letters(item)[number : number + 1], value)
+        yield from _convert(_letter_at(_px4_letters(item), number), value)
+
+
+def _letter_at(letters: str, number: int) -> str:
+    return letters[number] if number < len(letters) else "-"
 
 
 def _px4_letters(item: MissionItem) -> str:
@@ -157,7 +160,7 @@ def _px4_letters(item: MissionItem) -> str:
 
 def _convert(letter: str, value: float) -> Iterator[float]:
     """Yield the converted value. Yield nothing if the conversion overflows, because the result is undefined in C."""
-    if letter in ("", "-"):  # not stored
+    if letter == "-":  # not stored
         yield 0.0
     elif letter == "2":  # always 2
         yield 2.0

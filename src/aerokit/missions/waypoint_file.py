@@ -81,7 +81,7 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
 
     Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
     (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north. A .plan file
-    stores such values as null.
+    stores NaN as null.
 
     Raises:
         InvalidArgument: ``mission`` is no mission, a number is infinite, the altitude of a place is NaN, or the version

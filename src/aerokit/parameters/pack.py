@@ -85,7 +85,7 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
 
     Raises:
         RemoteProtocolError: the file is damaged, or its number of parameters differs from that in its header. ArduPilot
-            sends such a file once after its list has changed; download the file again.
+            sends a wrong number once, after its list has changed; download the file again.
     """
     magic, count, total = read_header(data)  # `total` also counts the parameters before `start`.
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:

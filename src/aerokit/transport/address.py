@@ -171,10 +171,10 @@ class _Parser:
             return LinkAddress("pty", path=text[len("pty:") :])
         scheme, after_scheme = self.split_scheme(text)
         if scheme in _SCHEMES:
-            return self.with_scheme(scheme, after_scheme)
+            return self.parse_with_scheme(scheme, after_scheme)
         if scheme:
             raise self.scheme_error(scheme)
-        return self.bare(text)
+        return self.parse_bare(text)
 
     def split_scheme(self, text: str) -> tuple[str, str]:
         """Return the scheme in lower case ("" if there is none), and the text after it."""
@@ -186,38 +186,38 @@ class _Parser:
             return match[1].lower(), match[2]
         return "", text
 
-    def with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
+    def parse_with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
         kind = _SCHEMES[scheme]
         target, _, query = after_scheme.partition("?")
-        options = self.options(kind, query)
+        options = self.parse_options(kind, query)
         if kind == "serial":
-            return self.serial(target, options, decode=True)
+            return self.parse_serial(target, options, decode=True)
         if kind == "replay":
             if scheme == "file" and re.match(r"/[a-z]:[/\\]", target, re.IGNORECASE):
                 target = target[1:]  # In file:///C:/…, the slash before a Windows drive is not part of the path.
-            return self.replay(_unquote(target), options)
+            return self.parse_replay(_unquote(target), options)
         if kind in _ZENOH_KINDS:
-            return self.zenoh(kind, target.removesuffix("/"), options)
-        return self.network(kind, target.removesuffix("/"), options)
+            return self.parse_zenoh(kind, target.removesuffix("/"), options)
+        return self.parse_network(kind, target.removesuffix("/"), options)
 
-    def bare(self, text: str) -> LinkAddress:
+    def parse_bare(self, text: str) -> LinkAddress:
         """Parse an address without a scheme: a recording, a serial port, or host:port to listen on."""
         if _RECORDING.fullmatch(text):
             end = text.lower().rindex(".tlog") + len(".tlog")
-            return self.replay(text[:end], self.options("replay", text[end + 1 :]))
+            return self.parse_replay(text[:end], self.parse_options("replay", text[end + 1 :]))
         if _DATAFLASH.fullmatch(text):
             raise self.error("this is a log in the autopilot's own format, not a MAVLink recording (.tlog)")
         if match := _WITHOUT_COLON.match(text):
             raise self.missing_colon_error(match[1].lower(), match[0], text)
         if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
-            return self.serial(text, {}, decode=False)
+            return self.parse_serial(text, {}, decode=False)
         if ":" not in text:
             raise self.error("it is neither host:port nor the path of a serial port or of a .tlog file")
         if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
             raise self.scheme_error(text.partition(":")[0])  # e.g. "upd:127.0.0.1:14550"
-        return self.network("udpin", text, {})
+        return self.parse_network("udpin", text, {})
 
-    def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+    def parse_network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
         """Parse the part of a network address after its scheme: ``host:port``."""
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
@@ -240,9 +240,9 @@ class _Parser:
             raise self.error("broadcast exists in IPv4 only")
         if not _is_ipv6(host) and not _HOST.fullmatch(host):
             raise self.error(f"{host!r} is not a host")
-        return LinkAddress(kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items())))
+        return LinkAddress(kind, host=host, port=self.parse_port(kind, tail), options=tuple(sorted(options.items())))
 
-    def zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+    def parse_zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
         """Parse the part of a zenoh address after its scheme: ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
@@ -262,19 +262,19 @@ class _Parser:
             raise self.error(str(error)) from None
         return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
 
-    def port(self, kind: LinkKind, tail: str) -> int:
+    def parse_port(self, kind: LinkKind, tail: str) -> int:
         """Parse the text after a host, which must be ``:port``."""
         if tail in ("", ":"):
             raise self.error("the port is missing")
         if not tail.startswith(":"):
             raise self.error(f"{tail!r} follows the host, not :port")
-        port = self.whole_number("the port", tail[1:])
+        port = self.parse_whole_number("the port", tail[1:])
         min_port = 0 if kind in _LISTENING else 1
         if not min_port <= port <= 65535:
             raise self.error(f"the port {port} is out of range ({min_port} to 65535)")
         return port
 
-    def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
+    def parse_serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
         """Parse a serial port and its baud rate. ``decode`` is True for an address with a scheme."""
         # In an address without a scheme, only the name of a COM port may be followed by a colon and the baud rate.
         # Other names may contain colons themselves.
@@ -290,17 +290,17 @@ class _Parser:
         device = _unquote(device) if decode else device
         if not device.strip("/"):
             raise self.error("the serial port is missing")
-        baud = None if baud_text is None else self.whole_number("the baud rate", baud_text)
+        baud = None if baud_text is None else self.parse_whole_number("the baud rate", baud_text)
         if baud == 0:
             raise self.error("the baud rate is 0")
         return LinkAddress("serial", device=device, baud=baud, options=tuple(sorted(options.items())))
 
-    def replay(self, path: str, options: dict[str, str]) -> LinkAddress:
+    def parse_replay(self, path: str, options: dict[str, str]) -> LinkAddress:
         if not path.strip():
             raise self.error("the path of the recording is missing")
         return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
 
-    def options(self, kind: LinkKind, query: str) -> dict[str, str]:
+    def parse_options(self, kind: LinkKind, query: str) -> dict[str, str]:
         options: dict[str, str] = {}
         allowed = _OPTIONS.get(kind, ())
         if kind not in _NEVER_COSTLY:
@@ -317,14 +317,14 @@ class _Parser:
                 if not options[key]:
                     raise self.error(f"{key}= is empty")
             else:
-                options[key] = self.option_value(key, value.strip().lower())
+                options[key] = self.checked_option(key, value.strip().lower())
         # An option with its default value is left out, so that equal links have equal addresses.
         defaults = (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 
-    def option_value(self, key: str, value: str) -> str:
+    def checked_option(self, key: str, value: str) -> str:
         """Check the value of an option, and return its canonical form."""
-        if key == "baud":  # `serial` checks the number.
+        if key == "baud":  # `parse_serial` checks the number.
             return value
         if key in _CHOICES:
             if value not in _CHOICES[key]:
@@ -342,7 +342,7 @@ class _Parser:
             raise self.error(f"{key}={value} is not a number above 0")
         return repr(number).removesuffix(".0")
 
-    def whole_number(self, what: str, text: str) -> int:
+    def parse_whole_number(self, what: str, text: str) -> int:
         if not (text.isascii() and text.isdigit() and len(text) <= 9):
             raise self.error(f"{what} {text!r} is not a whole number")
         return int(text)

@@ -51,7 +51,7 @@ class OrderRefusalListener(Receiver, Protocol):
         """Called when a message with this name was not forwarded to the vehicle.
 
         ``lease_holder`` is the client that has control, if its control is the reason. ``answers`` are the frames by
-        which a vehicle would reject the command, if there are such frames.
+        which a vehicle would reject the command; empty if there are none.
         """
 
 

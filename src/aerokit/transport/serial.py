@@ -42,7 +42,7 @@ _MAX_BUFFER_S = 2.0  # The write buffer holds data for this time. Older data wou
 
 
 class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
-    """An invalid connection string. It is also a SerialException, which pymavlink raises for such a string."""
+    """An invalid connection string. It is also a SerialException, which pymavlink raises for it."""
 
 
 class SerialLink(BaseLink):

@@ -196,7 +196,8 @@ class UdpListen(_UdpLink):
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
         if source != self._last_source:  # Consecutive datagrams of one sender are checked once, to save time.
-            if source not in self._peers and not self._allowed.allows(source[0]):
+            host, *_ = source
+            if source not in self._peers and not self._allowed.allows(host):
                 return
             self._last_source = source
             if not self._keeps_peers:
@@ -283,8 +284,9 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         # Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames
         # before it accepts the port by `keep_peer`.
-        is_same_host = self._keeps_peers and self._remote is not None and source[0] == self._remote[0]
-        return (is_same_host or self._is_remote_silent()) and self._allowed.allows(source[0])
+        host, *_ = source
+        is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
+        return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 
 
 class _DatagramProtocol(asyncio.DatagramProtocol):

@@ -99,7 +99,7 @@ class Copies:
             self._current.is_accepted = True
 
 
-# After a switch to another link, answers to earlier requests may still arrive over the former link for this time.
+# After a switch to another link, answers to earlier requests may still arrive over the previous link for this time.
 ANSWER_TIMEOUT_S = 3.0
 
 # A component counts as reachable over a link until it has sent nothing over this link for this time.
@@ -186,7 +186,7 @@ class MergedStreams:
         if candidate is not None and not choice.may_be_used(candidate):
             return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
-            return False  # This telemetry may be older than the last telemetry that the former link delivered.
+            return False  # This telemetry may be older than the last telemetry that the previous link delivered.
         if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):
@@ -227,7 +227,7 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
     # request that was sent before the switch to the link in use.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S
     is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
-    return not is_on_used_link or (is_answer and candidate is choice.former and is_after_change)
+    return not is_on_used_link or (is_answer and candidate is choice.previous and is_after_change)
 
 
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:

@@ -97,7 +97,7 @@ class LinkProbes:
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes over any link. Record such an answer."""
+        """Return True if this TIMESYNC answers one of our probes over any link, and record the answer."""
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
         if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:
@@ -132,7 +132,7 @@ class LinkProbes:
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
         """Return the seconds since the probe; None if the probe was sent to another system, or over another link."""
-        probed_system, probed_link, sent_at = self._pending.get(answer.ts1, (0, 0, 0.0))
+        probed_system, probed_link, sent_at = self._pending[answer.ts1]
         if (probed_system, probed_link) != (system_id, link):
             return None
         del self._pending[answer.ts1]

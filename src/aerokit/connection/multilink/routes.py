@@ -334,14 +334,14 @@ class MultiLinkRoutes:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
-            name, former = self._link.names[used.link], self._link.names[before.link]
+            name, previous = self._link.names[used.link], self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
             log(
                 "system %d: switched to %s, because %s is %s",
                 system_id,
                 name,
-                former,
-                _DISADVANTAGE_OF_FORMER.get(reason, reason),
+                previous,
+                _DISADVANTAGE_OF_PREVIOUS.get(reason, reason),
             )
         self._bus.publish(
             LinkSelected(
@@ -361,8 +361,8 @@ class MultiLinkRoutes:
                 self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)
 
 
-# Maps the reason for a switch, which describes the new link, to the word that describes the former link in the log.
-_DISADVANTAGE_OF_FORMER = {"better": "worse", "cheaper": "costly"}
+# Maps the reason for a switch, which describes the new link, to the word that describes the previous link in the log.
+_DISADVANTAGE_OF_PREVIOUS = {"better": "worse", "cheaper": "costly"}
 
 
 def _link_index(peer: Peer) -> int:

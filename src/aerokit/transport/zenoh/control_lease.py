@@ -241,7 +241,7 @@ def _decoded(frame: Frame) -> Message | None:
 
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
-    """Return the frames by which a vehicle would reject a message. Empty for broadcasts, or without such frames."""
+    """Return the frames by which a vehicle would reject a message. Empty if it is a broadcast or needs no answer."""
     fields: object = message  # The type is `object`, because the class Message does not declare these fields.
     system: int = getattr(fields, "target_system", 0)
     # A message for all components (0) is answered by the autopilot (1).
@@ -320,7 +320,10 @@ class FreshnessChecker:
         return oldest_number <= stamp.beacon <= newest_number
 
     def _expire(self, now: float) -> None:
-        while self._sent and now - self._sent[0][1] > MAX_DELAY_S:
+        while self._sent:
+            _, sent_at = self._sent[0]
+            if now - sent_at <= MAX_DELAY_S:
+                return
             self._sent.popleft()
 
 

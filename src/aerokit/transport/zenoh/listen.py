@@ -33,7 +33,7 @@ from aerokit.transport.zenoh.session import (
 )
 
 MAX_CLIENTS = 64
-"""Maximum number of clients. A further one is ignored unless a client has been silent for `CLIENT_TIMEOUT_S`."""
+"""Maximum number of clients. A new client is then ignored, unless a client has been silent for `CLIENT_TIMEOUT_S`."""
 
 CLIENT_TIMEOUT_S = 30.0
 """A client may be replaced by a new client after this silence."""
