@@ -345,7 +345,7 @@ class LinkChoice:
         """Use this link from now on; return ``reason``."""
         previous = self.used
         if previous is not None:
-            # Before `fresh_after`, telemetry over the new link may be older than the last telemetry of the previous one.
+            # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
             self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
             # A link is chosen only if it leads to the same vehicle as the previous link. The choice therefore also
