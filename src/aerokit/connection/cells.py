@@ -95,10 +95,10 @@ class StateCell(Generic[T]):
         self._latest: T | None = None
         self._source: Source | None = None
         self._updated_at = -math.inf
-        self._arrivals = 0
-        self._changes = 0
+        self._arrivals = 0  # number of values set so far
+        self._changes = 0  # number of values that differed from the value before
         self._sinks: list[_Sink[T]] = []
-        self._followers = 0
+        self._followers = 0  # number of iterators
         self._feeds: tuple[Feed, ...] = ()
         self._close_error: BaseException | None = None
 

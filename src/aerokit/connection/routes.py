@@ -70,7 +70,8 @@ class RouteClaim:
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
-            self._sequence_matches, self._clock_matches = sequence_matches, None
+            self._sequence_matches = sequence_matches
+            self._clock_matches = None
             self._claimed_at = frame.received_at
         self._frames += 1
         # A mismatch of the clock is final. Otherwise another sender could try often enough until a frame matches by

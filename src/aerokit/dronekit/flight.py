@@ -140,15 +140,15 @@ class FlightMethods(VehicleAttributes):
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
-        send = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
+        order_take_off = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
         if not aio.autopilot.repositions_amsl:  # ArduPilot: altitude above home; the command does not change the mode
             params = (0, 0, 0, 0, 0, 0, altitude)
-            return send((), MavCmd.NAV_TAKEOFF, *params)
+            return order_take_off((), MavCmd.NAV_TAKEOFF, *params)
         plan = aio.autopilot.take_off(altitude, self._dk_known_home().alt, is_vtol=aio.is_vtol)
         mode = aio.autopilot.mode_for("take_off")
         if plan is None or plan.command is None or mode is None:
             raise APIException("simple_takeoff: this vehicle has no take-off command")
-        return send((mode,), plan.command, *plan.params)
+        return order_take_off((mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None) -> None:
         """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`.

@@ -125,7 +125,7 @@ class ListenerThread:
             except BaseException:  # including SystemExit, which would end only this thread, not the program
                 logger.exception("Exception in a callback")
             self.on_called()
-            del function, args  # the thread would keep_alive them alive until the next call
+            del function, args  # the thread would keep them alive until the next call
 
 
 class _Thread(threading.Thread):

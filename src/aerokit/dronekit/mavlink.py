@@ -221,10 +221,7 @@ def _open(
                 is_last_attempt = attempt == MAX_OPEN_ATTEMPTS - 1
                 was_refused = isinstance(error.__context__, ConnectionRefusedError)
                 if is_last_attempt or not was_refused:
-                    classic_error = _classic_error(error)
-                    if classic_error is error:
-                        raise
-                    raise classic_error from error
+                    raise _classic_error(error)
                 time.sleep(RETRY_INTERVAL_S)
         raise AssertionError("unreachable: the last attempt returns or raises")
     except BaseException:
@@ -258,11 +255,15 @@ def _check_address(ip: object) -> None:
 def _classic_error(error: LinkOpenError) -> Exception:
     """Convert a failure to open a link to an exception of the operating system's type, which programs catch."""
     cause = error.__context__
+    classic: Exception
     if isinstance(cause, OSError):
-        return type(cause)(str(error)) if cause.errno is None else type(cause)(cause.errno, str(error))
-    if isinstance(cause, ValueError):  # raised by pyserial for an unsupported baud rate
-        return ValueError(str(error))
-    return error
+        classic = type(cause)(str(error)) if cause.errno is None else type(cause)(cause.errno, str(error))
+    elif isinstance(cause, ValueError):  # raised by pyserial for an unsupported baud rate
+        classic = ValueError(str(error))
+    else:
+        return error
+    classic.__cause__ = error
+    return classic
 
 
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:

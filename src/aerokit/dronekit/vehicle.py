@@ -260,7 +260,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         """Start receiving, in the same loop iteration in which the vehicle was found. Uses weak references only."""
         core = self._dk
         core.start_receiving(aio, tasks)
-        self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
+        self._handler.vehicle = self
+        self._handler.note_sent = aio.note_sent
         self._handler.calls.describe = self._dk_describe
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
         # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.
@@ -287,8 +288,9 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         deadline = next_value_deadline = now + FIRST_VALUES_TIMEOUT_S
         missing_before = names
         while (missing := names - ready.names) and now < min(deadline, next_value_deadline):
-            if missing < missing_before:  # at least one more value has arrived (`<` means: a proper subset)
-                missing_before, next_value_deadline = missing, now + NEXT_VALUE_TIMEOUT_S
+            if len(missing) < len(missing_before):  # at least one more value has arrived
+                missing_before = missing
+                next_value_deadline = now + NEXT_VALUE_TIMEOUT_S
             ready.wait_for_change(names, min(deadline, next_value_deadline) - now)
             now = time.monotonic()
 

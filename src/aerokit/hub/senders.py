@@ -91,9 +91,8 @@ class Sender:
         """Record a frame at another port than `port_number`. Return True if the routes to the sender change."""
         is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
-        if (
-            now - self.received_at > ROUTE_TIMEOUT_S
-        ):  # The sender is silent at `port_number`: messages go to the new port.
+        if now - self.received_at > ROUTE_TIMEOUT_S:
+            # The sender is silent at its present port, so messages go to the new port.
             self.ports[self.port_number] = self.received_at
             self.port_number, self.received_at = number, now
             return True

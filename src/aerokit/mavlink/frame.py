@@ -51,11 +51,12 @@ class Frame(FrameFields):
         frame = cls()
         frame._raw = raw
         frame.received_at = received_at
-        payload_end = raw[1] + (6 if raw[0] == MAGIC_V1 else 10)
+        magic, payload_length = raw[:2]
+        payload_end = payload_length + (6 if magic == MAGIC_V1 else 10)
         frame.checksum = int.from_bytes(raw[payload_end : payload_end + 2], "little")
-        if raw[0] == MAGIC_V1:
-            # `body` always has the header layout of MAVLink 2, so the MAVLink 1 header is converted.
-            frame.body = bytes((raw[1], 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
+        if magic == MAGIC_V1:
+            # `body` always has the header layout of MAVLink 2: the flags and the upper bytes of the message id are 0.
+            frame.body = bytes((payload_length, 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
         else:
             frame.body = raw[1:payload_end]
         frame.system_id, frame.component_id = frame.body[4:6]

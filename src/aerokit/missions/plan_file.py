@@ -108,7 +108,7 @@ def format_plan(plan: Plan | Mission) -> str:
 
 
 def _document(plan: Plan) -> dict[str, Any]:
-    """Return the JSON object of a file: that of ``plan.source``, in which only the changed parts are replaced."""
+    """Return the JSON object of a file: the object in ``plan.source``, in which only changed parts are replaced."""
     document: dict[str, Any]
     if plan.source:
         document, old = json.loads(plan.source), parse_plan(plan.source)

@@ -88,7 +88,7 @@ class LinkProbes:
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = system_id, candidate.link, now
-        self._send(m.Timesync(0, ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
+        self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             request = m.CommandLong(
                 system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),

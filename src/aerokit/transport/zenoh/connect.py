@@ -166,7 +166,9 @@ class ZenohConnect(NetworkLink):
 
     def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
         if not is_put:  # A vehicle side that closes deletes its beacon.
-            closed_epoch, _ = decode_sent_at(attachment) or (None, 0.0)
+            closed_epoch = None
+            if (sent_at := decode_sent_at(attachment)) is not None:
+                closed_epoch, _ = sent_at
             if closed_epoch is not None and closed_epoch == self._tracker.epoch:
                 self._tracker.reset()
                 self._lose("the vehicle side was closed")
