@@ -221,7 +221,7 @@ def _open(
                 is_last_attempt = attempt == MAX_OPEN_ATTEMPTS - 1
                 was_refused = isinstance(error.__context__, ConnectionRefusedError)
                 if is_last_attempt or not was_refused:
-                    raise _classic_error(error)
+                    raise _classic_error(error)  # noqa: B904 - `error` already is its cause
                 time.sleep(RETRY_INTERVAL_S)
         raise AssertionError("unreachable: the last attempt returns or raises")
     except BaseException:
