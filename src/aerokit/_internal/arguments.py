@@ -173,10 +173,8 @@ def _hint(check: Check, value: object) -> str:
 def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
     """Return the rule of an annotation. ``module_globals`` are the globals of the module that has the annotation."""
     if isinstance(node, ast.BinOp):
-        (is_left, left_text), (is_right, right_text) = (
-            _rule(node.left, module_globals),
-            _rule(node.right, module_globals),
-        )
+        is_left, left_text = _rule(node.left, module_globals)
+        is_right, right_text = _rule(node.right, module_globals)
         return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
     if isinstance(node, ast.Constant):  # None is the only constant in our annotations.
         return _SIMPLE["None"]

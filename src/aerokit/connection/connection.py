@@ -401,7 +401,7 @@ class Connection:
     def fail(self, error: Exception) -> None:
         """Close the connection because of an internal error of aerokit, which becomes the cause of raised errors."""
         if not self.is_open and isinstance(error, AerokitError):
-            return  # a background task failed only because the connection was closed before
+            return  # A background task failed only because the connection was closed before.
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
         closed = ConnectionClosed(f"an internal error of aerokit closed the connection: {error!r}")
         closed.__cause__ = error
@@ -508,7 +508,7 @@ class Connection:
     def _end(self, error: Exception) -> None:
         if not self.is_open:
             return
-        self._end_signal.error = error  # first, so that sinks of the following events find the connection closed
+        self._end_signal.error = error  # Set first, so that sinks of the following events find the connection closed.
         self._receiver.close()
         # Only a lost link is published as an event: a program that closes the connection itself needs none.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))

@@ -70,7 +70,7 @@ class Locations(HasObservers, LocationPrivates):
         if message is None:
             return LocationGlobal(None, None, None)
         latitude, longitude = _position_of(message)
-        if message.alt == 0 and not self._has_altitude:  # the vehicle may send 0 for an unknown altitude
+        if message.alt == 0 and not self._has_altitude:  # The vehicle may send 0 for an unknown altitude.
             return LocationGlobal(latitude, longitude, None)
         return LocationGlobal(latitude, longitude, message.alt / 1000.0)
 
@@ -227,7 +227,8 @@ class VehicleAttributes(VehicleCore):
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
         aio = self._dk.aio_or_none
-        if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4, whose checks are a bit of SYS_STATUS
+        if aio is not None and aio.autopilot.prearm_depends_on_mode:
+            # On PX4, a bit of SYS_STATUS has the result of the checks.
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         # Like DroneKit: any fix (2D or better), and a predicted position of the estimator.
@@ -258,7 +259,7 @@ class VehicleAttributes(VehicleCore):
     # ----------------------------------------------------------------------------- receiving
 
     def _dk_on_heartbeat(self, message: m.Heartbeat) -> None:
-        if not is_autopilot(message):  # sent by a ground station or companion that uses the autopilot's ids
+        if not is_autopilot(message):  # A ground station or companion may use the autopilot's ids.
             return
         self._handler.match_mavlink_version(message)
         self._dk_heartbeat = message

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Attributes that `wait_ready(True)` waits for.
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 
-WAIT_STEP_S = 0.2  # longer waits are split into steps, so that Ctrl-C and a lost link end them
+WAIT_STEP_S = 0.2  # Ctrl-C and a lost link end a wait after this time.
 SILENCE_WARNING_S = 5
 TICK_INTERVAL_S = 0.05
 IDLE_TICK_INTERVAL_S = 1.0
@@ -236,7 +236,7 @@ class Core:
         """
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # creates the object now, so that it receives each PARAM_VALUE before our handlers do
+        _ = aio.parameters  # This creates the object, so that it gets each PARAM_VALUE before our handlers.
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
@@ -251,7 +251,7 @@ class Core:
         is_silent = age > SILENCE_WARNING_S
         if is_silent != self._is_silent:
             self._is_silent = is_silent
-            post = self.handler.listener_thread.post  # not on the loop, because the program's log handlers may block
+            post = self.handler.listener_thread.post  # The loop does not log, because the log handlers may block.
             if is_silent:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:
@@ -367,7 +367,7 @@ class VehicleCore(HasObservers):
                 return False
             self._dk.check_link()
             if (failure := ready.failure_of(missing)) is not None:
-                if raise_exception:  # a new exception, because several threads may raise it
+                if raise_exception:  # Several threads may raise it, so each raises a copy.
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
             for name in ready.fetchers.keys() & missing:

@@ -185,7 +185,7 @@ class FlightMethods(VehicleAttributes):
         # Autopilots without reposition modes take the altitude above home.
         target = self._dk_target(location, is_relative=not modes)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
-            flight_orders.check_speed(name, speed)  # before anything is sent
+            flight_orders.check_speed(name, speed)  # Raises before anything is sent.
         if modes and self._flightmode not in map(str, modes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
@@ -344,7 +344,7 @@ class FlightMethods(VehicleAttributes):
                 return True
             # Calls is_done again, because the effect may have been reported between the first call and the failure.
             if order.done() and order.exception() is not None and not is_done():
-                self._dk.check_link()  # raises if the link is lost, which is the more useful error
+                self._dk.check_link()  # If the link is lost, this raises a more useful error.
                 raise TimeoutError(f"{failure_text}: {order.exception()}") from order.exception()
             return False
 

@@ -63,7 +63,7 @@ def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
     try:
         known_mode = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
     except InvalidArgument as error:
-        raise KeyError(mode) from error  # the cause's text lists the available modes
+        raise KeyError(mode) from error  # The text of the cause lists the available modes.
     except (AttributeError, TypeError):  # `mode` is not a string
         raise KeyError(mode) from None
     if not isinstance(mode, str) or not (mode.isupper() or mode == known_mode.name):
@@ -107,7 +107,7 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
         with vehicle.posted(*topics, armed=value) as order:
             await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
             await order.wait_confirmed(ARMED_TIMEOUT_S)
-    except CommandRejected:  # the vehicle certainly does not execute the command
+    except CommandRejected:  # The vehicle certainly does not execute the command.
         raise
     except (OperationRejected, OperationTimeout) as error:
         error.args = (f"{error}; the vehicle may still execute the command, which is not monitored any more",)
@@ -254,7 +254,7 @@ class CurrentCommand:
         # MISSION_SET_CURRENT was not confirmed in time, so a command, which the vehicle acknowledges, sets the item.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:  # home, for which mission.set_current() has no number: its 0 is the first item after home
+        if seq == 0:  # 0 is home, for which `mission.set_current` has no number: its 0 is the first item after home.
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)

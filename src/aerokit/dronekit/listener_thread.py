@@ -97,7 +97,7 @@ class ListenerThread:
         with self._lock:
             self.is_stopped = True
         self._kept_alive.clear()
-        self._calls.put((_nothing, ()))  # wakes the thread, which then notices `is_stopped`
+        self._calls.put((_nothing, ()))  # This wakes the thread, which then notices `is_stopped`.
 
     def join(self) -> None:
         """Wait until the thread has ended, at most two seconds, because a callback may block."""
@@ -110,7 +110,7 @@ class ListenerThread:
                 thread = _Thread(target=self._run, name=self._name, daemon=True)
                 try:
                     thread.start()
-                except RuntimeError:  # the interpreter is shutting down
+                except RuntimeError:  # The interpreter is shutting down.
                     self.is_stopped = True
                 else:
                     self._thread = thread
@@ -122,10 +122,10 @@ class ListenerThread:
                 return
             try:
                 function(*args)
-            except BaseException:  # including SystemExit, which would end only this thread, not the program
+            except BaseException:  # SystemExit, too, would end only this thread, not the program.
                 logger.exception("Exception in a callback")
             self.on_called()
-            del function, args  # the thread would keep them alive until the next call
+            del function, args  # Without this, the thread would keep them alive until the next call.
 
 
 class _Thread(threading.Thread):

@@ -169,7 +169,7 @@ class MAVConnection(ClassicConnection):
         for listener in tuple(listeners):
             try:
                 listener(self, *args)
-            except BaseException:  # including SystemExit, which would end only the listener thread
+            except BaseException:  # SystemExit, too, would only end the listener thread.
                 logger.exception("Exception in a listener of the connection")
 
     def write_frame(self, frame: Frame) -> None:

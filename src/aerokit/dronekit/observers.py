@@ -96,7 +96,7 @@ class Listeners:
             self.deliver(name, value)
         elif waits:
             self._thread.call(self.deliver, name, value)
-        elif cache:  # post_or_drop() could drop the call, but a change must not be lost
+        elif cache:  # A change must not be lost, so the call may not be dropped.
             self._thread.post(self.deliver, name, value)
         else:
             self._thread.post_or_drop(self.deliver, name, value)
@@ -114,7 +114,7 @@ class Listeners:
             for listener in self.by_name.get(name, ()):
                 try:
                     listener(self._owner, attr_name, value)
-                except BaseException:  # including SystemExit, which would end only the listener thread
+                except BaseException:  # SystemExit, too, would only end the listener thread.
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:
@@ -193,7 +193,7 @@ class MessageListeners(Listeners):
 
     def add(self, name: str, listener: AttributeListener) -> None:
         """Add a listener for every message of this name, or for every message (``'*'``)."""
-        _pymavlink()  # imported here, because the 60 ms would delay reception at the first message
+        _pymavlink()  # The import takes 60 ms, which would delay the first message.
         super().add(str(name), listener)
         self._attach_now()
 
@@ -214,7 +214,7 @@ class MessageListeners(Listeners):
         if self._handler.loop.is_current:
             self._attach()
         else:
-            with contextlib.suppress(AerokitError):  # the connection may be closed
+            with contextlib.suppress(AerokitError):  # The connection may be closed.
                 # Blocks until attached, so that no message is missed after add() has returned.
                 self._handler.loop.call(self._attach)
 

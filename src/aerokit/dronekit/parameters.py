@@ -178,7 +178,7 @@ class ParameterValues:
         """Store a parameter; return True if it is new or changed."""
         name, previous = parameter.name, self._parameters.get(parameter.name)
         if previous is None and len(self._parameters) >= MAX_PARAMETERS:
-            return False  # limits memory, because a sender can make up names
+            return False  # A sender can make up names, so their number is limited.
         if previous is None and name != name.upper():
             self._spelling_of_upper[name.upper()] = name
         self._parameters[name] = parameter
@@ -320,7 +320,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if resolved is not None:
             vehicle_name = resolved.name
             if resolved.renamed is not None:
-                converted = resolved.renamed.to_vehicle(number)  # set_parameter converts to integers
+                converted = resolved.renamed.to_vehicle(number)  # `set_parameter` converts it to an integer if needed.
                 warn_of_rename(resolved.renamed)
         core = self._core
         if retries <= 0:
@@ -347,7 +347,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        is_settled = self._is_settled  # read before find(), because the last value may arrive in between
+        is_settled = self._is_settled  # Read before `find`: the last value may arrive in between.
         resolved = self._values.find(name)
         if resolved is None and waits and not is_settled and _is_valid_name(name):
             self._core.run(self._wait_for, name)

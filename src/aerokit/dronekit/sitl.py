@@ -71,7 +71,7 @@ class ServedVehicle:
 
     def stop(self) -> None:
         if self._thread.is_alive():
-            with suppress(RuntimeError):  # the loop may have just ended
+            with suppress(RuntimeError):  # The loop may have just ended.
                 self._loop.call_soon_threadsafe(self._stop_requested.set)
             self._thread.join()
 
@@ -82,7 +82,7 @@ class ServedVehicle:
         try:
             self._loop.run_until_complete(self._serve())
         except Exception as error:
-            if self._startup_ended.is_set():  # otherwise __init__ raises the error
+            if self._startup_ended.is_set():  # Otherwise `__init__` raises the error.
                 errprinter(f"the simulated vehicle failed: {error!r}")
             self._error = error
         finally:
@@ -204,7 +204,7 @@ def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
     if (lat is None) != (lon is None):
         raise InvalidArgument("dronekit_sitl.start_default needs either both lat and lon or neither")
     sitl = SITL()
-    heading_deg = 353  # required by the format of SITL's --home, but ignored
+    heading_deg = 353  # The format of SITL's --home requires a heading, which is ignored.
     sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},{heading_deg}"])
     return sitl
 

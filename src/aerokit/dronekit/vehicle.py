@@ -218,7 +218,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
         timeout = heartbeat_limit_s or CONNECT_TIMEOUT_S
         with self._dk_initializing:
-            if self._dk.aio_or_none is not None:  # already connected by an earlier call
+            if self._dk.aio_or_none is not None:  # An earlier call has connected it.
                 self._dk_wait_until_booted(timeout)
                 return
             self._dk.heartbeat_limit_s = heartbeat_limit_s
@@ -288,7 +288,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         deadline = next_value_deadline = now + FIRST_VALUES_TIMEOUT_S
         missing_before = names
         while (missing := names - ready.names) and now < min(deadline, next_value_deadline):
-            if len(missing) < len(missing_before):  # at least one more value has arrived
+            if len(missing) < len(missing_before):  # Another value has arrived.
                 missing_before = missing
                 next_value_deadline = now + NEXT_VALUE_TIMEOUT_S
             ready.wait_for_change(names, min(deadline, next_value_deadline) - now)
@@ -397,7 +397,7 @@ def connect(
             heartbeat=heartbeat,
         )
     except (OSError, ValueError, KeyboardInterrupt) as error:
-        raise error.with_traceback(None) from None  # frames of this package do not help the user
+        raise error.with_traceback(None) from None  # Frames of this package do not help the user.
     handler.overrides.is_enabled = release_overrides
     try:
         vehicle = cast("VehicleT", Vehicle(handler)) if vehicle_class is None else vehicle_class(handler)

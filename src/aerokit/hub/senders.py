@@ -195,7 +195,6 @@ class IdentityGuard:
             ids = event.system_id, event.component_id
             if event.at - self._reported_at.get(ids, -math.inf) > REPEAT_EVENT_S:
                 self._reported_at[ids] = event.at
-                text = (
-                    f"frames as {event.system_id}/{event.component_id} are dropped, because another peer has these ids"
-                )
+                sender = f"{event.system_id}/{event.component_id}"
+                text = f"frames as {sender} are dropped, because another peer has these ids"
                 self._report("duplicate_sender", self._current_peer, text)

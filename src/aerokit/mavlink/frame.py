@@ -28,7 +28,7 @@ class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
     # For speed, there is no constructor: the framer sets the attributes directly. Properties compute all other values.
-    if not TYPE_CHECKING:  # type checkers see the attributes of the base class
+    if not TYPE_CHECKING:  # Type checkers see the attributes of the base class.
         __slots__ = ()
 
     body: bytes
@@ -66,7 +66,7 @@ class Frame(FrameFields):
     @property
     def raw(self) -> bytes:
         """The whole frame, from the magic byte to the checksum or signature."""
-        raw: bytes | None = getattr(self, "_raw", None)  # twice as fast as catching AttributeError
+        raw: bytes | None = getattr(self, "_raw", None)  # This is twice as fast as catching AttributeError.
         return b"\xfd" + self.body + self.checksum.to_bytes(2, "little") if raw is None else raw
 
     @property

@@ -295,7 +295,7 @@ class PythonFramer:
         """Return (verdict, end, frame if valid) for the magic byte at ``begin``."""
         size = len(data)
         if data[begin] == MAGIC_V2:
-            if size - begin < 3:  # the flags have not arrived yet
+            if size - begin < 3:  # The flags have not arrived yet.
                 return _WAIT, begin + 3, None
             if size - begin < _MIN_LENGTH_V2:
                 are_flags_known = data[begin + 2] <= SIGNED

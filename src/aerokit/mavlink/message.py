@@ -213,7 +213,7 @@ class Message:
     Messages are equal if their classes and fields are; NaN equals NaN.
     """
 
-    if not TYPE_CHECKING:  # type checkers take a slot for a class attribute of the same name
+    if not TYPE_CHECKING:  # Type checkers take a slot for a class attribute of the same name.
         __slots__ = ("received_frame",)
         __match_args__ = ()  # overridden by each class, and inferred by type checkers, for `match`
     __hash__: ClassVar[None]  # type: ignore[assignment]

@@ -77,9 +77,8 @@ class MultiLink(Link):
         # For each link, the peers that the receiver keeps. After a reopening, `keep_peer` is called again for them.
         self._kept: list[set[Peer]] = [set() for _ in self._links]
         self._openings: set[asyncio.Task[None]] = set()
-        self._foreign: set[int] = (
-            set()
-        )  # indices of links that another connection has opened, and that must not be closed here
+        # Indices of links that another connection has opened, and that must not be closed here.
+        self._foreign: set[int] = set()
         self._is_opening = False
         self._last_loss: LinkLost | None = None
         self._lost_at: float | None = None

@@ -134,7 +134,7 @@ class ReconnectingLink(Link):
         try:
             await self._link.open(current)
         except BaseException:
-            self._cancel_reopening()  # running if the link was lost while it was being opened
+            self._cancel_reopening()  # It is running if the link was lost while it was being opened.
             self._receiver = self._current = self._lost_at = None
             self._was_opened = False
             raise

@@ -33,7 +33,7 @@ async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketA
     """
     try:
         results = socket.getaddrinfo(host, port, type=kind, flags=socket.AI_NUMERICHOST)
-    except socket.gaierror:  # the host is a name, not an IP address
+    except socket.gaierror:  # The host is a name, not an IP address.
         results = await asyncio.get_running_loop().getaddrinfo(host, port, type=kind)
     addresses = [SocketAddress(family, address) for family, _, _, _, address in results]
     return sorted(addresses, key=lambda address: address.family != socket.AF_INET)

@@ -200,7 +200,7 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
 
     try:
         future = asyncio.get_running_loop().run_in_executor(None, work)
-    except RuntimeError:  # the loop is closed or closing
+    except RuntimeError:  # The loop is closed or closing.
         work()
         closed()
     else:
