@@ -27,8 +27,8 @@ _BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 CLAIM_MIN_FRAMES = 3
 
 
-class _Evidence(NamedTuple):
-    """What a frame of another peer proves. True if it continues the owner's stream, None if unknown."""
+class Evidence(NamedTuple):
+    """Evidence in a frame of another peer: True if it continues the stream of the owner, None if unknown."""
 
     expected: int  # the owner's next frame number
     sequence_matches: bool | None
@@ -63,7 +63,7 @@ class RouteClaim:
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
 
-    def add(self, frame: Frame, evidence: _Evidence) -> None:
+    def add(self, frame: Frame, evidence: Evidence) -> None:
         """Add a frame of the peer, and what it proves."""
         expected, sequence_matches, clock_matches = evidence
         if expected != self._expected:  # The owner has sent frames since the last call, so the claim starts again.
@@ -289,7 +289,7 @@ class Routes:
             claim = self._claims[key] = RouteClaim()
         return claim
 
-    def _evidence(self, route: _Route, frame: Frame) -> _Evidence:
+    def _evidence(self, route: _Route, frame: Frame) -> Evidence:
         """Compare the sequence number and the time since boot of a frame with those expected of the route's owner."""
         sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
@@ -312,7 +312,7 @@ class Routes:
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
             clock_matches = abs(boot_ms - expected_ms) <= tolerance_ms
-        return _Evidence(expected, sequence_matches, clock_matches)
+        return Evidence(expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         before, route.peer = route.peer, peer

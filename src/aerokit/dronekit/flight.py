@@ -321,7 +321,8 @@ class FlightMethods(VehicleAttributes):
             altitude: float | None = frame.alt
             if altitude is None:
                 return False
-            start = altitude if start is None else start
+            if start is None:
+                start = altitude
             has_passed = start < alt <= altitude or altitude <= alt < start  # on the way up, or down
             return abs(altitude - alt) <= epsilon or has_passed
 

@@ -120,7 +120,8 @@ def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
         texts[-1] += " "
     wrapped: list[str] = []
     for number, text in enumerate(texts):
-        wrapped += [""] if number else []
+        if number:  # An empty line separates paragraphs.
+            wrapped.append("")
         wrapped += textwrap.wrap(text, _WIDTH - len(indent) - 6, break_long_words=False, break_on_hyphens=False)
     if len(wrapped) == 1:
         return [f'{indent}"""{wrapped[0]}"""']
