@@ -200,7 +200,8 @@ class Bus:
             kind = MESSAGE
         else:
             kind = BOTH
-        plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
+        plan = kind, tuple(sink for _, sink in entries)
+        self._plans[frame.system_id << 24 | frame.message_id] = plan
         return plan
 
     def _entries(self, frame: Frame) -> tuple[_Entry, ...]:

@@ -302,7 +302,8 @@ class Router(Generic[PortT]):
 
     def _is_loop(self, node: RouterPort[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True if a loop is proven, now or during the last `LOOP_WINDOW_S`."""
-        count = node.echoes[source] = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
+        count = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
+        node.echoes[source] = count
         was_proven = now < node.loop_until
         if count < MIN_LOOP_FRAMES and not was_proven:
             return False
@@ -340,7 +341,8 @@ class Router(Generic[PortT]):
     def _plan(self, node: RouterPort[PortT], key: int) -> ForwardingPlan[PortT]:
         """Make the plan for ``key``, a key of `RouterPort.plans`, and cache it."""
         message_id, target, source = key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF
-        target_system, target_component = ids = target & 0xFF, target >> 8
+        target_system, target_component = target & 0xFF, target >> 8
+        ids = target_system, target_component
         plan_key = message_id << 16 | source
         if message_id == _SETUP_SIGNING:
             return ForwardingPlan(plan_key, message_id, ids, reason="secret")

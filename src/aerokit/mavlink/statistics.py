@@ -321,7 +321,8 @@ class FramerStatistics(CounterFields):
         """Create the counters of a new sender. If ``may_stay`` is False, the counters are not kept."""
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
         if may_stay:
-            self._by_key[key] = self.sources[source.system_id, source.component_id] = source
+            self._by_key[key] = source
+            self.sources[source.system_id, source.component_id] = source
         else:
             self._others += 1
         return source

@@ -286,7 +286,8 @@ class PtyLink(BaseLink):
 
         self._loop = asyncio.get_running_loop()
         # The other end is kept open here, because reading our end fails while no process has the other end open.
-        ours, theirs = self._ends = os.openpty()
+        ours, theirs = os.openpty()
+        self._ends = ours, theirs
         tty.setraw(theirs)
         os.set_blocking(ours, False)
         name = os.ttyname(theirs)
