@@ -129,10 +129,8 @@ class RouteChanged(Event):
 class RouteChangeRefused(Event):
     """Frames of a silent component arrive from the new address ``peer``, but aerokit ignores them.
 
-    Their sequence numbers do not continue those of the component.
-
-    The sender may therefore be another vehicle, or the same vehicle after a reboot.
-    ``aerokit.connect(…, may_move=True)`` accepts the frames in both cases.
+    Their sequence numbers do not continue those of the component, so the sender may be another vehicle, or the same
+    vehicle after a reboot. ``aerokit.connect(…, may_move=True)`` accepts the frames in both cases.
     """
 
     component_id: int
@@ -351,10 +349,10 @@ class LinkDrained(Event):
 class LinkSelected(Event):
     """The traffic to this system now uses ``link`` (its address), one of several links.
 
-    ``before`` is the previous link; None if there was none. ``reason`` is "first heard" for the first link; "silent",
-    "stalled" or "lost" if the previous link is; "better" or "cheaper" if the new link is; and "another vehicle" if
-    AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit requests message rates again,
-    because autopilots keep separate rates for each link.
+    ``before`` is the previous link; None if there was none. ``reason`` is "first heard" for the first link. Otherwise
+    it describes the previous link ("silent", "stalled", "lost") or the new link ("better", "cheaper"), or is "another
+    vehicle" if AUTOPILOT_VERSION showed that the previous link leads to another vehicle. aerokit requests message rates
+    again, because autopilots keep separate rates for each link.
     """
 
     link: str
@@ -415,7 +413,7 @@ class LinkStatus(Snapshot):
     link: str
     """Address of the link."""
     state: LinkState
-    """SILENT: no vehicle was heard for a second or two. LOST: the link is closed, and aerokit tries to reopen it."""
+    """SILENT: no vehicle was received for a second or two. LOST: the link is closed, and aerokit tries to reopen it."""
     is_costly: bool
     """True if the link is used only when all others fail (``costly=1``)."""
     systems: tuple[int, ...]

@@ -168,7 +168,7 @@ def every_cell(vehicle: aerokit.Vehicle) -> list[StateCell[Any]]:
     """Return all cells of a vehicle, its parts and its devices, as created by `make_parts`."""
     gc.collect()
     cells = [thing for thing in gc.get_objects() if isinstance(thing, StateCell)]
-    return [cell for cell in cells if cell.name not in OURS and cell._closed_by is None]
+    return [cell for cell in cells if cell.name not in OURS and cell._close_error is None]
 
 
 async def test_cells_after_pause_are_as_old_as_their_message(grounded: Flight) -> None:

@@ -9,7 +9,7 @@ from test_routes import COPTER, PeersLink
 
 from aerokit import events
 from aerokit.connection import routes as routes_module
-from aerokit.connection.routes import RouteClaim, Routes, boot_time_ms
+from aerokit.connection.routes import Evidence, RouteClaim, Routes, boot_time_ms
 from aerokit.mavlink import Frame, Framer
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
@@ -202,27 +202,27 @@ def test_full_table_is_swept_once_a_second(monkeypatch: pytest.MonkeyPatch) -> N
 def test_claim_is_judged_by_first_frame_after_owner() -> None:
     claim, (frame, _) = RouteClaim(), Sender().send(1.0)
     assert (claim.continues_owner, claim.may_continue_owner) == (False, True)
-    claim.add(frame, (10, False, True))
-    claim.add(frame, (10, True, True))
+    claim.add(frame, Evidence(10, False, True))
+    claim.add(frame, Evidence(10, True, True))
     assert (claim.continues_owner, claim.may_continue_owner) == (False, False)
     claim.is_refusal_reported = True
-    claim.add(frame, (11, True, None))
+    claim.add(frame, Evidence(11, True, None))
     assert (claim.continues_owner, claim.may_continue_owner, claim.is_refusal_reported) == (
         False,
         True,
         False,
     )
-    claim.add(frame, (11, True, True))
+    claim.add(frame, Evidence(11, True, True))
     assert claim.continues_owner
-    claim.add(frame, (11, True, False))
-    claim.add(frame, (11, True, True))
+    claim.add(frame, Evidence(11, True, False))
+    claim.add(frame, Evidence(11, True, True))
     assert (claim.continues_owner, claim.may_continue_owner) == (False, False)
 
 
 def test_claim_needs_three_frames_in_the_time_of_three() -> None:
     claim, (frame, _) = RouteClaim(), Sender().send(1.0)
     for frames in (1, 2, 3):
-        claim.add(frame, (10, True, True))
+        claim.add(frame, Evidence(10, True, True))
         assert claim.has_replaced(9.0, 10.0) is (frames == 3)
     assert not claim.has_replaced(1.29, 10.0)
     assert claim.has_replaced(1.5, 6.0)

@@ -12,7 +12,7 @@ from several_harness import EventLog, Radios, ReceivedMessages, over
 import aerokit
 from aerokit import events
 from aerokit import messages as m
-from aerokit.connection.multilink.link_choice import MAX_TIMES_WITHOUT_HARDWARE, MIN_CLOCK_MATCHES, LinkChoice
+from aerokit.connection.multilink.link_choice import MAX_ANSWERS_WITHOUT_HARDWARE, MIN_CLOCK_MATCHES, LinkChoice
 from aerokit.connection.multilink.vehicle_clock import HardwareId
 from aerokit.errors import AerokitError
 from aerokit.sim import SimulatedCopter
@@ -187,7 +187,7 @@ def test_vehicle_without_hardware_id_is_proven_by_clock() -> None:
     while not answers.second.is_proven:
         answers.answer_probes(1)
         steps += 1
-    assert MIN_CLOCK_MATCHES < steps <= 1 + MIN_CLOCK_MATCHES + MAX_TIMES_WITHOUT_HARDWARE
+    assert MIN_CLOCK_MATCHES < steps <= 1 + MIN_CLOCK_MATCHES + MAX_ANSWERS_WITHOUT_HARDWARE
 
 
 def test_late_other_hardware_id_disables_the_link() -> None:

@@ -123,7 +123,7 @@ def test_dropped_vehicle_is_not_kept_by_previous_use(address: str, use: Callable
 
 
 def test_dropped_vehicle_is_not_kept_by_parameter_download(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parameter_transfers, "_method", lambda _: anyio.sleep_forever())
+    monkeypatch.setattr(parameter_transfers, "_download_method", lambda _: anyio.sleep_forever())
     vehicle = dronekit.connect(address)
     dropped = weakref.ref(vehicle)
     del vehicle

@@ -98,7 +98,7 @@ def test_queue_behind_blocked_listener_is_bounded(
     thread.post(block_thread)
     assert is_stuck.wait(LIMIT_S)
     for number in range(20):
-        thread.offer(observed.append, number)
+        thread.post_or_drop(observed.append, number)
     thread.post(observed.append, "state")
     may_go_on.set()
     wait_until_empty(thread)

@@ -259,7 +259,7 @@ def _simulated_vehicles(text: str) -> list[SimulatedCopter] | list[SimulatedPx4]
 @contextmanager
 def _address_opens(make: Any, thread: int | None = None) -> Iterator[None]:
     """Let `ADDRESS` open links that ``make`` returns, in all threads or in one."""
-    original = create._udp
+    original = create._create_udp
 
     def udp(where: LinkAddress, peers: Any) -> Link:
         is_address = f"{where.kind}:{where.host}:{where.port}" == ADDRESS
@@ -267,7 +267,7 @@ def _address_opens(make: Any, thread: int | None = None) -> Iterator[None]:
         link: Link = make() if is_address and is_here else original(where, peers)
         return link
 
-    with patch.object(create, "_udp", udp), patch.object(create, "_zenoh", lambda _: make()):
+    with patch.object(create, "_create_udp", udp), patch.object(create, "_create_zenoh", lambda _: make()):
         yield
 
 

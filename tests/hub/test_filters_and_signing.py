@@ -63,7 +63,7 @@ def test_signed_frame_keeps_sender_and_content(message: Heartbeat, version: int)
     own, _ = border()
     encoder = FrameEncoder(7, 9, version=version)
     encoder.sequence = 77
-    signed = own.signed(encoder.encode(message), NOW)
+    signed = own.sign(encoder.encode(message), NOW)
     assert signed is not None
     (frame,) = Framer().receive(signed)
     assert (frame.system_id, frame.component_id, frame.sequence, frame.version) == (7, 9, 77, 2)
@@ -71,7 +71,7 @@ def test_signed_frame_keeps_sender_and_content(message: Heartbeat, version: int)
     assert STANDARD.decode(frame) == expected
     assert Signing(KEY).check(frame, NOW) is None
     other, _ = border()
-    inside = other.admitted(frame, NOW)
+    inside = other.verify(frame, NOW)
     assert inside is not None
     assert inside.incompat_flags == 0
     assert Framer().receive(inside.raw)[0].body == inside.body
@@ -83,13 +83,13 @@ def test_signed_frame_keeps_sender_and_content(message: Heartbeat, version: int)
 def test_unsigned_frame_is_refused() -> None:
     own, refused = border()
     raw = FrameEncoder(7, 9).encode(MESSAGES[0])
-    assert own.admitted(Frame.parse(raw), NOW) is None
+    assert own.verify(Frame.parse(raw), NOW) is None
     assert refused == [Refusal.UNSIGNED.value]
-    signed = own.signed(raw, NOW)
+    signed = own.sign(raw, NOW)
     assert signed is not None
     again, refused = border()
-    assert again.admitted(Frame.parse(signed), NOW) is not None
-    assert again.admitted(Frame.parse(signed), NOW) is None
+    assert again.verify(Frame.parse(signed), NOW) is not None
+    assert again.verify(Frame.parse(signed), NOW) is None
     assert refused == [Refusal.REPLAYED.value]
 
 
@@ -97,21 +97,21 @@ def test_allow_unsigned_admits_a_radio() -> None:
     signing = Signing(KEY, allow_unsigned=lambda frame: frame.system_id == 7)
     own = SigningGateway(signing, STANDARD.extras, lambda frame, why: None)
     frame = Frame.parse(FrameEncoder(7, 9).encode(MESSAGES[0]))
-    assert own.admitted(frame, NOW) is frame
-    assert own.admitted(Frame.parse(FrameEncoder(8, 9).encode(MESSAGES[0])), NOW) is None
+    assert own.verify(frame, NOW) is frame
+    assert own.verify(Frame.parse(FrameEncoder(8, 9).encode(MESSAGES[0])), NOW) is None
 
 
 def test_allow_unsigned_exception_refuses() -> None:
     refused: list[str] = []
     signing = Signing(KEY, allow_unsigned=lambda frame: 1 / 0 > 1)
     own = SigningGateway(signing, STANDARD.extras, lambda frame, why: refused.append(why))
-    assert own.admitted(Frame.parse(FrameEncoder(7, 9).encode(MESSAGES[0])), NOW) is None
+    assert own.verify(Frame.parse(FrameEncoder(7, 9).encode(MESSAGES[0])), NOW) is None
     assert "ZeroDivisionError" in refused[0]
 
 
 def test_unknown_messages_cannot_be_signed() -> None:
     unknown = bytes.fromhex("fd 04 00 00 07 01 01 22 c8 00") + b"mine" + b"\x12\x34"
-    assert border()[0].signed(unknown, NOW) is None
+    assert border()[0].sign(unknown, NOW) is None
 
 
 def test_rate_for_all_excludes_answers() -> None:

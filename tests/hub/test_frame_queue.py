@@ -17,7 +17,7 @@ def held(raw: bytes, kind: MessageKind = MessageKind.TRANSFER, since: float = 0.
 
 def taken(frames: FrameQueue) -> list[bytes]:
     found = []
-    while (raw := frames.next()) is not None:
+    while (raw := frames.pop()) is not None:
         found.append(raw)
     return found
 
@@ -83,7 +83,9 @@ def test_bounds_hold_and_every_frame_is_accounted_for(
         assert len(frames) <= MAX_QUEUED_FRAMES
         assert sum(len(frame.raw) for frame in frames._frames.values()) == frames._bytes <= MAX_QUEUED_BYTES
         assert all(
-            now - frame.since <= ORDER_MAX_AGE_S for frame in frames._frames.values() if frame.kind is MessageKind.ORDER
+            now - frame.waiting_since <= ORDER_MAX_AGE_S
+            for frame in frames._frames.values()
+            if frame.kind is MessageKind.ORDER
         )
     assert len(taken(frames)) + dropped == len(arrivals)
     assert frames._bytes == frames._order_count == frames._telemetry_count == 0

@@ -9,7 +9,7 @@ from hub_stage import Program
 import aerokit
 from aerokit import events
 from aerokit.hub import shared
-from aerokit.hub.attachment import _queue_above_bytes
+from aerokit.hub.attachment import _min_queue_above_bytes
 from aerokit.mavlink.messages import Heartbeat
 from aerokit.sim import SimulatedCopter, SimulatorServer
 from aerokit.testing import run_virtual
@@ -50,4 +50,4 @@ def test_station_with_our_ids_is_reported_once(component: int) -> None:
     ],
 )
 def test_shared_link_has_the_queue_limit_of_its_link(address: str, most: int) -> None:
-    assert _queue_above_bytes(address) == most
+    assert _min_queue_above_bytes(address) == most

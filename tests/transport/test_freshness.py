@@ -68,11 +68,11 @@ class SimulatedNetwork:
             (begun, rate), (begun_too, rate_too) = self.vehicle_clock, self.client_clock
             vehicle, client = begun + rate * now, begun_too + rate_too * now
             if kind == "beacon":
-                self.at(self.arrival(now, 0), "received", self.checker.beacon(vehicle))
+                self.at(self.arrival(now, 0), "received", self.checker.make_beacon(vehicle))
             elif kind == "received":
                 self.tracker.receive_beacon(what, client)
             elif kind == "send":
-                stamp = self.tracker.stamp(client)
+                stamp = self.tracker.make_stamp(client)
                 if stamp is None:
                     self.unsent.append(now)
                 else:
@@ -123,19 +123,19 @@ def test_working_network_accepts_everything(
 
 def test_nothing_is_sent_in_silence_and_held_back_refused() -> None:
     checker, tracker = FreshnessChecker(7), VehicleSideTracker(1)
-    assert tracker.stamp(0.0) is None  # no beacon was received
-    assert tracker.receive_beacon(checker.beacon(100.0), 0.0)
-    held = tracker.stamp(1.9)
+    assert tracker.make_stamp(0.0) is None  # no beacon was received
+    assert tracker.receive_beacon(checker.make_beacon(100.0), 0.0)
+    held = tracker.make_stamp(1.9)
     assert held is not None
-    assert tracker.stamp(2.1) is None  # the beacon is too old by our own clock
+    assert tracker.make_stamp(2.1) is None  # the beacon is too old by our own clock
     assert not checker.accepts("ground", held, 102.1)
     assert checker.late == 1
-    beacon = checker.beacon(110.0)
+    beacon = checker.make_beacon(110.0)
     assert not tracker.receive_beacon(beacon, 20.0)  # ten seconds late: it was held back, too
     assert tracker.late == 1
-    assert tracker.stamp(20.0) is None
-    assert tracker.receive_beacon(checker.beacon(120.0), 20.0)
-    fresh = tracker.stamp(20.1)
+    assert tracker.make_stamp(20.0) is None
+    assert tracker.receive_beacon(checker.make_beacon(120.0), 20.0)
+    fresh = tracker.make_stamp(20.1)
     assert checker.accepts("ground", fresh, 120.1)
     assert not checker.accepts("ground", fresh, 120.1)  # the same once more
     assert checker.duplicates == 1
@@ -143,24 +143,24 @@ def test_nothing_is_sent_in_silence_and_held_back_refused() -> None:
 
 def test_second_vehicle_side_with_same_name() -> None:
     first, second, tracker = FreshnessChecker(1), FreshnessChecker(2), VehicleSideTracker(1)
-    assert tracker.receive_beacon(first.beacon(0.0), 0.0)
-    assert not tracker.receive_beacon(second.beacon(50.0), 0.1)  # the first one is active
+    assert tracker.receive_beacon(first.make_beacon(0.0), 0.0)
+    assert not tracker.receive_beacon(second.make_beacon(50.0), 0.1)  # the first one is active
     assert not tracker.accepts(2, 50.0, 0.1)
     assert tracker.foreign == 2
-    stamp = tracker.stamp(0.2)
+    stamp = tracker.make_stamp(0.2)
     assert first.accepts("ground", stamp, 0.2)
     assert not second.accepts("ground", stamp, 50.2)
-    assert tracker.receive_beacon(second.beacon(53.0), 3.0)  # the first one is silent: this is its successor
-    assert second.accepts("ground", tracker.stamp(3.1), 53.1)
+    assert tracker.receive_beacon(second.make_beacon(53.0), 3.0)  # the first one is silent: this is its successor
+    assert second.accepts("ground", tracker.make_stamp(3.1), 53.1)
     tracker.reset()
-    assert tracker.stamp(3.2) is None
-    assert tracker.receive_beacon(first.beacon(3.3), 3.3)
+    assert tracker.make_stamp(3.2) is None
+    assert tracker.receive_beacon(first.make_beacon(3.3), 3.3)
 
 
 @pytest.mark.parametrize("stamp", [None, Stamp(8, 1, 1, 1), Stamp(7, 0, 1, 1), Stamp(7, 2, 1, 1)])
 def test_datagram_without_valid_stamp_is_refused(stamp: Stamp | None) -> None:
     checker = FreshnessChecker(7)
-    checker.beacon(0.0)
+    checker.make_beacon(0.0)
     assert not checker.accepts("ground", stamp, 0.1)
     assert checker.late == 1
     assert checker.accepts("ground", Stamp(7, 1, 1, 1), 0.1)
@@ -168,7 +168,7 @@ def test_datagram_without_valid_stamp_is_refused(stamp: Stamp | None) -> None:
 
 def test_checker_bounds_remembered_clients() -> None:
     checker = FreshnessChecker(7)
-    checker.beacon(0.0)
+    checker.make_beacon(0.0)
     for nonce in range(1000):
         assert checker.accepts("ground", Stamp(7, 1, nonce, 1), 0.1)
     assert len(checker._sequences) == 256

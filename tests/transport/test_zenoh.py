@@ -451,7 +451,7 @@ async def test_duplicated_datagram_reaches_vehicle_once(monkeypatch: pytest.Monk
     link, taken = ZenohListen("north", "alpha"), list[bytes]()
     monkeypatch.setattr(link, "_now", lambda: 100.0)
     monkeypatch.setattr(link, "_deliver", lambda data, peer: taken.append(data))
-    epoch = link._freshness.beacon(100.0).epoch
+    epoch = link._freshness.make_beacon(100.0).epoch
     orders = [frame(ParamRequestList(1, 1)) for _ in range(3)]
     for sequence in (1, 1, 3, 2, 3):
         link._on_datagram("ground", orders[sequence - 1], Stamp(epoch, 1, 7, sequence).encode())
@@ -466,7 +466,7 @@ async def test_payload_larger_than_datagram_is_ignored() -> None:
     async with serving(port) as (vehicle, recorder), client(port, "&client=ground") as (link, answered):
         link.write(order := frame(ParamRequestList(1, 1)))
         await recorder.until_data(order)
-        stamp, sent = link._tracker.stamp(link._now()), encode_sent_at(vehicle._freshness.epoch, vehicle._now())
+        stamp, sent = link._tracker.make_stamp(link._now()), encode_sent_at(vehicle._freshness.epoch, vehicle._now())
         assert stamp is not None
         for session, key, attachment in (
             (link._session, link._keys.to_vehicle("ground"), stamp.encode()),

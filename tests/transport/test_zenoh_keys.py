@@ -25,7 +25,7 @@ def test_keys() -> None:
     keys = KeySpace("north", "alpha")
     assert keys.to_all_clients == "aerokit/north/alpha/from/all"
     assert keys.to_vehicle("ground") == "aerokit/north/alpha/to/ground"
-    assert keys.alive(255) == "aerokit/north/alpha/alive/000000ff"
+    assert keys.vehicle_token(255) == "aerokit/north/alpha/alive/000000ff"
     assert keys.state("1/position") == "aerokit/north/alpha/state/1/position"
 
 

@@ -110,18 +110,21 @@ class _Rules:
         self._var_positional = ""
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
-        rules = self._read() if self._by_name is None else self._by_name
+        rules = self._compute() if self._by_name is None else self._by_name
         names = self._positional
         if self._var_positional:
             names += (self._var_positional,) * (len(args) - len(names))
         # This loop runs for each message that a program sends or reads. To be fast, it copies nothing unless a value is
         # wrong.
         for name, value in chain(zip(names, args), kwargs.items()):  # noqa: B905 - Python rejects surplus arguments
-            if name in rules and not rules[name][0](value):
+            if name not in rules:
+                continue
+            is_allowed, _ = rules[name]
+            if not is_allowed(value):
                 vehicle_parameter = {**dict(zip(names, args)), **kwargs}.get("name")  # noqa: B905 - as above
                 raise _error(rules[name], name, value, vehicle_parameter)
 
-    def _read(self) -> dict[str, Rule]:
+    def _compute(self) -> dict[str, Rule]:
         """Compute the rules from the signature of the function."""
         parameters = inspect.signature(self._function).parameters.values()
         rules = {param.name: self._rule(param) for param in parameters if param.annotation is not param.empty}
@@ -137,8 +140,9 @@ class _Rules:
 
 
 def _is_time(parameter: inspect.Parameter) -> bool:
-    """Return True if the parameter is a time in seconds, and not a speed, whose name ends in ``_s``, too."""
-    name, is_speed = parameter.name, parameter.name.endswith(("m_s", "deg_s"))
+    """Return True if the parameter is a time in seconds. A speed is not a time, although its name ends in ``_s``."""
+    name = parameter.name
+    is_speed = name.endswith(("m_s", "deg_s"))
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
 
@@ -166,16 +170,17 @@ def _hint(check: Check, value: object) -> str:
 # ------------------------------------------------------------------------------------- annotations
 
 
-def _rule(node: ast.expr, names: Mapping[str, Any]) -> Rule:
-    """Return the rule of an annotation. ``names`` are the globals of the module that has the annotation."""
+def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
+    """Return the rule of an annotation. ``module_globals`` are the globals of the module that has the annotation."""
     if isinstance(node, ast.BinOp):
-        (is_left, left_text), (is_right, right_text) = _rule(node.left, names), _rule(node.right, names)
+        is_left, left_text = _rule(node.left, module_globals)
+        is_right, right_text = _rule(node.right, module_globals)
         return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
     if isinstance(node, ast.Constant):  # None is the only constant in our annotations.
         return _SIMPLE["None"]
     if isinstance(node, ast.Subscript):
-        return _generic_rule(_name_of(node.value), node.slice, names)
-    return _named_rule(_name_of(node), names)
+        return _generic_rule(_name_of(node.value), node.slice, module_globals)
+    return _named_rule(_name_of(node), module_globals)
 
 
 def _name_of(node: ast.expr) -> str:
@@ -185,11 +190,11 @@ def _name_of(node: ast.expr) -> str:
     return node.id if isinstance(node, ast.Name) else ""
 
 
-def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
+def _named_rule(name: str, module_globals: Mapping[str, Any]) -> Rule:
     """Return the rule of an annotation that is a single name."""
     if name in _SIMPLE:
         return _SIMPLE[name]
-    annotated = names.get(name)
+    annotated = module_globals.get(name)
     if isinstance(annotated, type):
         return (lambda value: isinstance(value, annotated)), with_article(name)
     if get_origin(annotated) is Literal:
@@ -204,26 +209,27 @@ def _named_rule(name: str, names: Mapping[str, Any]) -> Rule:
     return partial(_has_class_name, name), with_article(name)
 
 
-def _generic_rule(name: str, inner: ast.expr, names: Mapping[str, Any]) -> Rule:
+def _generic_rule(name: str, inner: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
     """Return the rule of the annotation ``name[inner]``."""
     if name in _SIMPLE:  # e.g. Callable[[int], None] or PathLike[str]
         return _SIMPLE[name]
     parts = inner.elts if isinstance(inner, ast.Tuple) else [inner]
-    rules = [_rule(part, names) for part in parts]
+    rules = [_rule(part, module_globals) for part in parts]
     if name == "type":
-        class_names = _class_names(_name_of(parts[0]), names)
+        class_names = _class_names(_name_of(parts[0]), module_globals)
         return partial(_is_class, class_names), f"a class{' of ' if class_names else ''}{' or '.join(class_names)}"
     if name == "Mapping":
         (is_key, _), (is_value, description) = rules
         return partial(_is_mapping, is_key, is_value), f"a mapping whose values are each {description}"
     if name in ("Iterable", "Sequence", "list", "tuple"):
-        return partial(_are_items, rules[0][0]), f"an iterable whose items are each {rules[0][1]}"
+        is_item, description = rules[0]
+        return partial(_are_items, is_item), f"an iterable whose items are each {description}"
     return partial(_has_class_name, name), with_article(name)
 
 
-def _class_names(name: str, names: Mapping[str, Any]) -> tuple[str, ...]:
+def _class_names(name: str, module_globals: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of the classes that ``type[name]`` allows; empty if it allows any class."""
-    annotated = names.get(name)
+    annotated = module_globals.get(name)
     if not isinstance(annotated, TypeVar):
         return () if name == "Any" else (name,)
     bound = annotated.__bound__

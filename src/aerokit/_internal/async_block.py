@@ -1,4 +1,4 @@
-"""``async_block`` and ``ReadOnly``, whose errors explain how to use the public API correctly."""
+"""``async_block`` and ``ReadOnly``: their errors explain how to use the public API correctly."""
 
 from __future__ import annotations
 

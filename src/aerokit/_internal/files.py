@@ -63,7 +63,7 @@ def decompress(data: bytes, name: str) -> bytes:
     """
     if not data.startswith(_XZ_MAGIC):
         return data
-    import lzma  # not available in all builds of Python
+    import lzma  # Not all builds of Python have it.
 
     decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY_LIMIT)
     try:

@@ -102,7 +102,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Return ``" (did you mean 'GUIDED'?)"`` for the most similar known name; empty if none is similar."""
     if not isinstance(name, str) or len(name) > _MAX_LENGTH:
         return ""
-    import difflib  # imported here because it is only needed for errors
+    import difflib  # Imported here, because it is only needed for errors.
 
     by_upper_case = {candidate.upper(): candidate for candidate in known}
     close = difflib.get_close_matches(name.upper(), by_upper_case, n=1)

@@ -34,8 +34,10 @@ def _suggestion(package: str, name: str) -> str:
     """Return a hint if ``aerokit.errors`` or ``aerokit.events`` defines the name; otherwise an empty text."""
     if package != "aerokit" or name.startswith("_"):
         return ""
-    places = (module for module in _NAMED_MODULES if name in import_module(module).__all__)
-    return next((f": did you mean {module}.{name}?" for module in places), "")
+    for module in _NAMED_MODULES:
+        if name in import_module(module).__all__:
+            return f": did you mean {module}.{name}?"
+    return ""
 
 
 def lazy_exports(

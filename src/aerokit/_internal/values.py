@@ -30,7 +30,10 @@ class _SnapshotType(type):
         defaults = {field: value for base in bases for field, value in getattr(base, "_defaults", {}).items()}
         # A default is removed from the class, because a slot and a class attribute cannot have the same name.
         defaults.update({field: namespace.pop(field) for field in own_fields if field in namespace})
-        fields = (*(field for base in bases for field in getattr(base, "__match_args__", ())), *own_fields)
+        fields: tuple[str, ...] = ()
+        for base in bases:
+            fields += getattr(base, "__match_args__", ())
+        fields += own_fields
         cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own_fields, "__match_args__": fields})
         if own_fields:
             type.__setattr__(cls, "__init__", _lazy_init(cls))

@@ -157,7 +157,10 @@ BLIMP = ModeTable(
 
 TRACKER = ModeTable({0: "MANUAL", 1: "STOP", 2: "SCAN", 3: "SERVOTEST", 4: "GUIDED", 10: "AUTO", 16: "INITIALISING"})
 
-EKF_PROBLEMS: Mapping[int, str] = {1024: "initialisation", 32768: "GPS without glitches"}
+EKF_PROBLEMS: Mapping[int, str] = {
+    EkfStatusFlags.UNINITIALIZED.value: "initialisation",
+    EkfStatusFlags.GPS_GLITCHING.value: "GPS without glitches",
+}
 
 COPTERS = (
     MavType.QUADROTOR,

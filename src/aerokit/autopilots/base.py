@@ -208,7 +208,7 @@ class Autopilot:
     calibrates_compasses_by_command = False
     """True if MAV_CMD_DO_START_MAG_CAL (42424) calibrates compasses; otherwise PREFLIGHT_CALIBRATION does."""
     speed_types: frozenset[int] = frozenset((SpeedType.GROUNDSPEED,))
-    """SPEED_TYPEs with which MAV_CMD_DO_CHANGE_SPEED (178) works; with others, it changes no speed or another one."""
+    """SPEED_TYPEs that MAV_CMD_DO_CHANGE_SPEED (178) supports. Any other type changes no speed, or another speed."""
     circles_by: Literal["orbit", "reposition", "setpoints"] | None = None
     """Way to circle a place: MAV_CMD_DO_ORBIT (34), DO_REPOSITION (192) with a radius, or set-points; None if there is
     none.
@@ -243,7 +243,7 @@ class Autopilot:
     upload is complete.
     """
     mission_completes_at_home = False
-    """True if a mission that ends with a return is reported as complete at home, False if when the return begins."""
+    """True if a mission that ends with a return is reported as complete at home, False if when it starts to return."""
     mission_starts_by_command = False
     """True if MAV_CMD_MISSION_START (300) starts the mission even on the ground. The command does not arm."""
     sets_current_by_command = False
@@ -348,10 +348,13 @@ class Autopilot:
         """Return the modes to which a command may change; empty if there are none or they are unknown."""
         if command == MavCmd.DO_SET_MODE:
             return self._modes_of_order(params, extra)
-        purposes = PURPOSES_OF_COMMANDS.get(command, ())
-        names = {self._purpose_name(purpose, is_vtol) for purpose in purposes for is_vtol in (False, True)}
-        names |= {name for name in NAMES_OF_COMMANDS.get(command, ()) if name in self.modes.names}
-        return tuple(self.modes.find(name) for name in sorted(filter(None, names)))
+        names = {name for name in NAMES_OF_COMMANDS.get(command, ()) if name in self.modes.names}
+        for purpose in PURPOSES_OF_COMMANDS.get(command, ()):
+            for is_vtol in (False, True):
+                name = self._purpose_name(purpose, is_vtol)
+                if name is not None:
+                    names.add(name)
+        return tuple(self.modes.find(name) for name in sorted(names))
 
     def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
         base_mode, custom_mode = mode_numbers((*params, 0.0, 0.0)[:2])  # Missing parameters are 0.

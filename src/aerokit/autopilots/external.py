@@ -47,7 +47,7 @@ class ExternalRules(Snapshot):
     - ``flow_in_radians``: the autopilot reads OPTICAL_FLOW_RAD instead of OPTICAL_FLOW
     - ``target_is_local``: the landing target must be in the local frame instead of relative to the vehicle
     - ``constant_position_at_rest``: the flag CONST_POS_MODE is also set while a vehicle with a position is at rest
-    - ``origin_is_final``: once the local frame has an origin, the autopilot refuses another one
+    - ``origin_is_final``: once the local frame has an origin, the autopilot refuses to change it
     """
 
     kinds: Mapping[ExternalKind, ExternalRule] = {}
@@ -75,6 +75,7 @@ def _external_navigation(quantity: str) -> ExternalRule:
 
 _GPS_ALONE = (("EK3_SRC1_POSXY", (3.0,)), ("EK3_SRC2_POSXY", (0.0, 3.0)), ("GPS2_TYPE", (0.0,)))
 
+# `required` has the values that select MAVLink as the driver of a sensor, e.g. GPS1_TYPE 14.
 ARDUPILOT_EXTERNAL = ExternalRules(
     kinds={
         "odometry": _external_navigation("POSXY"),

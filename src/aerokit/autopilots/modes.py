@@ -110,10 +110,13 @@ def is_armed(base_mode: int) -> bool:
 
 def base_mode_name(base_mode: int) -> str:
     """Return the name of a mode that has no custom_mode, from its MAV_MODE_FLAG bits."""
-    for bit, name in ((4, "AUTO"), (8, "GUIDED"), (16, "STABILIZE"), (64, "MANUAL")):
-        if base_mode & bit:
-            return name
-    return "PREFLIGHT"
+    names = {
+        MavModeFlag.AUTO_ENABLED: "AUTO",
+        MavModeFlag.GUIDED_ENABLED: "GUIDED",
+        MavModeFlag.STABILIZE_ENABLED: "STABILIZE",
+        MavModeFlag.MANUAL_INPUT_ENABLED: "MANUAL",
+    }
+    return next((name for flag, name in names.items() if base_mode & flag), "PREFLIGHT")
 
 
 def _key(name: str) -> str:

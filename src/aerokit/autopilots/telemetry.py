@@ -118,7 +118,7 @@ _GROUPS: Mapping[int, tuple[str, ...]] = {
     ),
 }
 
-_IDS: Mapping[str, int] = {row[0]: message_id for message_id, row in INDEX.items()}
+_IDS: Mapping[str, int] = {class_name: message_id for message_id, (class_name, *_) in INDEX.items()}
 
 # Maps message id to MAV_DATA_STREAM, from ArduPilot's GCS_MAVLink_Parameters.cpp.
 ARDUPILOT_GROUPS: Mapping[int, int] = {_IDS[name]: group for group, names in _GROUPS.items() for name in names}
@@ -164,5 +164,5 @@ class AutopilotVersion(Snapshot):
 def version_text(flight_sw_version: int) -> tuple[str, tuple[int, int, int]]:
     """Convert ``flight_sw_version`` to text and (major, minor, patch): ``("4.6.1-rc", (4, 6, 1))``."""
     major, minor, patch, release_type = flight_sw_version.to_bytes(4, "big")
-    suffix = next(text for first, text in _VERSION_TYPES if release_type >= first)
+    suffix = next(text for lowest_type, text in _VERSION_TYPES if release_type >= lowest_type)
     return f"{major}.{minor}.{patch}{suffix}", (major, minor, patch)

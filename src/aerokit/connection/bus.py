@@ -64,7 +64,7 @@ class Bus:
         self.one_at_a_time = False
         """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the others."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
-        self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}
+        self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}  # the key is (system id, message id)
         self._plans: dict[int, _DeliveryPlan] = {}  # cache; the key is system id << 24 | message id
         self._event_sinks: dict[type[Event], tuple[Sink, ...]] = {}
 
@@ -181,25 +181,31 @@ class Bus:
                     _report(sink)
 
     def _attach(self, key: tuple[int, int], entry: _Entry, *, ahead: bool = False) -> Detach:
-        sinks = self._sinks.get(key, ())
-        self._sinks[key] = (entry, *sinks) if ahead else (*sinks, entry)
+        entries = self._sinks.get(key, ())
+        self._sinks[key] = (entry, *entries) if ahead else (*entries, entry)
         self._plans.clear()
-        self.wanted[key[1]] = self.wanted.get(key[1], 0) + 1
+        _, message_id = key
+        self.wanted[message_id] = self.wanted.get(message_id, 0) + 1
         return once(lambda: self._detach(key, entry))
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Return the sinks for the frame's system, then those for all systems. An unknown message has no sinks."""
+        """Return the sinks of frames like this one, and cache them. A message outside the dialect has no sinks."""
         entries = self._entries(frame)
         if not entries or self.dialect.get(frame.message_id) is None:
             return FRAME, ()
         kinds = {kind for kind, _ in entries}
-        kind = MESSAGE if kinds == {MESSAGE} else BOTH
         if MESSAGE not in kinds:
             kind = FRAME  # No sink needs the message decoded: sinks of kind BOTH also accept the frame alone.
-        plan = self._plans[frame.system_id << 24 | frame.message_id] = kind, tuple(sink for _, sink in entries)
+        elif kinds == {MESSAGE}:
+            kind = MESSAGE
+        else:
+            kind = BOTH
+        plan = kind, tuple(sink for _, sink in entries)
+        self._plans[frame.system_id << 24 | frame.message_id] = plan
         return plan
 
     def _entries(self, frame: Frame) -> tuple[_Entry, ...]:
+        """Return the entries for the frame's system, followed by those for all systems."""
         system_id, message_id = frame.system_id, frame.message_id
         for_all_systems = self._sinks.get((EVERY_SYSTEM, message_id), ())
         if system_id == EVERY_SYSTEM:  # The sender's id is invalid. Only the sinks for all systems get the frame.
@@ -329,8 +335,8 @@ class Subscription(Generic[ItemT]):
             raise InvalidArgument(
                 f"overflow = {overflow!r} is not allowed: it must be 'drop_oldest', 'drop_newest' or 'error'"
             )
-        # Function that explains in time-out errors why no items arrive. The default, `str`, returns "": no explanation.
-        self._explain_timeout: Callable[[], str] = str
+        # Returns why no items arrive, for time-out errors; "" if unknown.
+        self._explain_timeout: Callable[[], str] = lambda: ""
         self.missed: int = 0
         """Number of items that were dropped because the reader was too slow."""
         self._attach = attach

@@ -45,6 +45,10 @@ class Source(Snapshot):
     message: str
 
 
+def _no_explanation() -> str:
+    return ""
+
+
 class StateCell(Generic[T]):
     """The latest value of one telemetry item: read it, check its age, wait for it, iterate over its changes.
 
@@ -57,7 +61,7 @@ class StateCell(Generic[T]):
         "_arrivals",
         "_changes",
         "_clock",
-        "_closed_by",
+        "_close_error",
         "_explain_timeout",
         "_feeds",
         "_followers",
@@ -85,18 +89,18 @@ class StateCell(Generic[T]):
         self._stamp = clock if stamp is None else stamp  # returns the receive time for a value that is set now
         self.waits_for: str = waits_for
         """Names of the messages that carry the value."""
-        # Function that explains in time-out errors why no values arrive. The default, `str`, returns "" (unknown).
-        self._explain_timeout: Callable[[], str] = str
+        # Returns why no values arrive, for time-out errors; "" if unknown.
+        self._explain_timeout: Callable[[], str] = _no_explanation
         self._known = False
         self._latest: T | None = None
         self._source: Source | None = None
         self._updated_at = -math.inf
-        self._arrivals = 0
-        self._changes = 0
+        self._arrivals = 0  # number of values set so far
+        self._changes = 0  # number of values that differed from the value before
         self._sinks: list[_Sink[T]] = []
-        self._followers = 0
+        self._followers = 0  # number of iterators
         self._feeds: tuple[Feed, ...] = ()
-        self._closed_by: BaseException | None = None
+        self._close_error: BaseException | None = None
 
     # ------------------------------------------------------------------------------ reading
 
@@ -245,14 +249,14 @@ class StateCell(Generic[T]):
 
     def close(self, error: BaseException) -> None:
         """Raise ``error`` in current and later waiters, because no more values will arrive. Reading still works."""
-        if self._closed_by is None:
-            self._closed_by = error
+        if self._close_error is None:
+            self._close_error = error
             for sink in tuple(self._sinks):
                 sink.fail(copy_exception(error))
 
     def _raise_if_closed(self) -> None:
-        if self._closed_by is not None:
-            raise copy_exception(self._closed_by)
+        if self._close_error is not None:
+            raise copy_exception(self._close_error)
 
     def _catch_up(self) -> None:
         for feed in self._feeds:
@@ -344,7 +348,7 @@ class Changes(AsyncIterator[T]):
         return self._cell.value
 
     def _total(self) -> int:
-        """Return how many values there were so far: changed ones for `changes`, received ones for `updates`."""
+        """Return the number of received values so far; for `changes()`, only values that differ from the one before."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:
@@ -414,7 +418,7 @@ class _Waiter(_Sink[T]):
         self._record(value)
         try:
             is_met = bool(self._predicate(value))
-        except Exception as error:  # a predicate's exception belongs to the caller of wait_until
+        except Exception as error:  # It belongs to the caller of `wait_until`.
             self.fail(error)
             return
         if not is_met:

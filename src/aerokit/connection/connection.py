@@ -125,7 +125,7 @@ class Connection:
         """Last HEARTBEAT of every (system id, component id) on the link."""
         self.keeps_peers = True
         self._background = BackgroundTasks(self.fail)
-        self._is_on_link = True
+        self._owns_link = True  # False if the link turns out to belong to another connection
         self._state_watch = LinkStateTracker(self.link_state, self.bus, system_id=0)
         self._end_signal = EndSignal()
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
@@ -198,7 +198,7 @@ class Connection:
     def _use_activity_monitor(self, activity: ActivityMonitor) -> None:
         """Pause our heartbeat when the program's own threads hang, although the loop's thread keeps running."""
         if self._heartbeat is not None:
-            self._heartbeat.require(activity, BLOCKING_MAX_IDLE_S)
+            self._heartbeat.watch(activity, BLOCKING_MAX_IDLE_S)
 
     @property
     def links(self) -> StateCell[tuple[LinkStatus, ...]] | None:
@@ -247,7 +247,7 @@ class Connection:
 
     @signing.setter
     def signing(self, signing: Signing | None) -> None:
-        self._gate.use(signing)
+        self._gate.set_signing(signing)
 
     @checked
     def subscribe(
@@ -300,8 +300,7 @@ class Connection:
 
         Frames with message ids outside the dialect are included, and their checksums are not checked. Frames that are
         refused because a second peer sends them under the ids of a known component are excluded. The callback must
-        return quickly; its exceptions are logged.
-        Without observers, frames without subscribers are not even built.
+        return quickly; its exceptions are logged. Without observers, frames without subscribers are not even built.
         """
         return self._observers.add(callback)
 
@@ -371,7 +370,10 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Return why signatures block communication with this component (0: any), for error texts; "" if none do."""
+        """Return why signatures block communication with a component, for error texts; "" if they do not.
+
+        ``component_id`` 0 means all components of the system.
+        """
         return self._gate.describe(
             heartbeat
             for (system, component), heartbeat in self.heartbeats.items()
@@ -383,7 +385,7 @@ class Connection:
         return self._receiver.statistics()
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Return how many frames of this system were received, and how many were lost by sequence number."""
+        """Return how many frames of this system were received, and how many sequence numbers are missing."""
         return self._receiver.counts(system_id)
 
     def close(self, error: Exception | None = None) -> None:
@@ -392,14 +394,14 @@ class Connection:
         May be called inside the connection's block. The block continues, but its further calls on the connection raise.
         """
         self._end(error or ConnectionClosed("the connection was closed"))
-        if self._is_on_link:
+        if self._owns_link:
             self.link.close()
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
         """Close the connection because of an internal error of aerokit, which becomes the cause of raised errors."""
         if not self.is_open and isinstance(error, AerokitError):
-            return  # a background task failed only because the connection was closed before
+            return  # A background task failed only because the connection was closed before.
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)
         closed = ConnectionClosed(f"an internal error of aerokit closed the connection: {error!r}")
         closed.__cause__ = error
@@ -430,21 +432,21 @@ class Connection:
     def link_interrupted(self, error: LinkLost) -> None:
         """Called when the link was lost and is being reopened."""
         self._state_watch.mark_lost(self._clock())
-        self.bus.publish(LinkInterrupted(self._clock(), 0, error))
+        self.bus.publish(LinkInterrupted(self._clock(), system_id=0, error=error))
 
     def link_restored(self, away_s: float) -> None:
         """Called when the link is open again after an interruption."""
         self._receiver.reset()
         self._state_watch.record_activity(self._clock())
-        self.bus.publish(LinkRestored(self._clock(), 0, away_s))
+        self.bus.publish(LinkRestored(self._clock(), system_id=0, away_s=away_s))
 
     def link_stalled(self, unsent_bytes: int) -> None:
         """Called when written data has stopped leaving this machine."""
-        self.bus.publish(LinkStalled(self._clock(), 0, unsent_bytes))
+        self.bus.publish(LinkStalled(self._clock(), system_id=0, unsent_bytes=unsent_bytes))
 
     def link_drained(self, stalled_s: float) -> None:
         """Called when written data leaves this machine again."""
-        self.bus.publish(LinkDrained(self._clock(), 0, stalled_s))
+        self.bus.publish(LinkDrained(self._clock(), system_id=0, stalled_s=stalled_s))
 
     def member_link_changed(self, link: int, is_available: bool) -> None:
         """Called when one of several links was lost or is available again."""
@@ -463,7 +465,8 @@ class Connection:
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
-        self.bus.publish(OrderRefused(self._clock(), 0, message, reason, lease_holder))
+        refusal = OrderRefused(self._clock(), system_id=0, message=message, reason=reason, lease_holder=lease_holder)
+        self.bus.publish(refusal)
         for answer in answers:  # Not passed to a framer, which would count these answers as frames of the link.
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
@@ -478,11 +481,11 @@ class Connection:
         try:
             await self.link.open(self)
         except BusyError:
-            self._is_on_link = False
+            self._owns_link = False
             raise
 
     async def _wait_until_link_is_closed(self) -> None:
-        if self._is_on_link:
+        if self._owns_link:
             await self.link.wait_closed()
 
     def _start(self) -> None:
@@ -505,7 +508,7 @@ class Connection:
     def _end(self, error: Exception) -> None:
         if not self.is_open:
             return
-        self._end_signal.error = error  # first, so that sinks of the following events find the connection closed
+        self._end_signal.error = error  # Set first, so that sinks of the following events find the connection closed.
         self._receiver.close()
         # Only a lost link is published as an event: a program that closes the connection itself needs none.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
@@ -513,7 +516,7 @@ class Connection:
         if self._multilink is not None:
             self._multilink.status.close(error)
         if isinstance(error, LinkLost):
-            self.bus.publish(LinkClosed(self._clock(), 0, error))
+            self.bus.publish(LinkClosed(self._clock(), system_id=0, error=error))
         self._end_signal.notify(error)
         self.deadlines.close()
         self._background.cancel()

@@ -28,7 +28,7 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
     ]
     detachments.append(connection.on_end(run.abort))
     if connection.links is not None:
-        detachments.append(connection.bus.attach_event(LinkSelected, partial(run.link_chosen, system_id)))
+        detachments.append(connection.bus.attach_event(LinkSelected, partial(run.on_link_selected, system_id)))
     try:
         return await run.result()
     finally:
@@ -63,9 +63,10 @@ class ExchangeRun(Generic[ResultT]):
         finally:  # If a callback of the program raises here, the bus logs the exception, and the exchange continues.
             self._after_step()
 
-    def link_chosen(self, system_id: int, event: LinkSelected) -> None:
-        """Inform the exchange that the connection has switched to another of its links."""
-        if event.system_id == system_id and event.before is not None:
+    def on_link_selected(self, system_id: int, event: LinkSelected) -> None:
+        """Inform the exchange that messages to this system now use another link than before."""
+        is_first_choice = event.before is None
+        if event.system_id == system_id and not is_first_choice:
             self._exchange.link_changed(self._connection.now())
             self._after_step()
 

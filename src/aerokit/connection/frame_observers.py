@@ -29,7 +29,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_WAITING = 1000  # maximum number of sent frames that wait for the first received frame
 
-SETUP_SIGNING = (256).to_bytes(3, "little")  # message id, as in the header of a MAVLink 2 frame
+SETUP_SIGNING_ID = (256).to_bytes(3, "little")  # message id, as in the header of a MAVLink 2 frame
 
 
 class Recording:
@@ -79,6 +79,7 @@ class Recording:
             self._waiting.append((raw, at))
 
     def _begin(self, waiting: Iterable[tuple[bytes, float]]) -> None:
+        """Create the file at the first received frame, and write the frames that were sent before."""
         try:
             self._open_new()
         except OSError as error:
@@ -99,7 +100,8 @@ class Recording:
                 return
 
     def _write(self, raw: bytes, at: float) -> None:
-        if self._writer is not None and not (raw[0] == MAGIC_V2 and raw[7:10] == SETUP_SIGNING):
+        contains_key = raw[0] == MAGIC_V2 and raw[7:10] == SETUP_SIGNING_ID
+        if self._writer is not None and not contains_key:
             try:
                 self._writer.write(raw, self._unix_epoch_s + at)
             except OSError as error:
@@ -150,8 +152,8 @@ def _check_renamable(path: str | os.PathLike[str]) -> None:
 def keep_existing(path: str | os.PathLike[str]) -> str | None:
     """Rename a file to the next free numbered name in its folder: ``flight.tlog`` to ``flight.1.tlog``.
 
-    Several programs can do this at the same time: none replaces a file of another one. Returns the new name, or None if
-    the file does not exist any more.
+    Several programs can do so at the same time: none replaces a file of another program. Returns the new name, or None
+    if the file does not exist any more.
 
     Raises:
         OSError: the file cannot be renamed.
@@ -161,7 +163,7 @@ def keep_existing(path: str | os.PathLike[str]) -> str | None:
     for number in itertools.count(1):
         kept = f"{stem}.{number}{suffix}"
         try:
-            os.close(os.open(kept, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # claims the name
+            os.close(os.open(kept, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # This claims the name.
         except FileExistsError:
             continue
         try:

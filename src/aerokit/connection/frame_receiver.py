@@ -42,7 +42,7 @@ class PeerTable:
     A sender becomes a peer with its first valid frame, and from then on gets broadcasts. When the table is full, the
     first peer without a vehicle is evicted; if there is none, new senders are ignored.
 
-    ``evictable_peers`` is :meth:`Routes.evictable_peers`. ``prepare(framer)`` is called with each new framer,
+    ``evictable_peers`` is :meth:`Routes.evictable_peers`. ``configure(framer)`` is called with each new framer,
     ``on_evict(peer)`` with each evicted peer.
     """
 
@@ -51,10 +51,10 @@ class PeerTable:
         link: Link,
         dialect: Dialect,
         evictable_peers: Callable[[Iterable[Peer], float], Iterable[Peer]],
-        prepare: Callable[[Framer], object],
+        configure: Callable[[Framer], object],
         on_evict: Callable[[Peer], object] | None = None,
     ) -> None:
-        self._link, self._dialect, self._prepare = link, dialect, prepare
+        self._link, self._dialect, self._configure = link, dialect, configure
         self._evictable_peers, self._on_evict = evictable_peers, on_evict
         self.framers: dict[Peer, Framer] = {}
         """Framers of verified peers."""
@@ -98,7 +98,7 @@ class PeerTable:
         if len(self._unverified) >= MAX_UNVERIFIED_PEERS:
             self._unverified.pop(next(iter(self._unverified))).close()
         framer = self._unverified[peer] = Framer(self._dialect, self._limit)
-        self._prepare(framer)
+        self._configure(framer)
         return framer
 
     def _make_room(self, now: float) -> bool:
@@ -186,12 +186,13 @@ class FrameReceiver:
         if self._bus.one_at_a_time or framer.late or framer.foreign:
             self._check_and_deliver(frames, framer, peer)
             return
-        last = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
-        if last is not None:
-            # The delivery stopped after the frame `last`, because one of its sinks closed the connection, set a signing
-            # key or added an observer. The other frames now need checks; `last` was not yet passed to the observers.
-            self.observers.notify_received(last, peer)
-            self._check_and_deliver(frames[frames.index(last) + 1 :], framer, peer)
+        last_delivered = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
+        if last_delivered is not None:
+            # The delivery stopped after this frame, because one of its sinks closed the connection, set a signing key
+            # or added an observer. The other frames now need checks. This frame was not yet passed to the observers.
+            self.observers.notify_received(last_delivered, peer)
+            remaining = frames[frames.index(last_delivered) + 1 :]
+            self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
         """Deliver the frames that pass all checks, and pass them to the recording and the observers."""
@@ -232,7 +233,7 @@ class FrameReceiver:
         return (framer.statistics for framer in self._peers)
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Return how many frames of this system were received, and how many were lost by sequence number."""
+        """Return how many frames of this system were received, and how many sequence numbers are missing."""
         sources = [
             source
             for statistics in self.statistics()
@@ -249,11 +250,11 @@ class FrameReceiver:
                 seconds,
                 IPYTHON_HINT if is_unintegrated_ipython() else BLOCKING_CODE_HINT,
             )
-        self._bus.publish(LoopBlocked(self._clock(), 0, seconds))
+        self._bus.publish(LoopBlocked(self._clock(), system_id=0, seconds=seconds))
 
     def _on_slept(self, seconds: float) -> None:
         logger.warning("the computer slept for %.0f s: the age of all vehicle values includes this time", seconds)
-        self._bus.publish(ComputerSlept(self._clock(), 0, seconds))
+        self._bus.publish(ComputerSlept(self._clock(), system_id=0, seconds=seconds))
 
     def _on_caught_up(self, paused_s: float) -> None:
         self._routes.exclude_pause(self._clock(), paused_s)
@@ -292,7 +293,7 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Return True if a frame must be dropped: another sender uses its ids, or it is an outdated heartbeat."""
+        """Return True if a frame must be dropped: a second sender sent it, or it is an outdated heartbeat."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False
@@ -304,6 +305,7 @@ class FrameReceiver:
         return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_outdated(frame))
 
     def _record_heartbeat(self, frame: Frame, framer: Framer, peer: Peer) -> None:
+        """Record the route and the content of a heartbeat. Publish the discovery of a new component."""
         heartbeat = self._bus.dialect.decode(frame)
         is_valid_sender = frame.system_id != 0  # 0 is the broadcast address
         if not is_valid_sender or not isinstance(heartbeat, Heartbeat):

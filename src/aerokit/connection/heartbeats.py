@@ -82,7 +82,7 @@ class OwnHeartbeat(Snapshot):
 
     A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program hangs,
     ``fed_within_s`` seconds after its last call or ``feed()``. None means 60 seconds in :mod:`aerokit.sync` and
-    :mod:`aerokit.dronekit`, whose event loop runs on a thread of its own. In asyncio, None means no limit, because a
+    :mod:`aerokit.dronekit`, which run their event loop on a separate thread. In asyncio, None means no limit, because a
     blocked loop sends nothing anyway. Infinity means no limit. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18
     for a companion computer (ONBOARD_CONTROLLER).
     """
@@ -132,8 +132,8 @@ class HeartbeatWatchdog:
         self._clock, self._publish = clock, publish
         self._paused_at: float | None = None
 
-    def require(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Pause the heartbeat when this activity ends; ``fed_within_s`` is the limit if the settings have none."""
+    def watch(self, activity: ActivityMonitor, fed_within_s: float) -> None:
+        """Pause the heartbeat when this activity ends. ``fed_within_s`` is the limit if the settings have none."""
         self.activity = activity
         if self._limit_s is None:
             self._limit_s = fed_within_s
@@ -145,13 +145,13 @@ class HeartbeatWatchdog:
         now = self._clock()
         if idle_s <= limit_s:
             if self._paused_at is not None:
-                self._publish(HeartbeatResumed(now, 0, now - self._paused_at))
+                self._publish(HeartbeatResumed(now, system_id=0, paused_s=now - self._paused_at))
                 logger.warning("the program is active again: heartbeats are sent again")
                 self._paused_at = None
             return True
         if self._paused_at is None:
             self._paused_at = now
-            self._publish(HeartbeatPaused(now, 0, idle_s))
+            self._publish(HeartbeatPaused(now, system_id=0, idle_s=idle_s))
             logger.warning(
                 "the program has not called aerokit for %.0f s: heartbeats are paused, so that the vehicle's ground"
                 " station failsafe can act (set the limit by connect(heartbeat=OwnHeartbeat(fed_within_s=…)))",

@@ -69,11 +69,13 @@ class LoopWatch:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._on_blocked, self._on_slept, self._on_caught_up = on_blocked, on_slept, on_caught_up
-        # The largest of three readings is used, because a single reading may be too small; see `_has_slept`.
-        self._suspended, self._suspended_before = suspended, max(suspended() for _ in range(3))
+        self._suspended = suspended
+        # The largest of three readings is used, because a single reading may be too small; see `_detect_sleep`.
+        self._suspended_before = max(suspended() for _ in range(3))
         self.late_after: float = math.inf
         """Data that is read before this loop time has not waited. For data that is read later, call :meth:`arrival`."""
-        self._ran_at = self._due = self._loop.time()
+        self._ran_at = self._loop.time()  # when the loop last ran, as far as known
+        self._due = self._ran_at  # when the timer should fire
         self._timer: asyncio.TimerHandle | None = None
         self.oldest_arrival: float = math.inf
         """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
@@ -101,7 +103,7 @@ class LoopWatch:
         self._check_sleep_at = now + CHECK_INTERVAL_S / 2
         # Data that is read in time proves that the loop runs, so the timer is postponed. A timer that wakes an idle
         # process would cost as much as processing a few messages.
-        has_slept = self._has_slept()
+        has_slept = self._detect_sleep()
         if self.oldest_arrival == math.inf and not has_slept and now <= self._due + LATE_THRESHOLD_S:
             if self._timer is not None:
                 self._timer.cancel()
@@ -113,16 +115,16 @@ class LoopWatch:
     def slept_since(self, at: float) -> float:
         """Return how many seconds the computer was suspended since this loop time.
 
-        Detects a suspension at once, which the timer may notice 0.2 s later.
+        The timer may notice a suspension 0.2 s late; this method notices it at once.
         """
-        if self._timer is not None and self._has_slept():
+        if self._timer is not None and self._detect_sleep():
             self._assume_waiting_data()
         return sum(seconds for woke_at, seconds in self._sleeps if woke_at > at)
 
     def _tick(self) -> None:
         now = self._loop.time()
         late_s = now - self._due
-        has_slept = self._has_slept()
+        has_slept = self._detect_sleep()
         if self._timer is None:  # A sink of ComputerSlept has closed the connection.
             return
         if has_slept or late_s > LATE_THRESHOLD_S:
@@ -132,7 +134,8 @@ class LoopWatch:
         if late_s > BLOCKED_THRESHOLD_S:
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
-    def _has_slept(self) -> bool:
+    def _detect_sleep(self) -> bool:
+        """Return True if the computer was suspended since the last call. Record and report the suspension."""
         # `_suspended` subtracts two clock readings. Its result is too small if the process was preempted between the
         # readings. The true value never decreases, so the largest result so far is used.
         before = self._suspended_before
@@ -154,7 +157,9 @@ class LoopWatch:
     def _assume_waiting_data(self) -> float:
         """Set the receive time of data that is read from now on to the time when the loop last ran, and return it."""
         if self.oldest_arrival == math.inf:
-            self.oldest_arrival, self.late_after, self._idle_iterations = self._ran_at, -math.inf, 0
+            self.oldest_arrival = self._ran_at
+            self.late_after = -math.inf
+            self._idle_iterations = 0
             self._loop.call_soon(self._end_assumption_when_idle)
         return self.oldest_arrival
 

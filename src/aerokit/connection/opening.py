@@ -205,7 +205,7 @@ def _target_key(target: Link | LinkAddress) -> object:
     if opens_new_socket:
         return None
     # On zenoh networks, the same name with other endpoints is another vehicle.
-    endpoints = [option for option in target.options if option[0] in ("connect", "listen")]
+    endpoints = [(name, value) for name, value in target.options if name in ("connect", "listen")]
     return target.kind, target.host, target.port, target.device, target.path, tuple(endpoints)
 
 

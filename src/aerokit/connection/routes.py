@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.events import DuplicateSender, RouteChanged, RouteChangeRefused
 from aerokit.mavlink.enums import MavComponent
@@ -25,6 +25,14 @@ if TYPE_CHECKING:
 _BOOT_TIME_OFFSETS = {2: 17, 30: 9, 31: 9, 32: 9, 33: 9}
 
 CLAIM_MIN_FRAMES = 3
+
+
+class Evidence(NamedTuple):
+    """Evidence in a frame of another peer: True if it continues the stream of the owner, None if unknown."""
+
+    expected: int  # the owner's next frame number
+    sequence_matches: bool | None
+    clock_matches: bool | None
 
 
 class RouteClaim:
@@ -55,14 +63,15 @@ class RouteClaim:
         self.is_duplicate_reported: bool = False
         self.is_refusal_reported: bool = False
 
-    def add(self, frame: Frame, evidence: tuple[int, bool | None, bool | None]) -> None:
-        """Add a frame and its evidence, the result of ``Routes._evidence``."""
+    def add(self, frame: Frame, evidence: Evidence) -> None:
+        """Add a frame of the peer, and what it proves."""
         expected, sequence_matches, clock_matches = evidence
         if expected != self._expected:  # The owner has sent frames since the last call, so the claim starts again.
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
-            self._sequence_matches, self._clock_matches = sequence_matches, None
+            self._sequence_matches = sequence_matches
+            self._clock_matches = None
             self._claimed_at = frame.received_at
         self._frames += 1
         # A mismatch of the clock is final. Otherwise another sender could try often enough until a frame matches by
@@ -122,7 +131,7 @@ class _Route:
 
     peer: Peer
     heartbeat_at: float
-    silent_since: float  # `heartbeat_at`, or later if the event loop was blocked since then
+    silent_since: float  # `heartbeat_at`, or later if the event loop was blocked after that time
     sequence: int  # sequence number of the last heartbeat
     expected: int  # `counters.expected` at the last heartbeat, from which `rate` is computed
 
@@ -223,7 +232,7 @@ class Routes:
         is_same_host = self._link.host_of(peer) == self._link.host_of(route.peer)
         needs_no_evidence = self._may_move or is_signed or is_same_host or frame.system_id not in self._attached
         claim = self._claim(source, peer)
-        claim.add(frame, self._evidence(route, frame, counters))
+        claim.add(frame, self._evidence(route, frame))
         has_replaced = is_same_host and claim.has_replaced(now, route.rate)
         if has_replaced or (is_silent and (needs_no_evidence or claim.continues_owner)):
             self._move_route(route, frame, peer)
@@ -259,7 +268,7 @@ class Routes:
         evicted = next((peer for peer in peers if peer not in live), None)
         if evicted is None:
             return []
-        self._claims = {key: claim for key, claim in self._claims.items() if key[1] != evicted}
+        self._claims = {(source, peer): claim for (source, peer), claim in self._claims.items() if peer != evicted}
         return [evicted]
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
@@ -280,14 +289,8 @@ class Routes:
             claim = self._claims[key] = RouteClaim()
         return claim
 
-    def _evidence(
-        self, route: _Route, frame: Frame, counters: SourceStatistics | None
-    ) -> tuple[int, bool | None, bool | None]:
-        """Return the evidence for :meth:`RouteClaim.add`.
-
-        It is the frame count that is expected of the owner, and whether the frame's sequence number and time since boot
-        continue the owner's stream (None: unknown).
-        """
+    def _evidence(self, route: _Route, frame: Frame) -> Evidence:
+        """Compare the sequence number and the time since boot of a frame with those expected of the route's owner."""
         sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0
@@ -309,14 +312,14 @@ class Routes:
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence
             clock_matches = abs(boot_ms - expected_ms) <= tolerance_ms
-        return expected, sequence_matches, clock_matches
+        return Evidence(expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         before, route.peer = route.peer, peer
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        self._claims = {key: claim for key, claim in self._claims.items() if key[0] != source}
+        self._claims = {(claimed, by): claim for (claimed, by), claim in self._claims.items() if claimed != source}
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
@@ -340,9 +343,9 @@ class Routes:
         if now - self._swept_at >= SWEEP_INTERVAL_S:
             self._swept_at = now
             self._routes = {
-                source: route
-                for source, route in self._routes.items()
-                if source[0] in self._attached or now - route.heartbeat_at <= PEER_TTL_S
+                (system_id, component_id): route
+                for (system_id, component_id), route in self._routes.items()
+                if system_id in self._attached or now - route.heartbeat_at <= PEER_TTL_S
             }
         return len(self._routes) < MAX_ROUTES
 

@@ -44,10 +44,10 @@ class SignatureGate:
         self._logged_keep_error: OSError | None = None
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
-        self.on_change: Callable[[], object] = bool  # The default, `bool`, does nothing.
+        self.on_change: Callable[[], object] = lambda: None
         """Called when :attr:`is_open` may have changed."""
 
-    def use(self, signing: Signing | None) -> None:
+    def set_signing(self, signing: Signing | None) -> None:
         """Sign and verify with this key from now on (None: neither). Raises InvalidArgument with MAVLink 1."""
         check_signing(signing, self._encoder.version)
         self._encoder.signing = signing
@@ -90,7 +90,7 @@ class SignatureGate:
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
         if handover is not None and is_of_handover and handover.is_completed_by(frame, self._unix_time()):
             self._handover = None
-            self.use(handover.signing)
+            self.set_signing(handover.signing)
             handover.switched.set()
         signing = self._encoder.signing
         if signing is None:
@@ -143,7 +143,7 @@ class SignatureGate:
 
 
 def _has_key(frame: Frame) -> bool:
-    from aerokit.mavlink.signing import is_signed_with_a_key  # imports hashlib, which few programs need
+    from aerokit.mavlink.signing import is_signed_with_a_key  # It imports hashlib, which few programs need.
 
     return is_signed_with_a_key(frame)
 
@@ -160,7 +160,7 @@ class _Handover:
         return (frame.system_id, frame.component_id) == self._source
 
     def is_completed_by(self, frame: Frame, unix_time_s: float) -> bool:
-        """Return True if this frame and the earlier ones show that the component uses the new key, or no key."""
+        """Return True once the frames up to this one show that the component uses the new key, or no key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _has_key(frame):

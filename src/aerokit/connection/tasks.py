@@ -20,7 +20,7 @@ class BackgroundTasks:
     """Tasks that end with an ``async with`` block. Their exceptions go to ``on_error``, not to the block.
 
     This is not a task group, because the program's block would then run inside its cancel scope. Cancelling the
-    program's task, ``asyncio.timeout`` and ``asyncio.TaskGroup`` interact with such a scope differently in each
+    program's task, ``asyncio.timeout`` and ``asyncio.TaskGroup`` interact with cancel scopes differently in each
     version of Python and anyio; some swallow or exchange exceptions. A cancelled scope of the program does not reach
     these tasks either: heartbeats continue while a shielded program lands its vehicle.
     """

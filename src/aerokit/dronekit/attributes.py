@@ -70,7 +70,7 @@ class Locations(HasObservers, LocationPrivates):
         if message is None:
             return LocationGlobal(None, None, None)
         latitude, longitude = _position_of(message)
-        if message.alt == 0 and not self._has_altitude:  # the vehicle may send 0 for an unknown altitude
+        if message.alt == 0 and not self._has_altitude:  # The vehicle may send 0 for an unknown altitude.
             return LocationGlobal(latitude, longitude, None)
         return LocationGlobal(latitude, longitude, message.alt / 1000.0)
 
@@ -99,7 +99,7 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce("location")
 
     def _announce(self, frame: str) -> None:
-        """Notify this object's listeners of ``name``, then the vehicle's listeners of ``location.name``."""
+        """Notify this object's listeners of ``frame``, then the vehicle's listeners of ``location.frame``."""
         self._dk_listeners.announce(frame)
         self._core.listeners.announce(f"location.{frame}")
 
@@ -181,7 +181,8 @@ class VehicleAttributes(VehicleCore):
     @property
     def heading(self) -> int | Any:
         """Heading in degrees, 0 to 360 clockwise from north (VFR_HUD)."""
-        return self._dk_vfr_hud.values("heading")[0]
+        (heading,) = self._dk_vfr_hud.values("heading")
+        return heading
 
     @property
     def gps_0(self) -> GPSInfo:
@@ -226,7 +227,8 @@ class VehicleAttributes(VehicleCore):
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False
         aio = self._dk.aio_or_none
-        if aio is not None and aio.autopilot.prearm_depends_on_mode:  # PX4, whose checks are a bit of SYS_STATUS
+        if aio is not None and aio.autopilot.prearm_depends_on_mode:
+            # On PX4, a bit of SYS_STATUS has the result of the checks.
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
         # Like DroneKit: any fix (2D or better), and a predicted position of the estimator.
@@ -257,7 +259,7 @@ class VehicleAttributes(VehicleCore):
     # ----------------------------------------------------------------------------- receiving
 
     def _dk_on_heartbeat(self, message: m.Heartbeat) -> None:
-        if not is_autopilot(message):  # sent by a ground station or companion that uses the autopilot's ids
+        if not is_autopilot(message):  # A ground station or companion may use the autopilot's ids.
             return
         self._handler.match_mavlink_version(message)
         self._dk_heartbeat = message

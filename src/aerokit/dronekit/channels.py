@@ -52,7 +52,7 @@ class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
 
     @classmethod
     def fromkeys(cls, channels: Iterable[Any], value: Any = None) -> dict[Any, Any]:
-        return dict.fromkeys(channels, value)  # a plain dict: instances of this class belong to a vehicle
+        return dict.fromkeys(channels, value)  # A plain dict: instances of this class belong to a vehicle.
 
 
 def _unsupported(name: str) -> Any:
@@ -108,7 +108,7 @@ class Channels(_ChannelDict):
 
     # --------------------------------------------------------------------------------- private
 
-    if not TYPE_CHECKING:  # hidden from type checkers, because dict has these methods with other types
+    if not TYPE_CHECKING:  # A dict has these methods with other types, so type checkers do not see these.
         __setitem__, __delitem__, __ior__ = map(_unsupported, ("__setitem__", "__delitem__", "__ior__"))
         clear, pop, popitem = map(_unsupported, ("clear", "pop", "popitem"))
         setdefault, update = map(_unsupported, ("setdefault", "update"))
@@ -117,7 +117,7 @@ class Channels(_ChannelDict):
         self._store(0, ALL_VALUES(message))
 
     def _on_raw(self, message: RcChannelsRaw) -> None:
-        first_index = message.port * 8  # each message has the eight channels of one port
+        first_index = message.port * 8  # Each message has the eight channels of one port.
         if self._count < first_index + 8 <= MAX_CHANNELS:
             with self._changing:
                 self._set_count(first_index + 8)
@@ -218,7 +218,7 @@ class ChannelsOverride(_ChannelDict):
         active = {channel: value for channel, value in overrides.items() if value}
         # Earlier releases are repeated, in case their message was lost.
         released = (self._released | self.keys()) - active.keys()
-        self._send(active, released)  # may raise, so this dict changes only afterwards
+        self._send(active, released)  # This may raise, so the dict changes only afterwards.
         for channel in self.keys() - active.keys():
             dict.pop(self, channel)
         dict.update(self, active)
@@ -254,7 +254,7 @@ def _checked_value(number: int, value: Any) -> int:
     if value is None:
         return 0
     with contextlib.suppress(TypeError, ValueError, OverflowError):
-        microseconds = round(value)  # accepts floats and numpy numbers
+        microseconds = round(value)  # round() accepts floats and numpy numbers.
         if 0 <= microseconds <= UNUSED:
             return int(microseconds)
     raise InvalidArgument(

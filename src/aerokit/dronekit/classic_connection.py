@@ -50,7 +50,7 @@ class ClassicConnection:
         self.target_system = target_system
         """System id of the vehicle, 0 until it is found."""
         self.listener_thread: ListenerThread = ListenerThread()
-        self.listener_thread.on_called = loop.activity.feed  # each callback shows that the program does not hang
+        self.listener_thread.on_called = loop.activity.feed  # Each callback shows that the program does not hang.
         self.loop = loop
         self._context = context
         self.connection: Connection = context.value
@@ -76,7 +76,7 @@ class ClassicConnection:
 
         Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
         """
-        message.encode()  # so that the caller gets the error of an invalid field, which would be logged on the loop
+        message.encode()  # Raises for an invalid field here. On the loop, the error would only be logged.
         with classic_errors():
             self.connection.raise_if_ended()
             self.calls.post(self._send, message, to)
@@ -125,8 +125,8 @@ class ClassicConnection:
     def is_of_another_vehicle(self, system_id: int) -> bool:
         """Return True if the system with this id has an autopilot but is not the connected vehicle."""
         return system_id != self.target_system and any(
-            source[0] == system_id and is_autopilot(heartbeat)
-            for source, heartbeat in self.connection.heartbeats.items()
+            sender_system == system_id and is_autopilot(heartbeat)
+            for (sender_system, _), heartbeat in self.connection.heartbeats.items()
         )
 
     def match_mavlink_version(self, heartbeat: Message) -> None:
@@ -211,7 +211,7 @@ class BackgroundCalls:
     def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
         kind = SHARED_KINDS.get(call.kind, call.kind)  # Disarming and arming replace each other.
         if kind in self._newest:
-            self._cancel(self._newest[kind])  # the new call replaces it
+            self._cancel(self._newest[kind])  # The new call replaces it.
         if call.set_running_or_notify_cancel():  # False if the call was cancelled before its start
             name = f"dronekit {call.kind}"
             call.task = asyncio.get_running_loop().create_task(self._run(call, function), name=name)
@@ -225,7 +225,7 @@ class BackgroundCalls:
     def _end(self, kind: str, call: BackgroundCall) -> None:
         if self._newest.get(kind) is call:
             del self._newest[kind]
-        if not call.done():  # the task was cancelled before it had a result
+        if not call.done():  # The task was cancelled before it had a result.
             reason = "the order was cancelled or replaced by a newer one, or the connection was closed"
             call.set_exception(ConnectionClosed(f"{call.kind}: {reason}"))
 
@@ -235,9 +235,9 @@ class BackgroundCalls:
             await function()
         except Exception as error:
             if not isinstance(error, ConnectionClosed):
-                text = str(error)  # a logged exception would keep its stack frames, and thus the vehicle, alive
+                text = str(error)  # A logged exception would keep its stack frames and so the vehicle alive.
                 if isinstance(error, CommandRejected) and self.describe is not None:
-                    text += f" ({self.describe()})"  # the vehicle's answer rarely names the cause of a rejection
+                    text += f" ({self.describe()})"  # The vehicle's answer rarely names the cause.
                 vehicle_logger.warning("%s: %s", call.kind, text)
             call.set_exception(error)
         else:
@@ -270,7 +270,7 @@ RELEASE_UPPER = 0xFFFE  # releases a channel above 8; 0 leaves such a channel un
 CHANNELS_OF_MAVLINK_1 = 8
 CHANNELS = 18
 
-RELEASE_COPIES = 3  # sent several times, because the message is not acknowledged and a frame may be lost
+RELEASE_COPIES = 3  # The message is not acknowledged, and a frame may be lost.
 
 
 class OverrideRelease:
@@ -296,7 +296,7 @@ class OverrideRelease:
             is_upper = channel > CHANNELS_OF_MAVLINK_1
             if value == (RELEASE_UPPER if is_upper else RELEASE):
                 overridden.discard(channel)
-            elif value not in (IGNORE, RELEASE):  # above channel 8, RELEASE (0) leaves the channel unchanged, too
+            elif value not in (IGNORE, RELEASE):  # Above channel 8, 0 leaves the channel unchanged, too.
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:
@@ -305,7 +305,7 @@ class OverrideRelease:
             if self.is_enabled and channels:
                 values = [_release_value(channel, channel in channels) for channel in range(1, CHANNELS + 1)]
                 message = RcChannelsOverride(system, component, *values)
-                with contextlib.suppress(AerokitError):  # the link may already be closed
+                with contextlib.suppress(AerokitError):  # The link may already be closed.
                     for _ in range(RELEASE_COPIES):
                         connection.send(message)
 

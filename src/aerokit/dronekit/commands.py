@@ -42,7 +42,7 @@ AMSL_FRAMES = (0, 5)  # MAV_FRAME_GLOBAL and MAV_FRAME_GLOBAL_INT
 HOME_TOLERANCE_DEG, HOME_TOLERANCE_M = 1e-4, 2.0
 
 
-if TYPE_CHECKING:  # pymavlink's class has no useful annotations
+if TYPE_CHECKING:  # The class of pymavlink has no useful annotations.
 
     class _MissionItem:
         target_system: int
@@ -177,14 +177,14 @@ class CommandSequence:
             content = _content_of(self._state.items)
             if not self._state.is_changed and content == self._vehicle_content:
                 return
-            uploaded = self._state = self._state.replace(is_changed=True)  # stays True unless the upload succeeds
+            uploaded = self._state = self._state.replace(is_changed=True)  # It stays True unless the upload succeeds.
         aio = self._core.check_link()
         # DroneKit does not limit the distance of waypoints, and its programs must run unchanged.
         options = {"timeout": timeout, "max_distance_m": math.inf}
         self._core.run(aio.mission.upload, _mission_of(uploaded.items, aio), **options)
         with self._lock:
             self._vehicle_content = content
-            if self._state is uploaded:  # the program has not changed the sequence during the upload
+            if self._state is uploaded:  # The program has not changed the sequence meanwhile.
                 self._state = uploaded.replace(is_changed=False)
 
     @property
@@ -197,7 +197,7 @@ class CommandSequence:
 
     @next.setter  # noqa: A003 - DroneKit's name
     def next(self, index: int) -> None:
-        self._current.choose(index)
+        self._current.set_next(index)
 
     # ---------------------------------------------------------------------------------- a list
 
@@ -250,7 +250,7 @@ class CommandSequence:
             items = list(self._state.items)
             position = len(items) if index == len(items) else _checked_index(index, len(items))
             command.seq = position + 1
-            items[position : position + 1] = [command]  # appends at the end, as pymavlink does
+            items[position : position + 1] = [command]  # At the end, this appends, as in pymavlink.
             self._state = self._state.replace(items=tuple(items), is_changed=True)
 
     def rows(self) -> tuple[Command, ...]:
@@ -363,7 +363,8 @@ def _content_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
 
 
 def _comparable(value: Any) -> Any:
-    return "NaN" if value != value else value
+    is_nan = value != value  # Only NaN differs from itself; math.isnan() would refuse values of other types.
+    return "NaN" if is_nan else value
 
 
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
@@ -385,7 +386,7 @@ def _is_at_home(cmd: Command, home: LocationGlobal | None) -> bool:
     try:
         distance_deg = max(abs(cmd.x - home.lat), abs(cmd.y - home.lon) * math.cos(math.radians(home.lat)))
         return bool(distance_deg <= HOME_TOLERANCE_DEG and abs(cmd.z - home.alt) <= HOME_TOLERANCE_M)
-    except TypeError:  # a value is not a number, for which upload() raises later
+    except TypeError:  # A value is not a number. The upload will raise an error for it.
         return False
 
 
@@ -425,5 +426,6 @@ def _wire_number(value: Any, command: int, frame: int) -> int | float:
 def _command_of(item: MissionItem, seq: int, own_ids: tuple[int, int]) -> Command:
     # DroneKit's commands have the frames of MISSION_ITEM, which differ from those of MISSION_ITEM_INT.
     item = item.replace(frame=int(canonical_frame(item.frame)))
-    message = to_wire_float(item, seq, target_system=own_ids[0], target_component=own_ids[1])
+    own_system, own_component = own_ids
+    message = to_wire_float(item, seq, target_system=own_system, target_component=own_component)
     return Command(*(getattr(message, name) for name in FIELDS))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Attributes that `wait_ready(True)` waits for.
 DEFAULT_ATTRIBUTES = ("parameters", "gps_0", "armed", "mode", "attitude")
 
-WAIT_STEP_S = 0.2  # longer waits are split into steps, so that Ctrl-C and a lost link end them
+WAIT_STEP_S = 0.2  # Ctrl-C and a lost link end a wait after this time.
 SILENCE_WARNING_S = 5
 TICK_INTERVAL_S = 0.05
 IDLE_TICK_INTERVAL_S = 1.0
@@ -69,7 +69,10 @@ class Readiness:
 
     def failure_of(self, names: set[str]) -> APIException | None:
         """Return the error with which reading one of these attributes has failed, or None."""
-        return next(filter(None, map(self._failures.get, names)), None)
+        for name in names:
+            if name in self._failures:
+                return self._failures[name]
+        return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
         """Wait for a change if one of these attributes is missing, at most ``max_wait_s`` and at most 0.2 s."""
@@ -226,14 +229,14 @@ class Core:
 
         return self.on(message_type, announce, *names)
 
-    def begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
+    def start_receiving(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving once the vehicle is connected (loop thread).
 
         The loop gets weak references only, so that a vehicle that the program drops can be garbage collected.
         """
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
-        _ = aio.parameters  # creates the object now, so that it receives each PARAM_VALUE before our handlers do
+        _ = aio.parameters  # This creates the object, so that it gets each PARAM_VALUE before our handlers.
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
@@ -248,14 +251,14 @@ class Core:
         is_silent = age > SILENCE_WARNING_S
         if is_silent != self._is_silent:
             self._is_silent = is_silent
-            post = self.handler.listener_thread.post  # not on the loop, because the program's log handlers may block
-            if self._is_silent:
+            post = self.handler.listener_thread.post  # The loop does not log, because the log handlers may block.
+            if is_silent:
                 post(self.logger.warning, "Link timeout, no heartbeat in last %d seconds", SILENCE_WARNING_S)
             else:
                 post(self.logger.info, "...link restored.")
         wait_s = TICK_INTERVAL_S
         # Each wake-up costs as much as a few messages, so the wait is longer if no listener needs `last_heartbeat`.
-        if not self._is_silent and not self.listeners.has_listener("last_heartbeat"):
+        if not is_silent and not self.listeners.has_listener("last_heartbeat"):
             wait_s = max(wait_s, min(IDLE_TICK_INTERVAL_S, SILENCE_WARNING_S - age))
         asyncio.get_running_loop().call_later(wait_s, weak_callback(self.watch_link))
 
@@ -364,7 +367,7 @@ class VehicleCore(HasObservers):
                 return False
             self._dk.check_link()
             if (failure := ready.failure_of(missing)) is not None:
-                if raise_exception:  # a new exception, because several threads may raise it
+                if raise_exception:  # Several threads may raise it, so each raises a copy.
                     raise type(failure)(str(failure)) from failure.__cause__
                 return False
             for name in ready.fetchers.keys() & missing:

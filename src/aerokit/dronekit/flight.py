@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 
 HOME_TIMEOUT_S = 10.0
 ORDER_POLL_INTERVAL_S = 0.02
-ARMED_ORDER_KINDS = ("disarm", "arm")  # the index is the wanted value of `armed` (False or True)
+
+
+def _armed_order_kind(value: bool) -> str:
+    """Return the kind of the order that changes `armed` to this value."""
+    return "arm" if value else "disarm"
 
 
 class FlightMethods(VehicleAttributes):
@@ -86,13 +90,13 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
-        self._dk_arming = order = self._dk.order(ARMED_ORDER_KINDS[value], flight_orders.change_armed, aio, value)
+        self._dk_arming = order = self._dk.order(_armed_order_kind(value), flight_orders.change_armed, aio, value)
         return order
 
     def _dk_is_changing_to(self, value: bool) -> bool:
         """Return True while an order to change to ``value`` is pending."""
         order = self._dk_arming
-        return order is not None and order.kind == ARMED_ORDER_KINDS[value] and not order.done()
+        return order is not None and order.kind == _armed_order_kind(value) and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports armed motors.
@@ -136,14 +140,15 @@ class FlightMethods(VehicleAttributes):
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
-        send = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
+        order_take_off = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
         if not aio.autopilot.repositions_amsl:  # ArduPilot: altitude above home; the command does not change the mode
-            return send((), MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude)
+            params = (0, 0, 0, 0, 0, 0, altitude)
+            return order_take_off((), MavCmd.NAV_TAKEOFF, *params)
         plan = aio.autopilot.take_off(altitude, self._dk_known_home().alt, is_vtol=aio.is_vtol)
         mode = aio.autopilot.mode_for("take_off")
         if plan is None or plan.command is None or mode is None:
             raise APIException("simple_takeoff: this vehicle has no take-off command")
-        return send((mode,), plan.command, *plan.params)
+        return order_take_off((mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None) -> None:
         """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`.
@@ -180,7 +185,7 @@ class FlightMethods(VehicleAttributes):
         # Autopilots without reposition modes take the altitude above home.
         target = self._dk_target(location, is_relative=not modes)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
-            flight_orders.check_speed(name, speed)  # before anything is sent
+            flight_orders.check_speed(name, speed)  # Raises before anything is sent.
         if modes and self._flightmode not in map(str, modes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
@@ -210,7 +215,7 @@ class FlightMethods(VehicleAttributes):
     @property
     def airspeed(self) -> float | Any:
         """Airspeed in m/s (VFR_HUD); None if unknown. Set it to change the airspeed (MAV_CMD_DO_CHANGE_SPEED)."""
-        speed = self._dk_vfr_hud.values("airspeed")[0]
+        (speed,) = self._dk_vfr_hud.values("airspeed")
         return None if speed is None or math.isnan(speed) else speed
 
     @airspeed.setter
@@ -220,7 +225,8 @@ class FlightMethods(VehicleAttributes):
     @property
     def groundspeed(self) -> float | Any:
         """Ground speed in m/s (VFR_HUD). Set it to change the ground speed (MAV_CMD_DO_CHANGE_SPEED)."""
-        return self._dk_vfr_hud.values("groundspeed")[0]
+        (speed,) = self._dk_vfr_hud.values("groundspeed")
+        return speed
 
     @groundspeed.setter
     def groundspeed(self, speed: float) -> None:
@@ -315,7 +321,8 @@ class FlightMethods(VehicleAttributes):
             altitude: float | None = frame.alt
             if altitude is None:
                 return False
-            start = altitude if start is None else start
+            if start is None:
+                start = altitude
             has_passed = start < alt <= altitude or altitude <= alt < start  # on the way up, or down
             return abs(altitude - alt) <= epsilon or has_passed
 
@@ -338,7 +345,7 @@ class FlightMethods(VehicleAttributes):
                 return True
             # Calls is_done again, because the effect may have been reported between the first call and the failure.
             if order.done() and order.exception() is not None and not is_done():
-                self._dk.check_link()  # raises if the link is lost, which is the more useful error
+                self._dk.check_link()  # If the link is lost, this raises a more useful error.
                 raise TimeoutError(f"{failure_text}: {order.exception()}") from order.exception()
             return False
 

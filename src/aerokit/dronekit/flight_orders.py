@@ -61,29 +61,38 @@ def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
     if isinstance(mode, int) and autopilot.modes_are_numbered:
         return Mode(mode_name(vehicle, mode), mode)
     try:
-        found = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
+        known_mode = autopilot.find_mode(mode, vehicle.telemetry.mode_names)
     except InvalidArgument as error:
-        raise KeyError(mode) from error  # the cause's text lists the available modes
+        raise KeyError(mode) from error  # The text of the cause lists the available modes.
     except (AttributeError, TypeError):  # `mode` is not a string
         raise KeyError(mode) from None
-    if not isinstance(mode, str) or not (mode.isupper() or mode == found.name):
+    if not isinstance(mode, str) or not (mode.isupper() or mode == known_mode.name):
         raise KeyError(mode)
     # PX4 gets the base_mode that pymavlink would send.
-    return found if autopilot.modes_are_numbered else found.replace(base_mode=_px4_flags(found.name))
+    return known_mode if autopilot.modes_are_numbered else known_mode.replace(base_mode=_px4_base_mode(known_mode.name))
 
 
-def _px4_flags(name: str) -> int:
+def _px4_base_mode(name: str) -> int:
     # pymavlink's MAV_MODE_FLAG for a mode. PX4 evaluates only the flag for custom modes.
     from pymavlink.mavutil import px4_map
 
-    return int(px4_map.get(name, (CUSTOM_MODE_ENABLED,))[0])
+    base_mode, *_ = px4_map.get(name, (CUSTOM_MODE_ENABLED,))
+    return int(base_mode)
 
 
 def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
     # For autopilots without known mode numbers, such as iNav, ArduPilot's mode numbers are used, as by pymavlink.
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
-    return autopilot_for(m.Heartbeat(vehicle.vehicle_type, MavAutopilot.ARDUPILOTMEGA, 0, 0, 0, 0))
+    heartbeat = m.Heartbeat(
+        vehicle.vehicle_type,
+        MavAutopilot.ARDUPILOTMEGA,
+        base_mode=0,
+        custom_mode=0,
+        system_status=0,
+        mavlink_version=0,
+    )
+    return autopilot_for(heartbeat)
 
 
 async def change_mode(vehicle: AsyncVehicle, mode: Mode) -> None:
@@ -98,7 +107,7 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
         with vehicle.posted(*topics, armed=value) as order:
             await order.command(MavCmd.COMPONENT_ARM_DISARM, float(value), component_id=0)
             await order.wait_confirmed(ARMED_TIMEOUT_S)
-    except CommandRejected:  # the vehicle certainly does not execute the command
+    except CommandRejected:  # The vehicle certainly does not execute the command.
         raise
     except (OperationRejected, OperationTimeout) as error:
         error.args = (f"{error}; the vehicle may still execute the command, which is not monitored any more",)
@@ -122,7 +131,10 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
         try:
             await order.command_int(
                 MavCmd.DO_REPOSITION,
-                *(-1, flags, 0, math.nan),  # default speed, flags, default radius, unchanged yaw
+                -1,  # default speed
+                flags,
+                0,  # default radius
+                math.nan,  # unchanged yaw
                 frame=MavFrame.GLOBAL_INT if is_amsl else MavFrame.GLOBAL_RELATIVE_ALT_INT,
                 x=latitude,
                 y=longitude,
@@ -131,14 +143,18 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
             )
         except CommandRejected as error:
             is_unsupported = error.result == MavResult.UNSUPPORTED and not is_amsl
-            # A set-point replaces the unsupported command, unless a newer order or mode change has ended this order or
-            # the
-            # vehicle is silent.
+            # A set-point replaces the unsupported command, unless a newer order or mode change has ended this order, or
+            # the vehicle is silent.
             may_still_order = not order.end and vehicle.heartbeat_age <= MODE_MAX_AGE_S
             if not is_unsupported or not may_still_order:
                 raise
-            target = (vehicle.system_id, 0, MavFrame.GLOBAL_RELATIVE_ALT_INT, POSITION_ONLY)
-            vehicle.send(m.SetPositionTargetGlobalInt(0, *target, latitude, longitude, altitude, *(0.0,) * 8))
+            set_point = m.SetPositionTargetGlobalInt(
+                time_boot_ms=0, target_system=vehicle.system_id, target_component=0,
+                coordinate_frame=MavFrame.GLOBAL_RELATIVE_ALT_INT, type_mask=POSITION_ONLY,
+                lat_int=latitude, lon_int=longitude, alt=altitude,
+                vx=0.0, vy=0.0, vz=0.0, afx=0.0, afy=0.0, afz=0.0, yaw=0.0, yaw_rate=0.0,
+            )  # fmt: skip
+            vehicle.send(set_point)
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
@@ -207,7 +223,7 @@ class CurrentCommand:
             return 0
         return int(message.seq) + 1
 
-    def choose(self, seq: int) -> None:
+    def set_next(self, seq: int) -> None:
         """Set the next command without waiting. Raises InvalidArgument if ``seq`` is not from 0 to 65,535."""
         if not 0 <= operator.index(seq) <= MAX_SEQ:
             raise InvalidArgument(f"next = {seq!r} is not allowed: it must be 0 to {MAX_SEQ}")
@@ -238,7 +254,7 @@ class CurrentCommand:
         # MISSION_SET_CURRENT was not confirmed in time, so a command, which the vehicle acknowledges, sets the item.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:  # home, for which mission.set_current() has no number: its 0 is the first item after home
+        if seq == 0:  # 0 is home, for which `mission.set_current` has no number: its 0 is the first item after home.
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)
@@ -256,6 +272,8 @@ class Maintenance(VehicleCore):
     """Orders for a vehicle on the ground. They return immediately; a rejection is logged as a warning."""
 
     # -------------------------------------------------------------------------- calibrations
+
+    # Parameters of PREFLIGHT_CALIBRATION: gyroscopes, compasses, pressure, radio, accelerometers.
 
     def send_calibrate_gyro(self) -> None:
         """Calibrate the gyroscopes: keep the vehicle still."""
@@ -277,7 +295,7 @@ class Maintenance(VehicleCore):
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 1)
 
     def send_calibrate_accelerometer(self, simple: bool = False) -> None:
-        """Calibrate the accelerometers in six poses, which the vehicle's texts request; with ``simple``, level only."""
+        """Calibrate the accelerometers in six poses, which STATUSTEXT messages request; with ``simple``, level only."""
         self._dk_calibrate(MavCmd.PREFLIGHT_CALIBRATION, 0, 0, 0, 0, 4 if simple else 1)
 
     def _dk_calibrate(self, command: int, *params: float) -> None:
@@ -300,7 +318,7 @@ class Maintenance(VehicleCore):
         text = _tune_text(tune)
         if self._dk.check_link().connection.mavlink_version == 1:
             raise APIException("play_tune needs MAVLink 2, and this vehicle uses MAVLink 1")
-        first_size = TUNE_SIZES[0]
+        first_size, _ = TUNE_SIZES
         self._dk.send(PlayTune(self._dk.target_system, 0, text[:first_size], text[first_size:]))
 
     def reboot(self) -> None:

@@ -15,7 +15,7 @@ from aerokit.sync.thread_future import ThreadFuture
 
 logger: logging.Logger = logging.getLogger("dronekit")
 
-MAX_QUEUED_CALLS = 10_000  # `offer` drops calls while this many are queued
+MAX_QUEUED_CALLS = 10_000  # `post_or_drop` drops calls while this many are queued
 JOIN_TIMEOUT_S = CALL_TIMEOUT_S = 2.0
 
 
@@ -46,7 +46,7 @@ class ListenerThread:
         if not self.is_stopped:
             self._calls.put((function, args))
 
-    def offer(self, function: Callable[..., object], *args: Any) -> None:
+    def post_or_drop(self, function: Callable[..., object], *args: Any) -> None:
         """Queue a call like :meth:`post`, but drop it while 10,000 calls are queued. For values that repeat."""
         if self._calls.qsize() < MAX_QUEUED_CALLS:
             self.post(function, *args)
@@ -81,7 +81,7 @@ class ListenerThread:
         while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= deadline:
             pass
 
-    def keep(self, owner: object, *, has_listeners: bool) -> None:
+    def keep_alive(self, owner: object, *, has_listeners: bool) -> None:
         """Keep an object alive while it has listeners, even if the program has dropped the vehicle."""
         if has_listeners and not self.is_stopped:
             self._kept_alive[id(owner)] = owner
@@ -97,7 +97,7 @@ class ListenerThread:
         with self._lock:
             self.is_stopped = True
         self._kept_alive.clear()
-        self._calls.put((_nothing, ()))  # wakes the thread, which then notices `is_stopped`
+        self._calls.put((_nothing, ()))  # This wakes the thread, which then notices `is_stopped`.
 
     def join(self) -> None:
         """Wait until the thread has ended, at most two seconds, because a callback may block."""
@@ -110,7 +110,7 @@ class ListenerThread:
                 thread = _Thread(target=self._run, name=self._name, daemon=True)
                 try:
                     thread.start()
-                except RuntimeError:  # the interpreter is shutting down
+                except RuntimeError:  # The interpreter is shutting down.
                     self.is_stopped = True
                 else:
                     self._thread = thread
@@ -122,10 +122,10 @@ class ListenerThread:
                 return
             try:
                 function(*args)
-            except BaseException:  # including SystemExit, which would end only this thread, not the program
+            except BaseException:  # SystemExit, too, would end only this thread, not the program.
                 logger.exception("Exception in a callback")
             self.on_called()
-            del function, args  # the thread would keep them alive until the next call
+            del function, args  # Without this, the thread would keep them alive until the next call.
 
 
 class _Thread(threading.Thread):

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 MAX_MESSAGES = 1000
-MESSAGE_MAX_AGE_S = 5.0  # drops older messages, so that a program that reads rarely gets recent ones
+MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program that reads rarely gets recent ones.
 # Messages are stored from the first access on. Until this long after the first access, a look-up waits for its message.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
-SIGNAL_CHECK_INTERVAL_S = 0.2  # longer waits are split into steps, so that Ctrl-C and a closed connection end them
+SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.
 
 
 class Master:
@@ -144,7 +144,8 @@ class Master:
 
     def _command(self, command: int, *params: float) -> None:
         seven_params = (*params, *(0,) * (7 - len(params)))
-        self.mav.command_long_send(self.target_system, self.target_component, command, 0, *seven_params)
+        confirmation = 0
+        self.mav.command_long_send(self.target_system, self.target_component, command, confirmation, *seven_params)
 
     # ------------------------------------------------------------ raw parameter and mission messages
 
@@ -194,7 +195,8 @@ class Master:
         def matches(message: Any) -> bool:
             return bool(mavutil.evaluate_condition(condition, {message.get_type(): message}))
 
-        may_wait = blocking and not self._connection.loop.is_current  # a wait on the loop's thread would stop reception
+        # A wait on the loop's thread would stop reception.
+        may_wait = blocking and not self._connection.loop.is_current
         return self.messages.next_match(names, matches, timeout if may_wait else 0.0)
 
     def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
@@ -223,7 +225,7 @@ class Master:
         ``alt`` is in metres above home with ``relative_alt``, otherwise above sea level.
         """
         gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
-        hud = self.recv_match(type="VFR_HUD", blocking=True)  # like pymavlink, take the altitude from VFR_HUD
+        hud = self.recv_match(type="VFR_HUD", blocking=True)  # As in pymavlink, the altitude is from VFR_HUD.
         position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
         alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
         return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)
@@ -239,9 +241,9 @@ class Master:
 
     def _autopilot(self) -> tuple[int, Heartbeat | None]:
         """Return the component id and the last HEARTBEAT of the vehicle's autopilot."""
-        for source, heartbeat in self._connection.connection.heartbeats.copy().items():
-            if source[0] == self.target_system and is_autopilot(heartbeat):
-                return source[1], heartbeat
+        for (system_id, component_id), heartbeat in self._connection.connection.heartbeats.copy().items():
+            if system_id == self.target_system and is_autopilot(heartbeat):
+                return component_id, heartbeat
         return 0, None
 
 
@@ -282,7 +284,8 @@ class Inbox(Mapping[str, Any]):
         message_id = _id_of(name)
         while (frame := self._latest.get(message_id)) is None and self._may_wait():
             with self._frame_arrived:
-                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # short, so that _may_wait() ends in time
+                # The wait is short, so that `_may_wait` ends the loop in time.
+                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)
         if frame is None:
             raise KeyError(name)
         return message_of(frame)
@@ -304,7 +307,8 @@ class Inbox(Mapping[str, Any]):
         if loop.is_current:
             observe_frames(weak_callback(self._on_frame))
         else:
-            loop.call(observe_frames, weak_callback(self._on_frame))  # blocks until attached, to miss no later message
+            # This blocks until the observer is attached, so that no later message is missed.
+            loop.call(observe_frames, weak_callback(self._on_frame))
 
     def _may_wait(self) -> bool:
         is_young = self._started_at is not None and time.monotonic() < self._started_at + FIRST_LOOKUP_TIMEOUT_S

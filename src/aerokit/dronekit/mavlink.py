@@ -155,21 +155,21 @@ class MAVConnection(ClassicConnection):
         return queue.Queue()
 
     def _forward(self, frame: Frame, peer: Peer) -> None:
-        self.listener_thread.offer(self._deliver, frame)
+        self.listener_thread.post_or_drop(self._deliver, frame)
 
     def _deliver(self, frame: Frame) -> None:
         self._call(self.message_listeners, message_of(frame))
 
     def _tick(self) -> None:
         if self.connection.is_open:
-            self.listener_thread.offer(self._call, self.loop_listeners)
+            self.listener_thread.post_or_drop(self._call, self.loop_listeners)
             asyncio.get_running_loop().call_later(TICK_INTERVAL_S, self._tick)
 
     def _call(self, listeners: list[Callable[..., object]], *args: Any) -> None:
         for listener in tuple(listeners):
             try:
                 listener(self, *args)
-            except BaseException:  # including SystemExit, which would end only the listener thread
+            except BaseException:  # SystemExit, too, would only end the listener thread.
                 logger.exception("Exception in a listener of the connection")
 
     def write_frame(self, frame: Frame) -> None:
@@ -221,7 +221,7 @@ def _open(
                 is_last_attempt = attempt == MAX_OPEN_ATTEMPTS - 1
                 was_refused = isinstance(error.__context__, ConnectionRefusedError)
                 if is_last_attempt or not was_refused:
-                    _raise_classic(error)
+                    raise _classic_error(error)  # noqa: B904 - `error` already is its cause
                 time.sleep(RETRY_INTERVAL_S)
         raise AssertionError("unreachable: the last attempt returns or raises")
     except BaseException:
@@ -252,16 +252,18 @@ def _check_address(ip: object) -> None:
         raise AddressError(str(error)) from None
 
 
-def _raise_classic(error: LinkOpenError) -> NoReturn:
-    """Raise a failure to open a link as an exception of the operating system's type, which programs catch."""
+def _classic_error(error: LinkOpenError) -> Exception:
+    """Convert a failure to open a link to an exception of the operating system's type, which programs catch."""
     cause = error.__context__
+    classic: Exception
     if isinstance(cause, OSError):
-        if cause.errno is not None:
-            raise type(cause)(cause.errno, str(error)) from error
-        raise type(cause)(str(error)) from error
-    if isinstance(cause, ValueError):  # raised by pyserial for an unsupported baud rate
-        raise ValueError(str(error)) from error
-    raise error
+        classic = type(cause)(str(error)) if cause.errno is None else type(cause)(cause.errno, str(error))
+    elif isinstance(cause, ValueError):  # raised by pyserial for an unsupported baud rate
+        classic = ValueError(str(error))
+    else:
+        return error
+    classic.__cause__ = error
+    return classic
 
 
 def mavudpin_multi(device: str, baud: int | None = None, **_: Any) -> MAVConnection:

@@ -96,10 +96,10 @@ class Listeners:
             self.deliver(name, value)
         elif waits:
             self._thread.call(self.deliver, name, value)
-        elif cache:  # offer() could drop the call, but a change must not be lost
+        elif cache:  # A change must not be lost, so the call may not be dropped.
             self._thread.post(self.deliver, name, value)
         else:
-            self._thread.offer(self.deliver, name, value)
+            self._thread.post_or_drop(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
         """Call :meth:`notify` with the owner's attribute of this name. Reads the attribute only if it has listeners."""
@@ -114,13 +114,13 @@ class Listeners:
             for listener in self.by_name.get(name, ()):
                 try:
                     listener(self._owner, attr_name, value)
-                except BaseException:  # including SystemExit, which would end only the listener thread
+                except BaseException:  # SystemExit, too, would only end the listener thread.
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
     def _keep_owner(self) -> None:
         # Listeners get the owner as an argument, so they keep the owner alive even if the program has dropped it.
         if self._thread is not None:
-            self._thread.keep(self, has_listeners=bool(self.by_name))
+            self._thread.keep_alive(self, has_listeners=bool(self.by_name))
 
 
 def listener_decorator(
@@ -193,7 +193,7 @@ class MessageListeners(Listeners):
 
     def add(self, name: str, listener: AttributeListener) -> None:
         """Add a listener for every message of this name, or for every message (``'*'``)."""
-        _pymavlink()  # imported here, because the 60 ms would delay reception at the first message
+        _pymavlink()  # The import takes 60 ms, which would delay the first message.
         super().add(str(name), listener)
         self._attach_now()
 
@@ -214,7 +214,7 @@ class MessageListeners(Listeners):
         if self._handler.loop.is_current:
             self._attach()
         else:
-            with contextlib.suppress(AerokitError):  # the connection may be closed
+            with contextlib.suppress(AerokitError):  # The connection may be closed.
                 # Blocks until attached, so that no message is missed after add() has returned.
                 self._handler.loop.call(self._attach)
 
@@ -243,7 +243,7 @@ class MessageListeners(Listeners):
 
     def _on_frame(self, frame: Frame, peer: Peer = None) -> None:
         if not self._handler.is_of_another_vehicle(frame.system_id):
-            self._handler.listener_thread.offer(self._deliver, frame)
+            self._handler.listener_thread.post_or_drop(self._deliver, frame)
 
     def _deliver(self, frame: Frame) -> None:
         message = message_of(frame)

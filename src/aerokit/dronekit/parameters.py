@@ -130,7 +130,7 @@ async def _download(
 ) -> None:
     """Download all parameters on the loop, without a reference that keeps the classic vehicle alive."""
     try:
-        on_success(await vehicle.parameters.download(method=await _method(vehicle)))
+        on_success(await vehicle.parameters.download(method=await _download_method(vehicle)))
     except ConnectionClosed:
         return
     except AerokitError as error:
@@ -141,7 +141,7 @@ async def _download(
         on_ended()
 
 
-async def _method(vehicle: AsyncVehicle) -> DownloadMethod:
+async def _download_method(vehicle: AsyncVehicle) -> DownloadMethod:
     """Return the method of the download. Waits briefly for AUTOPILOT_VERSION, which shows if a file is available."""
     version = vehicle.telemetry.version
     with anyio.move_on_after(VERSION_TIMEOUT_S):
@@ -178,7 +178,7 @@ class ParameterValues:
         """Store a parameter; return True if it is new or changed."""
         name, previous = parameter.name, self._parameters.get(parameter.name)
         if previous is None and len(self._parameters) >= MAX_PARAMETERS:
-            return False  # limits memory, because a sender can make up names
+            return False  # A sender can make up names, so their number is limited.
         if previous is None and name != name.upper():
             self._spelling_of_upper[name.upper()] = name
         self._parameters[name] = parameter
@@ -251,7 +251,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     def __getitem__(self, name: str) -> float:
         value = self.get(name)
         if value is None:
-            raise KeyError(_with_replacement(name.upper()) if isinstance(name, str) else name)
+            raise KeyError(_key_error_text(name.upper()) if isinstance(name, str) else name)
         return value
 
     def get(  # type: ignore[override]
@@ -320,7 +320,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if resolved is not None:
             vehicle_name = resolved.name
             if resolved.renamed is not None:
-                converted = resolved.renamed.to_vehicle(number)  # set_parameter converts to integers
+                converted = resolved.renamed.to_vehicle(number)  # `set_parameter` converts it to an integer if needed.
                 warn_of_rename(resolved.renamed)
         core = self._core
         if retries <= 0:
@@ -347,7 +347,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        is_settled = self._is_settled  # read before find(), because the last value may arrive in between
+        is_settled = self._is_settled  # Read before `find`: the last value may arrive in between.
         resolved = self._values.find(name)
         if resolved is None and waits and not is_settled and _is_valid_name(name):
             self._core.run(self._wait_for, name)
@@ -401,7 +401,8 @@ def _upper_name(name: str) -> str:
     return name.upper()
 
 
-def _with_replacement(name: str) -> str:
+def _key_error_text(name: str) -> str:
+    """Return the name of an unknown parameter, and what has replaced the parameter, if known."""
     from aerokit.parameters.renames import replacement_of
 
     replacement = replacement_of(name)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from aerokit.dronekit.sitl import ServedVehicle
 else:
-    Loader = MetaPathFinder = object  # importing the real classes takes longer than importing the rest of this package
+    Loader = MetaPathFinder = object  # Importing the real classes takes longer than importing the rest of this package.
 
 ALIAS, PACKAGE = "dronekit", "aerokit.dronekit"
 
@@ -99,7 +99,7 @@ class _SubmoduleLoader(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        module.__spec__ = self._own_spec  # restored, because the import system has set the spec of the alias
+        module.__spec__ = self._own_spec  # The import system has set the spec of the alias.
 
 
 FAILED, CANNOT_OPEN = 1, 2
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         return FAILED
     sys.excepthook = _print_program_traceback
     if not getattr(sys.flags, "safe_path", False):
-        del sys.path[:1]  # the folder of this command; the program's own folder takes its place
+        del sys.path[:1]  # The program's folder takes the place of this command's folder.
     run = _run_module if options.module else _run_file
     try:
         run(options.program, program_arguments)
@@ -261,7 +261,7 @@ def _lacks_main(path: str) -> bool:
 def _file_error(path: str) -> str | None:
     try:
         io.open_code(os.path.abspath(path)).close()
-    except IsADirectoryError:  # not an error here, because a folder with a __main__.py is a program
+    except IsADirectoryError:  # A folder with a __main__.py is a program.
         return None
     except OSError as error:
         return error.strerror
@@ -316,7 +316,7 @@ def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None
     # Skip our frames up to the one that runs the program, then those of runpy.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):
         entry = entry.tb_next
-    if entry is None:  # the error did not happen in the program, so all frames are of interest
+    if entry is None:  # The error did not happen in the program, so all frames are of interest.
         return traceback
     entry = entry.tb_next
     while entry is not None and entry.tb_frame.f_code.co_filename in RUNPY_FILES:

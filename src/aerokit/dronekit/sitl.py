@@ -71,7 +71,7 @@ class ServedVehicle:
 
     def stop(self) -> None:
         if self._thread.is_alive():
-            with suppress(RuntimeError):  # the loop may have just ended
+            with suppress(RuntimeError):  # The loop may have just ended.
                 self._loop.call_soon_threadsafe(self._stop_requested.set)
             self._thread.join()
 
@@ -82,7 +82,7 @@ class ServedVehicle:
         try:
             self._loop.run_until_complete(self._serve())
         except Exception as error:
-            if self._startup_ended.is_set():  # otherwise __init__ raises the error
+            if self._startup_ended.is_set():  # Otherwise `__init__` raises the error.
                 errprinter(f"the simulated vehicle failed: {error!r}")
             self._error = error
         finally:
@@ -109,8 +109,9 @@ def serve_for_program(kind: str, home: tuple[float, float, float], speedup: floa
         _vehicle_for_program = ServedVehicle(kind, USUAL_ADDRESSES, home=home, speedup=speedup)
     except LinkOpenError as error:
         errprinter(f"{error}; using another port")
-        any_port = ("tcpin:127.0.0.1:0", *USUAL_ADDRESSES[1:])
-        _vehicle_for_program = ServedVehicle(kind, any_port, home=home, speedup=speedup)
+        _, udp_address = USUAL_ADDRESSES
+        addresses = ("tcpin:127.0.0.1:0", udp_address)  # The system chooses the TCP port.
+        _vehicle_for_program = ServedVehicle(kind, addresses, home=home, speedup=speedup)
     return _vehicle_for_program
 
 
@@ -121,7 +122,8 @@ class SITL:
         global _next_instance
         self.path = path
         if instance is None:
-            instance, _next_instance = _next_instance, _next_instance + 1
+            instance = _next_instance
+            _next_instance += 1
         self.instance: int = instance
         self._kind: str | None = None
         self._served: ServedVehicle | None = None
@@ -155,15 +157,18 @@ class SITL:
             if not restart:
                 raise ChildProcessError("SITL is already running in this process, please use .stop() to kill it")
             self.stop()
-        options = _sitl_options().parse_known_args(list(initial_args))[0]
+        options, _ = _sitl_options().parse_known_args(list(initial_args))
         if options.instance is not None:
             self.instance = options.instance
-        kind, speedup, addresses = self._kind, speedup or options.speedup, [self._address()]
+        kind = self._kind
+        speedup = speedup or options.speedup
+        addresses = [self._address()]
         # The new vehicle replaces that of --sim, whose kind and speed are the defaults.
         if _vehicle_for_program is not None:
             kind = kind or _vehicle_for_program.kind
             speedup = speedup or _vehicle_for_program.speedup
-            addresses += USUAL_ADDRESSES[1:]  # the UDP address; `_address` is the TCP address
+            _, udp_address = USUAL_ADDRESSES
+            addresses.append(udp_address)
             _vehicle_for_program.stop()
             _vehicle_for_program = None
         kind = kind or KINDS.get(options.model or "", "copter")
@@ -199,7 +204,7 @@ def start_default(lat: float | None = None, lon: float | None = None) -> SITL:
     if (lat is None) != (lon is None):
         raise InvalidArgument("dronekit_sitl.start_default needs either both lat and lon or neither")
     sitl = SITL()
-    heading_deg = 353  # required by the format of SITL's --home, but ignored
+    heading_deg = 353  # The format of SITL's --home requires a heading, which is ignored.
     sitl.launch([] if lat is None else [f"--home={lat:f},{lon:f},{HOME[2]},{heading_deg}"])
     return sitl
 

@@ -27,7 +27,7 @@ from aerokit.dronekit.privates import OverridableProperty, VehiclePrivates
 from aerokit.dronekit.util import ErrprinterHandler
 from aerokit.errors import AerokitError, ConnectFailed
 from aerokit.mavlink.enums import MavCmd
-from aerokit.mavlink.messages import CommandLong
+from aerokit.protocols.command import command_long
 from aerokit.vehicle.connect import connect as connect_async
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         heartbeat_limit_s = max(heartbeat_timeout or 0.0, 0.0)
         timeout = heartbeat_limit_s or CONNECT_TIMEOUT_S
         with self._dk_initializing:
-            if self._dk.aio_or_none is not None:  # already connected by an earlier call
+            if self._dk.aio_or_none is not None:  # An earlier call has connected it.
                 self._dk_wait_until_booted(timeout)
                 return
             self._dk.heartbeat_limit_s = heartbeat_limit_s
@@ -259,8 +259,9 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving, in the same loop iteration in which the vehicle was found. Uses weak references only."""
         core = self._dk
-        core.begin(aio, tasks)
-        self._handler.vehicle, self._handler.note_sent = self, aio.note_sent
+        core.start_receiving(aio, tasks)
+        self._handler.vehicle = self
+        self._handler.note_sent = aio.note_sent
         self._handler.calls.describe = self._dk_describe
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
         # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.
@@ -287,8 +288,9 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         deadline = next_value_deadline = now + FIRST_VALUES_TIMEOUT_S
         missing_before = names
         while (missing := names - ready.names) and now < min(deadline, next_value_deadline):
-            if missing < missing_before:  # at least one more value has arrived (`<` means: a proper subset)
-                missing_before, next_value_deadline = missing, now + NEXT_VALUE_TIMEOUT_S
+            if len(missing) < len(missing_before):  # Another value has arrived.
+                missing_before = missing
+                next_value_deadline = now + NEXT_VALUE_TIMEOUT_S
             ready.wait_for_change(names, min(deadline, next_value_deadline) - now)
             now = time.monotonic()
 
@@ -325,7 +327,7 @@ async def _request_capabilities(aio: AsyncVehicle) -> None:
     for _ in range(5):
         if aio.telemetry.version.is_known:
             return
-        aio.send(CommandLong(aio.system_id, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, 0, 1, *(0.0,) * 6))
+        aio.send(command_long(aio.system_id, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
         await anyio.sleep(1.0)
 
 
@@ -362,7 +364,8 @@ def connect(
         timeout: seconds for ``wait_ready``.
         still_waiting_callback: called with the set of missing names.
         still_waiting_interval: seconds between these calls.
-        status_printer: called with every text of the autopilot, on the listener thread, until the vehicle is closed.
+        status_printer: called with every STATUSTEXT of the autopilot, on the listener thread, until the vehicle is
+            closed.
         vehicle_class: a subclass of :class:`Vehicle`.
         rate: Hz of the requested data streams; None requests none.
         baud: bits per second, for a serial port whose string has no baud rate.
@@ -394,13 +397,13 @@ def connect(
             heartbeat=heartbeat,
         )
     except (OSError, ValueError, KeyboardInterrupt) as error:
-        raise error.with_traceback(None) from None  # frames of this package do not help the user
+        raise error.with_traceback(None) from None  # Frames of this package do not help the user.
     handler.overrides.is_enabled = release_overrides
     try:
         vehicle = cast("VehicleT", Vehicle(handler)) if vehicle_class is None else vehicle_class(handler)
         if status_printer is not None:
             _print_texts(handler, status_printer)
-            handler.listener_thread.keep(vehicle, has_listeners=True)
+            handler.listener_thread.keep_alive(vehicle, has_listeners=True)
         if _initialize:
             vehicle.initialize(rate=rate, heartbeat_timeout=heartbeat_timeout)
         if wait_ready:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.connection.frame_receiver import MAX_PEERS, PeerTable
 from aerokit.hub.message_rules import Filters, MessageKind
@@ -62,7 +62,7 @@ class Attachment:
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
-        self._is_on_link = False  # True once this object has opened the link, and therefore must close it
+        self._owns_link = False  # True once this object has opened the link, and therefore must close it
         self._reports_bursts = False
         # True if the link has a single remote end, e.g. a serial port. Its `Port` has the key None.
         self._is_single = False
@@ -75,7 +75,7 @@ class Attachment:
         )
         self._is_full_reported = False
         self.counters: EndpointCounters = EndpointCounters(Counter())
-        self._former_totals = [0, 0, 0, 0]  # frames, bytes, lost frames and bad bytes from peers that are forgotten
+        self._totals_of_forgotten_peers = _Totals(0, 0, 0, 0)
         self._reported_refusals: set[str] = set()
         self._gateway: SigningGateway | None = None
         if endpoint.signing is not None:
@@ -83,26 +83,28 @@ class Attachment:
 
     async def open(self) -> None:
         await self.link.open(self)
-        self._is_on_link = True
+        self._owns_link = True
         self._on_up()
         self._report(self, "opened", f"{self.link.address} is open")
 
     def close(self) -> None:
         self._on_down()
-        if self._is_on_link:
+        if self._owns_link:
             self.link.close()
 
     async def wait_closed(self) -> None:
-        if self._is_on_link:
+        if self._owns_link:
             await self.link.wait_closed()
 
     def statistics(self) -> EndpointStatistics:
         router, ports = self._switch.router, tuple(self._ports.values())
-        totals = list(self._former_totals)
+        totals = self._totals_of_forgotten_peers
         for framer in self._peers:
-            totals = [total + count for total, count in zip(totals, _totals(framer), strict=True)]
-        frames_in, bytes_in, lost, bad_bytes = totals
-        systems = {source for port in ports if port.node is not None for source in router.senders_at(port.node)}
+            totals = totals.plus(framer)
+        systems: set[tuple[int, int]] = set()
+        for port in ports:
+            if port.node is not None:
+                systems.update(router.senders_at(port.node))
         dropped = {reason: count for reason, count in self.counters.dropped.items() if count}
         if self.link.dropped_writes:
             dropped["link"] = self.link.dropped_writes
@@ -111,12 +113,12 @@ class Attachment:
             address=self.link.address,
             is_open=self.is_open,
             peers=len(ports),
-            frames_in=frames_in,
-            bytes_in=bytes_in,
+            frames_in=totals.frames,
+            bytes_in=totals.bytes,
             frames_out=self.counters.frames_out,
             bytes_out=self.counters.bytes_out,
-            lost=lost,
-            bad_bytes=bad_bytes,
+            lost=totals.lost,
+            bad_bytes=totals.bad_bytes,
             waiting=sum(port.waiting for port in ports),
             dropped=dropped,
             systems=tuple(sorted(systems)),
@@ -238,7 +240,7 @@ class Attachment:
         kind = self.link.address.partition(":")[0]
         if kind in UNBUFFERED_KINDS and isinstance(self.endpoint.address, str):
             return UNLIMITED
-        return _queue_above_bytes(self.link.address)
+        return _min_queue_above_bytes(self.link.address)
 
     def _forget(self, peer: Peer) -> None:
         self._forget_port(peer)
@@ -248,9 +250,7 @@ class Attachment:
         """Remove the port of a peer. The counters of its framer stay in the endpoint's totals."""
         framer = self._peers.framers.get(peer)
         if framer is not None:
-            self._former_totals = [
-                total + count for total, count in zip(self._former_totals, _totals(framer), strict=True)
-            ]
+            self._totals_of_forgotten_peers = self._totals_of_forgotten_peers.plus(framer)
         self._guard.forget(peer)
         port = self._ports.pop(peer, None)
         self._guard.is_shared = len(self._ports) > 1
@@ -280,9 +280,10 @@ class Attachment:
         if frame.kind is not MessageKind.ORDER:  # Only dropped commands are reported; other frames are just counted.
             return
         name = self._dialect[frame.message_id].NAME
-        waited_s = self._now() - frame.since
+        waited_s = self._now() - frame.waiting_since
         explanation = {"late": "it waited too long", "queue_full": "the queue is full"}.get(reason, "the link was lost")
-        target = f"{frame.target[0]}/{frame.target[1]}"
+        system_id, component_id = frame.target
+        target = f"{system_id}/{component_id}"
         self._report(self, "order_dropped", f"{name} for {target} was dropped after {waited_s:.1f} s: {explanation}")
 
 
@@ -296,7 +297,8 @@ def filters_of(endpoint: Endpoint, dialect: Dialect) -> Filters:
     return Filters(dialect, endpoint.only, endpoint.block, endpoint.rates)
 
 
-def _queue_above_bytes(address: str) -> int:
+def _min_queue_above_bytes(address: str) -> int:
+    """Return the smallest limit of the links in an address, which may name several links."""
     kinds = (part.split(":")[0] for part in address.removeprefix("shared:").split(" + "))
     return min(QUEUE_ABOVE_BYTES.get(kind, DEFAULT_QUEUE_ABOVE_BYTES) for kind in kinds)
 
@@ -305,8 +307,19 @@ def _keep_unknown(framer: Framer) -> None:
     framer.keep_unknown = True
 
 
-def _totals(framer: Framer) -> tuple[int, int, int, int]:
-    """Return four counters of a framer: frames, bytes, lost frames and bad bytes."""
-    counters = framer.statistics
-    lost = sum(source.lost for source in counters.sources.values())
-    return counters.frames, counters.bytes, lost, counters.bad_bytes
+class _Totals(NamedTuple):
+    """Counters of received data, summed over framers."""
+
+    frames: int
+    bytes: int
+    lost: int
+    bad_bytes: int
+
+    def plus(self, framer: Framer) -> _Totals:
+        counters = framer.statistics
+        return _Totals(
+            self.frames + counters.frames,
+            self.bytes + counters.bytes,
+            self.lost + sum(source.lost for source in counters.sources.values()),
+            self.bad_bytes + counters.bad_bytes,
+        )

@@ -102,7 +102,7 @@ class MessageKind(Enum):
     TELEMETRY = "telemetry"
     """While it waits, newer telemetry with the same message id from the same sender replaces it."""
     TRANSFER = "transfer"
-    """Sent in order and never replaced, e.g. part of a transfer, an answer or a text."""
+    """Sent in order and never replaced, e.g. part of a transfer, an answer or a STATUSTEXT."""
     ORDER = "order"
     """A command: sent in order, but dropped after a second, so that it never arrives late."""
 
@@ -207,8 +207,8 @@ class TargetFields:
             # A message that is not in the table has no target (None).
             self.offsets.update(dict.fromkeys(dialect.rows))
             for (system, component), message_ids in STANDARD_OFFSETS.items():
-                component = NO_FIELD if component is None else HEADER_LENGTH + component
-                self.offsets.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component)))
+                component_offset = NO_FIELD if component is None else HEADER_LENGTH + component
+                self.offsets.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component_offset)))
 
     def look_up(self, message_id: int) -> FieldOffsets | None:
         """Return the offsets of a message; None if it has no target, or is not in the dialect."""
@@ -233,9 +233,11 @@ class TargetFields:
         if offsets is None:
             return 0, 0
         # A byte beyond the end is 0: MAVLink 2 truncates trailing zeros, and MAVLink 1 has no extension fields.
-        body, (system, component) = frame.body, offsets
-        size = len(body)
-        return body[system] if system < size else 0, body[component] if component < size else 0
+        body, size = frame.body, len(frame.body)
+        system_offset, component_offset = offsets
+        system_id = body[system_offset] if system_offset < size else 0
+        component_id = body[component_offset] if component_offset < size else 0
+        return system_id, component_id
 
 
 def _field_offsets(message_type: type[Message]) -> FieldOffsets | None:

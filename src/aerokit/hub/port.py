@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit.hub.message_rules import ORDER_MAX_AGE_S, MessageKind, kind_of
-from aerokit.mavlink.frame import MAGIC_V2, SIGNED, Frame, x25
+from aerokit.mavlink.frame import HEADER_LENGTH, MAGIC_V2, SIGNED, Frame, x25
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -32,7 +32,7 @@ class QueuedFrame(NamedTuple):
     kind: MessageKind
     message_id: int
     target: tuple[int, int]
-    since: float
+    waiting_since: float
 
 
 class FrameQueue:
@@ -68,13 +68,12 @@ class FrameQueue:
         while self._is_full(len(frame.raw)):
             if not self._telemetry_count:
                 return [*dropped, ("queue_full", frame)]
-            oldest_key = next(at for at, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY)
-            dropped.append(("queue_full", self._remove(oldest_key)))
+            oldest_telemetry = next(
+                queued_key for queued_key, queued in self._frames.items() if queued.kind is MessageKind.TELEMETRY
+            )
+            dropped.append(("queue_full", self._remove(oldest_telemetry)))
         self._frames[key] = frame
-        self._bytes += len(frame.raw)
-        # True counts as 1.
-        self._order_count += frame.kind is MessageKind.ORDER
-        self._telemetry_count += frame.kind is MessageKind.TELEMETRY
+        self._count(frame, 1)
         return dropped
 
     def expire(self, now: float) -> list[tuple[str, QueuedFrame]]:
@@ -84,13 +83,16 @@ class FrameQueue:
         late = [
             key
             for key, queued in self._frames.items()
-            if queued.kind is MessageKind.ORDER and now - queued.since > ORDER_MAX_AGE_S
+            if queued.kind is MessageKind.ORDER and now - queued.waiting_since > ORDER_MAX_AGE_S
         ]
         return [("late", self._remove(key)) for key in late]
 
-    def next(self) -> bytes | None:
+    def pop(self) -> bytes | None:
         """Remove and return the first frame, or None if the queue is empty. Call :meth:`expire` before."""
-        return self._remove(next(iter(self._frames))).raw if self._frames else None
+        if not self._frames:
+            return None
+        first_key = next(iter(self._frames))
+        return self._remove(first_key).raw
 
     def clear(self) -> list[tuple[str, QueuedFrame]]:
         dropped = [("link_lost", frame) for frame in self._frames.values()]
@@ -103,18 +105,23 @@ class FrameQueue:
 
     def _remove(self, key: int) -> QueuedFrame:
         frame = self._frames.pop(key)
-        self._bytes -= len(frame.raw)
-        self._order_count -= frame.kind is MessageKind.ORDER
-        self._telemetry_count -= frame.kind is MessageKind.TELEMETRY
+        self._count(frame, -1)
         return frame
 
+    def _count(self, frame: QueuedFrame, change: int) -> None:
+        """Update the counts for an added frame (``change`` is 1) or a removed frame (-1)."""
+        self._bytes += change * len(frame.raw)
+        if frame.kind is MessageKind.ORDER:
+            self._order_count += change
+        elif frame.kind is MessageKind.TELEMETRY:
+            self._telemetry_count += change
 
-def _reframed(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
+
+def _to_mavlink2(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
     """Return the frame as an unsigned MAVLink 2 frame with these incompatibility flags, and a new checksum."""
-    body = frame.body
     # MAVLink 2 truncates trailing zeros, but keeps at least one byte. MAVLink 1 does not truncate.
-    payload = body[9:].rstrip(b"\0") or body[9:10]
-    body = bytes((len(payload), flags)) + body[2:9] + payload
+    payload = frame.payload.rstrip(b"\0") or frame.payload[:1]
+    body = bytes((len(payload), flags)) + frame.body[2:HEADER_LENGTH] + payload
     return bytes((MAGIC_V2,)) + body + x25(body + crc_extra).to_bytes(2, "little")
 
 
@@ -132,7 +139,7 @@ class SigningGateway:
         self.signing = signing
         self._extras, self._refused = crc_extras, refused
 
-    def admitted(self, frame: Frame, unix_time: float) -> Frame | None:
+    def verify(self, frame: Frame, unix_time: float) -> Frame | None:
         """Verify a received frame. Return the frame without its signature; None if the frame is refused."""
         try:
             refusal = self.signing.check(frame, unix_time)
@@ -142,21 +149,21 @@ class SigningGateway:
         if refusal is not None:
             self._refused(frame, refusal.value)
             return None
-        return self.unsigned(frame)
+        return self.strip_signature(frame)
 
-    def unsigned(self, frame: Frame) -> Frame:
+    def strip_signature(self, frame: Frame) -> Frame:
         extra = self._extras.get(frame.message_id)
         if not frame.incompat_flags & SIGNED or extra is None:
             return frame
-        return Frame.parse(_reframed(frame, extra, flags=0), frame.received_at)
+        return Frame.parse(_to_mavlink2(frame, extra, flags=0), frame.received_at)
 
-    def signed(self, raw: bytes, unix_time: float) -> bytes | None:
+    def sign(self, raw: bytes, unix_time: float) -> bytes | None:
         """Return the frame ``raw`` with a signature; None if the dialect does not have the message."""
         frame = Frame.parse(raw)
         extra = self._extras.get(frame.message_id)
         if extra is None:
             return None
-        data = _reframed(frame, extra, flags=SIGNED)
+        data = _to_mavlink2(frame, extra, flags=SIGNED)
         return data + self.signing.sign(data, unix_time)
 
 
@@ -220,11 +227,12 @@ class Port:
         """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
         """Data to write: single frames, or pieces of several."""
-        self.joined_frames: int = 0  # A piece of n frames in `batch` counts as n - 1, in addition to its element.
-        """Difference between the number of frames in ``batch`` and the number of its pieces, for the counters."""
+        self.joined_frames: int = 0
+        """Number of frames in ``batch`` minus the number of its pieces, for the counters."""
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
-        self._queue_above_bytes, self._may_queue = queue_above_bytes, queue_above_bytes < UNLIMITED
+        self._queue_above_bytes = queue_above_bytes
+        self._may_queue = queue_above_bytes < UNLIMITED
         self._on_drop = on_drop
         self._queue = FrameQueue()
         self._due: dict[int, float] = {}
@@ -249,7 +257,8 @@ class Port:
         message_type = self._dialect.get(plan.message_id)
         kind = MessageKind.TRANSFER  # An unknown message may be part of a transfer, so it is never replaced.
         if message_type is not None:
-            kind = kind_of(message_type.NAME, has_target=plan.target[0] != 0)
+            system_id, _ = plan.target
+            kind = kind_of(message_type.NAME, has_target=system_id != 0)
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def is_due(self, key: int, period_s: float, now: float) -> bool:
@@ -285,7 +294,7 @@ class Port:
         """Drop queued commands that have waited too long, then write queued frames while the link accepts data."""
         self._drop(self._queue.expire(now))
         while self._queue and not self._is_full():
-            raw = self._queue.next()
+            raw = self._queue.pop()
             assert raw is not None
             self.batch.append(raw)
             self.flush(unix_time)
@@ -294,9 +303,9 @@ class Port:
         """Drop all queued commands."""
         self._drop(self._queue.expire(math.inf))
 
-    def drop_late(self, frame: Frame, target: tuple[int, int], since: float) -> None:
-        """Drop a command that was received at this port, and has waited since this time."""
-        self._drop([("late", QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, since))])
+    def drop_late(self, frame: Frame, target: tuple[int, int], arrived_at: float) -> None:
+        """Drop a command that arrived at this port at this time, and was read too late."""
+        self._drop([("late", QueuedFrame(frame.raw, MessageKind.ORDER, frame.message_id, target, arrived_at))])
 
     def close(self) -> None:
         self._drop(self._queue.clear())
@@ -309,7 +318,7 @@ class Port:
 
     def _signed(self, batch: list[bytes], unix_time: float) -> list[bytes]:
         assert self.gateway is not None
-        signed = [self.gateway.signed(raw, unix_time) for raw in batch]
+        signed = [self.gateway.sign(raw, unix_time) for raw in batch]
         self.counters.dropped["unsignable"] += signed.count(None)
         return [raw for raw in signed if raw is not None]
 

@@ -81,7 +81,7 @@ class RouterPort(Generic[PortT]):
         self.number: int = number
         """Unique number above 0."""
         self.plans: dict[int, ForwardingPlan[PortT]] = {}
-        """Maps message id, target and sender (as one number) to the plan for such frames that arrive at this port."""
+        """Maps message id, target and sender (as one number) to the plan for frames that arrive at this port."""
         self.streams: dict[bytes, ForwardingPlan[PortT]] = {}
         """Maps sender and message, as bytes of a frame, to the plan for broadcasts of senders that this port reaches.
         """
@@ -187,8 +187,8 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # An earlier frame with this identity that arrived at the same port is another frame, whose number and
-                # checksum are equal by chance.
+                # An earlier frame with this identity that arrived at the same port (item 0 of its record) is another
+                # frame, whose number and checksum are equal by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == number:
                     newer[identity] = record
                     plan.sender.received_at = now
@@ -229,7 +229,7 @@ class Router(Generic[PortT]):
             recent.newer[identity] = first_port, port_count, now
         else:
             recent.newer[identity] = number, self._port_count, now
-        if sender.number == number:
+        if sender.port_number == number:
             sender.received_at = now
         else:
             self._record_at_other_port(sender, node, now)
@@ -241,9 +241,12 @@ class Router(Generic[PortT]):
             offsets = self._targets.look_up(message_id)
         target = 0
         if offsets is not None:
-            size, (system, component) = len(body), offsets
-            if system < size:
-                target = body[system] | (body[component] << 8 if component < size else 0)
+            size = len(body)
+            system_offset, component_offset = offsets
+            if system_offset < size:
+                target = body[system_offset]
+                if component_offset < size:
+                    target |= body[component_offset] << 8
         key = message_id << 32 | target << 16 | source
         try:
             return node.plans[key]
@@ -274,10 +277,10 @@ class Router(Generic[PortT]):
         return len(self._senders) < MAX_ROUTES
 
     def _record_at_other_port(self, sender: Sender, node: RouterPort[PortT], now: float) -> None:
-        former_number = sender.number
+        former_number = sender.port_number
         if sender.record_at_other_port(node.number, now):
             self.forget_plans()
-        if sender.is_autopilot and sender.number != former_number:
+        if sender.is_autopilot and sender.port_number != former_number:
             self._report("route_changed", sender.source, node, former_number)
 
     def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
@@ -299,7 +302,8 @@ class Router(Generic[PortT]):
 
     def _is_loop(self, node: RouterPort[PortT], source: int, first_port: int, now: float) -> bool:
         """Count a returning frame. Return True if a loop is proven, now or during the last `LOOP_WINDOW_S`."""
-        count = node.echoes[source] = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
+        count = min(node.echoes.get(source, 0) + 1, MIN_LOOP_FRAMES)
+        node.echoes[source] = count
         was_proven = now < node.loop_until
         if count < MIN_LOOP_FRAMES and not was_proven:
             return False
@@ -329,21 +333,23 @@ class Router(Generic[PortT]):
             self.forget_plans()
             if self.on_vehicle is not None:
                 self.on_vehicle(node.port)
-            if sender.number != node.number:  # The autopilot was received at another port before.
-                self._report("duplicate_sender", sender.source, node, sender.number)
+            if sender.port_number != node.number:  # The autopilot was received at another port before.
+                self._report("duplicate_sender", sender.source, node, sender.port_number)
 
     # -------------------------------------------------------------------------------------- plans
 
     def _plan(self, node: RouterPort[PortT], key: int) -> ForwardingPlan[PortT]:
+        """Make the plan for ``key``, a key of `RouterPort.plans`, and cache it."""
         message_id, target, source = key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF
-        ids = target & 0xFF, target >> 8
+        target_system, target_component = target & 0xFF, target >> 8
+        ids = target_system, target_component
         plan_key = message_id << 16 | source
         if message_id == _SETUP_SIGNING:
             return ForwardingPlan(plan_key, message_id, ids, reason="secret")
-        has_target = ids[0] != 0
+        has_target = target_system != 0
         # The keys of the dictionary are used as a set that keeps its order.
         if has_target:
-            numbers = self._ports_to(*ids, source, node.number)
+            numbers = self._ports_to(target_system, target_component, source, node.number)
             if not numbers:
                 # This plan is not cached, because a sender could fill the cache with unknown targets.
                 return ForwardingPlan(plan_key, message_id, ids, reason="no_route")
@@ -373,7 +379,7 @@ class Router(Generic[PortT]):
         node.plans[key] = plan
         # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
         # sender's, may change the data about the sender, so `route` must process them.
-        if message_id and sender.number == node.number and self._offsets.get(message_id) is None:
+        if message_id and sender.port_number == node.number and self._offsets.get(message_id) is None:
             node.streams[source.to_bytes(2, "little") + message_id.to_bytes(3, "little")] = plan
         return plan
 
@@ -394,7 +400,8 @@ class Router(Generic[PortT]):
             is_reached = member.is_vehicle and any(member.is_at(number) for number in numbers)
             if is_reached:
                 continue
-            for number in (here,) if member is origin else member.destinations:
+            destinations = (here,) if member is origin else member.destinations
+            for number in destinations:
                 # A port at which an autopilot is received is left out for other members. The autopilot would otherwise
                 # get the command twice.
                 if member.is_autopilot or not any(autopilot.is_at(number) for autopilot in autopilots):
@@ -404,7 +411,7 @@ class Router(Generic[PortT]):
     def _is_redundant(self, number: int) -> bool:
         """Return True if other ports reach all autopilots that are received at this port."""
         here = [sender for sender in self._senders.values() if sender.is_autopilot and sender.is_at(number)]
-        return bool(here) and all(sender.number != number for sender in here)
+        return bool(here) and all(sender.port_number != number for sender in here)
 
     def _has_autopilot(self, number: int) -> bool:
         return any(sender.is_autopilot and number in sender.ports for sender in self._senders.values())

@@ -53,7 +53,7 @@ class Sender:
         "component_id",
         "is_autopilot",
         "is_vehicle",
-        "number",
+        "port_number",
         "ports",
         "received_at",
         "reported",
@@ -61,17 +61,17 @@ class Sender:
         "system_id",
     )
 
-    def __init__(self, source: int, number: int, now: float) -> None:
+    def __init__(self, source: int, port_number: int, now: float) -> None:
         self.source: int = source
         """System id + 256 · component id."""
         self.system_id: int = source & 0xFF
         self.component_id: int = source >> 8
-        self.number: int = number
+        self.port_number: int = port_number
         """Number of the port to which messages for this sender go, if one port is enough."""
         self.received_at: float = now
         """Time of the last frame at that port."""
-        self.ports: dict[int, float] = {number: now}
-        """Maps port numbers to the time of the last frame there; for `number`, use :attr:`received_at`."""
+        self.ports: dict[int, float] = {port_number: now}
+        """Maps port numbers to the time of the last frame there; for `port_number`, use :attr:`received_at`."""
         self.is_vehicle: bool = False
         """True if its HEARTBEAT is not that of a ground station. Messages for a vehicle go to one port only."""
         self.is_autopilot: bool = False
@@ -81,19 +81,20 @@ class Sender:
     @property
     def destinations(self) -> Iterable[int]:
         """Numbers of the ports to which messages for this sender go."""
-        return (self.number,) if self.is_vehicle else self.ports
+        return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
         """Return True if the sender was received at this port within `ROUTE_TIMEOUT_S` before its last frame."""
-        return number == self.number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
+        return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float) -> bool:
-        """Record a frame at another port than `number`. Return True if the routes to the sender change."""
+        """Record a frame at another port than `port_number`. Return True if the routes to the sender change."""
         is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
-        if now - self.received_at > ROUTE_TIMEOUT_S:  # The sender is silent at `number`: messages go to the new port.
-            self.ports[self.number] = self.received_at
-            self.number, self.received_at = number, now
+        if now - self.received_at > ROUTE_TIMEOUT_S:
+            # The sender is silent at its present port, so messages go to the new port.
+            self.ports[self.port_number] = self.received_at
+            self.port_number, self.received_at = number, now
             return True
         return is_new
 
@@ -115,9 +116,9 @@ class Sender:
         """Forget a port that was removed. Return True if the sender is not known at any other port."""
         self.reported.discard(number)
         self.ports.pop(number, None)
-        if self.number == number and self.ports:
-            self.number = max(self.ports, key=self.ports.__getitem__)
-            self.received_at = self.ports[self.number]
+        if self.port_number == number and self.ports:
+            self.port_number = max(self.ports, key=self.ports.__getitem__)
+            self.received_at = self.ports[self.port_number]
         return not self.ports
 
 
@@ -186,13 +187,14 @@ class IdentityGuard:
 
     def _publish(self, event: Event) -> None:
         if isinstance(event, RouteChanged):
-            source = event.system_id, event.component_id
-            self._reported_at.pop(source, None)  # The peer that owned the ids may now be the duplicate: report it.
-            text = f"messages for {source[0]}/{source[1]} are sent here now, no longer to {event.before}"
+            ids = event.system_id, event.component_id
+            self._reported_at.pop(ids, None)  # The peer that owned the ids may now be the duplicate: report it.
+            text = f"messages for {event.system_id}/{event.component_id} are sent here now, no longer to {event.before}"
             self._report("route_changed", self._current_peer, text)
         elif isinstance(event, DuplicateSender):
-            source = event.system_id, event.component_id
-            if event.at - self._reported_at.get(source, -math.inf) > REPEAT_EVENT_S:
-                self._reported_at[source] = event.at
-                text = f"frames as {source[0]}/{source[1]} are dropped, because another peer has these ids"
+            ids = event.system_id, event.component_id
+            if event.at - self._reported_at.get(ids, -math.inf) > REPEAT_EVENT_S:
+                self._reported_at[ids] = event.at
+                sender = f"{event.system_id}/{event.component_id}"
+                text = f"frames as {sender} are dropped, because another peer has these ids"
                 self._report("duplicate_sender", self._current_peer, text)

@@ -60,12 +60,12 @@ class SharedLink(Link):
             frame = Frame.parse(raw)
             if not self._is_duplicate_reported:
                 self._check_ids(frame)
-            is_for_this_program = self._targets.target_of(frame)[0] == self._connection.source_system
-            if is_for_this_program:
+            target_system, _ = self._targets.target_of(frame)
+            if target_system == self._connection.source_system:  # The frame is for this program.
                 continue
             try:
                 gateway = self._current_gateway()
-                signed = raw if gateway is None else gateway.signed(raw, self._connection.unix_time())
+                signed = raw if gateway is None else gateway.sign(raw, self._connection.unix_time())
                 if signed is None:
                     self.dropped_writes += 1
                 else:
@@ -104,13 +104,13 @@ class SharedLink(Link):
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         gateway = self._current_gateway()
         if self._receiver is not None:
-            unsigned = frame if gateway is None else gateway.unsigned(frame)
+            unsigned = frame if gateway is None else gateway.strip_signature(frame)
             self._receiver.bytes_received(unsigned.raw, None)
 
     def _on_sent(self, raw: bytes) -> None:
         gateway = self._current_gateway()
         if self._receiver is not None:
-            unsigned = raw if gateway is None else gateway.unsigned(Frame.parse(raw)).raw
+            unsigned = raw if gateway is None else gateway.strip_signature(Frame.parse(raw)).raw
             self._receiver.bytes_received(unsigned, None)
 
     def _on_end(self, error: Exception) -> None:

@@ -29,6 +29,8 @@ MAX_POLL_INTERVAL_S = 0.08
 # If a port receives more frames than this at once, the collected frames are written immediately.
 MAX_BURST_FRAMES = 256
 
+_HEARTBEAT_ID = 0
+
 _message_id = attrgetter("message_id")
 
 
@@ -53,7 +55,9 @@ class Switch:
         self.router.on_vehicle = _write_single_frames
         self._on_error = on_error
         self._loop_watch = LoopWatch(
-            lambda _: None, lambda _: self._drop_queued_orders(), on_caught_up=self._exclude_pause
+            on_blocked=lambda _: None,
+            on_slept=lambda _: self._drop_queued_orders(),
+            on_caught_up=self._exclude_pause,
         )
         self._loop_watch.start()
         self.recording: Recording | None = None
@@ -111,7 +115,7 @@ class Switch:
     ) -> None:
         """Forward frames received at a port. ``data`` has their bytes; None if other bytes were between them.
 
-        Commands that may have waited since ``arrived_at`` are dropped if that is too long.
+        Commands that may have waited too long since ``arrived_at`` are dropped.
         """
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
@@ -124,14 +128,15 @@ class Switch:
         late = framer.late
         is_checked = port.gateway is not None
         if guard is not None and not is_checked:
-            is_checked = guard.is_shared or 0 in map(_message_id, frames)  # 0: HEARTBEAT
+            is_checked = guard.is_shared or _HEARTBEAT_ID in map(_message_id, frames)
         if is_checked:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
             if port.gateway is not None or len(frames) != received_count:
                 data = None  # The bytes as received are no longer those of the frames to forward.
         if now - arrived_at > ORDER_MAX_AGE_S:
-            frames, data = self._without_orders(port, frames, arrived_at), None
+            frames = self._without_orders(port, frames, arrived_at)
+            data = None
         plans = self.router.route_all(node, frames, arrived_at, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
             for frame, plan in zip(frames, plans, strict=True):
@@ -147,9 +152,9 @@ class Switch:
         self._is_scheduled = False
         if not self._ports_to_flush:
             return
-        dirty, self._ports_to_flush = self._ports_to_flush, []
+        ports, self._ports_to_flush = self._ports_to_flush, []
         unix_time = self.unix_time()
-        for port in dirty:
+        for port in ports:
             if port.batch:
                 try:
                     port.flush(unix_time)
@@ -162,11 +167,11 @@ class Switch:
         late: list[Frame] = []
         gateway, guard, peer = port.gateway, port.guard, port.peer
         for received in frames:
-            frame = received if gateway is None else gateway.admitted(received, self.unix_time())
+            frame = received if gateway is None else gateway.verify(received, self.unix_time())
             if frame is None:
                 continue
-            # The guard must see every heartbeat (0). If there is only one peer, its other frames need no check.
-            must_check = guard is not None and (guard.is_shared or frame.message_id == 0)
+            # The guard must see every heartbeat. If there is only one peer, its other frames need no check.
+            must_check = guard is not None and (guard.is_shared or frame.message_id == _HEARTBEAT_ID)
             if guard is not None and must_check and not guard.admits(frame, framer, peer):
                 port.counters.dropped["foreign"] += 1
                 continue
@@ -179,9 +184,8 @@ class Switch:
         """Drop commands, and return the other frames."""
         remaining = []
         for frame in frames:
-            target = self._targets.target_of(frame)
             if self._targets.is_order(frame.message_id):
-                port.drop_late(frame, target, arrived_at)
+                port.drop_late(frame, self._targets.target_of(frame), arrived_at)
             else:
                 remaining.append(frame)
         return remaining

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 _MIN_VALUE, _MAX_VALUE = -(1 << 63), (1 << 64) - 1
 
-# Names of attributes that message classes already have. A field with such a name gets a trailing underscore. Only
-# private dialects have such fields.
+# Names of attributes that message classes already have. A field with one of these names gets a trailing
+# underscore. Only private dialects have such fields.
 _RESERVED = frozenset(
     (
         "ID", "NAME", "CRC_EXTRA", "FIELDS", "LENGTH", "BASE_LENGTH", "received_frame",
@@ -209,8 +209,8 @@ def read_xml(path: Path) -> DialectDefinition:
         root = DefusedXml.fromstring(read_bounded(path), forbid_dtd=True)
         return DialectDefinition(
             name=path.stem,
-            messages=tuple(_message(node, path.stem) for node in root.findall("messages/message")),
-            enums=tuple(_enum(node, path.stem) for node in root.findall("enums/enum")),
+            messages=tuple(_parse_message(node, path.stem) for node in root.findall("messages/message")),
+            enums=tuple(_parse_enum(node, path.stem) for node in root.findall("enums/enum")),
             includes=tuple((node.text or "").strip() for node in root.findall("include")),
         )
     except FileNotFoundError:
@@ -249,7 +249,7 @@ def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
     raise InvalidArgument(f"{file.name} includes {include}, which is in none of these folders: {searched}")
 
 
-def _message(node: Element, origin: str) -> MessageDefinition:
+def _parse_message(node: Element, origin: str) -> MessageDefinition:
     """Parse a ``<message>``. Fields after ``<extensions/>`` are extension fields."""
     fields: list[FieldDefinition] = []
     extension = False
@@ -257,7 +257,7 @@ def _message(node: Element, origin: str) -> MessageDefinition:
         if child.tag == "extensions":
             extension = True
         elif child.tag == "field":
-            fields.append(_field(child, extension, node.attrib["name"]))
+            fields.append(_parse_field(child, extension, node.attrib["name"]))
     message = MessageDefinition(
         id=int(node.attrib["id"], 0),
         name=_identifier(node.attrib["name"]),
@@ -277,7 +277,7 @@ def _message(node: Element, origin: str) -> MessageDefinition:
     return message
 
 
-def _field(node: Element, extension: bool, message: str) -> FieldDefinition:
+def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinition:
     # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
@@ -302,7 +302,7 @@ def carries_bytes(message: str, field_name: str, kind: str) -> bool:
     return kind == "char" and (message, field_name) in BYTES_IN_CHARS
 
 
-def _enum(node: Element, origin: str) -> EnumDefinition:
+def _parse_enum(node: Element, origin: str) -> EnumDefinition:
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):
@@ -314,7 +314,7 @@ def _enum(node: Element, origin: str) -> EnumDefinition:
                 name=_identifier(child.attrib["name"]),
                 value=value,
                 description=_text(child.find("description")),
-                params=tuple(_param(param) for param in child.findall("param")),
+                params=tuple(_parse_param(param) for param in child.findall("param")),
                 remarks=_remarks(child),
             )
         )
@@ -328,7 +328,7 @@ def _enum(node: Element, origin: str) -> EnumDefinition:
     )
 
 
-def _param(node: Element) -> tuple[int, str, str, str]:
+def _parse_param(node: Element) -> tuple[int, str, str, str]:
     return int(node.attrib["index"]), node.get("label", ""), node.get("units", ""), _text(node)
 
 

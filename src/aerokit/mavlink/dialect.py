@@ -43,7 +43,9 @@ class Dialect:
     def _set_rows(self, rows: dict[int, Row]) -> None:
         self.rows = rows
         """Maps message ids to (CRC_EXTRA, payload length without extensions, payload length with extensions)."""
-        self.extras: dict[int, bytes] = {message_id: bytes((row[0],)) for message_id, row in rows.items()}
+        self.extras: dict[int, bytes] = {
+            message_id: bytes((crc_extra,)) for message_id, (crc_extra, *_) in rows.items()
+        }
         """Maps message ids to CRC_EXTRA as a byte, which is appended to the payload for the checksum."""
         self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {
             message_id: partial(self._decode_first, message_id) for message_id in rows
@@ -123,10 +125,10 @@ class Dialect:
         """Return a dialect with the messages of both dialects. InvalidArgument if an id is defined differently."""
         for message_id in self.rows.keys() & other.rows.keys():
             if self.rows[message_id] != other.rows[message_id]:
+                ours, theirs = self[message_id], other[message_id]
                 raise InvalidArgument(
-                    f"message id {message_id} is {self[message_id].NAME} (CRC_EXTRA {self.rows[message_id][0]}) in"
-                    f" {self.name!r}, but {other[message_id].NAME} (CRC_EXTRA {other.rows[message_id][0]}) in"
-                    f" {other.name!r}"
+                    f"message id {message_id} is {ours.NAME} (CRC_EXTRA {ours.CRC_EXTRA}) in {self.name!r},"
+                    f" but {theirs.NAME} (CRC_EXTRA {theirs.CRC_EXTRA}) in {other.name!r}"
                 )
         return _Extended(self, other)
 
@@ -139,7 +141,8 @@ class _Standard(Dialect):
         self._set_rows({message_id: row[2:] for message_id, row in messages.INDEX.items()})
 
     def __getitem__(self, message_id: int) -> type[Message]:
-        message_class: type[Message] = getattr(messages, messages.INDEX[message_id][0])
+        class_name, *_ = messages.INDEX[message_id]
+        message_class: type[Message] = getattr(messages, class_name)
         return message_class
 
     def by_name(self, name: str) -> type[Message]:
@@ -170,11 +173,10 @@ class _Extended(Dialect):
                 continue
         if not enum_types:
             return super().enum(name)  # This raises InvalidArgument.
-        is_first_complete = len(enum_types) == 1 or (
-            enum_types[1].__members__.keys() <= enum_types[0].__members__.keys()
-        )
+        first, *others = enum_types
+        is_first_complete = all(other.__members__.keys() <= first.__members__.keys() for other in others)
         if is_first_complete:
-            return enum_types[0]
+            return first
         if name not in self._enums:
             self._enums[name] = _merge_enums(*enum_types)
         return self._enums[name]

@@ -65,8 +65,9 @@ class FrameEncoder:
             InvalidArgument: a field has an invalid value; no sequence number is used.
         """
         signing = self.signing if self._version == 2 else None
+        flags = 0 if signing is None else SIGNED
+        source = self.system_id, self.component_id
         if self._encode_frame is not None:
-            flags, source = 0 if signing is None else SIGNED, (self.system_id, self.component_id)
             compiled: bytes | None = self._encode_frame(message, self._version, flags, self.sequence, *source)
             if compiled is not None:
                 self.sequence = (self.sequence + 1) & 0xFF
@@ -77,16 +78,17 @@ class FrameEncoder:
         message_id = message.ID
         if self._version == 2:
             payload = payload.rstrip(b"\0") or payload[:1]  # MAVLink 2 never truncates the first byte.
-            flags = 0 if signing is None else SIGNED
-            source = self.system_id, self.component_id
-            body = _HEADER_V2(len(payload), flags, 0, self.sequence, *source, message_id & 0xFFFF, message_id >> 16)
-            body, magic = body + payload, _MAGIC_V2
+            compat_flags = 0
+            low_id, high_id = message_id & 0xFFFF, message_id >> 16
+            header = _HEADER_V2(len(payload), flags, compat_flags, self.sequence, *source, low_id, high_id)
+            magic = _MAGIC_V2
         else:
             if message_id > 255:
                 raise InvalidArgument(f"{message.NAME} has id {message_id}, but MAVLink 1 has no ids above 255")
             payload = payload[: message.BASE_LENGTH]
-            source = self.system_id, self.component_id
-            body, magic = bytes((len(payload), self.sequence, *source, message_id)) + payload, _MAGIC_V1
+            header = bytes((len(payload), self.sequence, *source, message_id))
+            magic = _MAGIC_V1
+        body = header + payload
         self.sequence = (self.sequence + 1) & 0xFF
         frame = magic + body + x25(body + _BYTES[message.CRC_EXTRA]).to_bytes(2, "little")
         return frame if signing is None else frame + signing.sign(frame, now)

@@ -28,7 +28,7 @@ class Frame(FrameFields):
     """One frame with a valid checksum. Treat it as immutable, because all receivers share it."""
 
     # For speed, there is no constructor: the framer sets the attributes directly. Properties compute all other values.
-    if not TYPE_CHECKING:  # type checkers see the attributes of the base class
+    if not TYPE_CHECKING:  # Type checkers see the attributes of the base class.
         __slots__ = ()
 
     body: bytes
@@ -51,11 +51,12 @@ class Frame(FrameFields):
         frame = cls()
         frame._raw = raw
         frame.received_at = received_at
-        payload_end = raw[1] + (6 if raw[0] == MAGIC_V1 else 10)
+        magic, payload_length = raw[:2]
+        payload_end = payload_length + (6 if magic == MAGIC_V1 else 10)
         frame.checksum = int.from_bytes(raw[payload_end : payload_end + 2], "little")
-        if raw[0] == MAGIC_V1:
-            # `body` always has the header layout of MAVLink 2, so the MAVLink 1 header is converted.
-            frame.body = bytes((raw[1], 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
+        if magic == MAGIC_V1:
+            # `body` always has the header layout of MAVLink 2: the flags and the upper bytes of the message id are 0.
+            frame.body = bytes((payload_length, 0, 0, *raw[2:6], 0, 0)) + raw[6:payload_end]
         else:
             frame.body = raw[1:payload_end]
         frame.system_id, frame.component_id = frame.body[4:6]
@@ -65,7 +66,7 @@ class Frame(FrameFields):
     @property
     def raw(self) -> bytes:
         """The whole frame, from the magic byte to the checksum or signature."""
-        raw: bytes | None = getattr(self, "_raw", None)  # twice as fast as catching AttributeError
+        raw: bytes | None = getattr(self, "_raw", None)  # This is twice as fast as catching AttributeError.
         return b"\xfd" + self.body + self.checksum.to_bytes(2, "little") if raw is None else raw
 
     @property
@@ -111,9 +112,11 @@ def is_whole_frame(data: bytes) -> bool:
     """Return True if the bytes are one frame by their header and length. The checksum is not verified."""
     if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
         return False
-    if data[0] == MAGIC_V1:
-        return len(data) == data[1] + 8
-    return data[2] <= SIGNED and len(data) == data[1] + 12 + SIGNATURE_LENGTH * data[2]
+    magic, payload_length, flags = data[:3]
+    if magic == MAGIC_V1:
+        return len(data) == payload_length + 8
+    signature_length = SIGNATURE_LENGTH if flags == SIGNED else 0
+    return flags <= SIGNED and len(data) == payload_length + 12 + signature_length
 
 
 def x25_in_python() -> Callable[[bytes], int]:

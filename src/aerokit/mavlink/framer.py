@@ -27,7 +27,7 @@ from aerokit.mavlink.statistics import OTHERS, FramerStatistics, SourceLimit, So
 MAX_SOURCES = 1024
 """Number of senders with separate counters, for a framer without a shared `SourceLimit`."""
 
-# The module struct has no format for three bytes. The message id is therefore the lower three bytes of the last item,
+# Python's ``struct`` has no format for three bytes. The message id is therefore the lower three bytes of the last item,
 # whose upper byte belongs to the payload.
 _HEADER_V2 = Struct("<BBBxBHI").unpack_from  # magic, length, flags, sequence, source, id
 _HEADER_V1 = Struct("<xBBHB").unpack_from  # length, sequence, source, id
@@ -131,30 +131,32 @@ class PythonFramer:
         while begin < size:
             try:
                 magic, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
-                if good := magic == MAGIC_V2 and flags <= SIGNED:
+                is_valid = magic == MAGIC_V2 and flags <= SIGNED
+                if is_valid:
                     message_id &= 0xFFFFFF
                     payload_end = begin + 10 + length
                     end = payload_end + 2
                     body = data[begin + 1 : payload_end]
                     (checksum,) = _CHECKSUM(data, payload_end)
-                    good = x25(body + extras[message_id]) == checksum
+                    is_valid = x25(body + extras[message_id]) == checksum
                     if flags:
                         end += SIGNATURE_LENGTH
-                        good = good and end <= size
+                        is_valid = is_valid and end <= size
             except (StructError, KeyError):
-                good, body = False, b""
+                is_valid = False
+                body = b""
                 end = sequence = key = message_id = checksum = 0
-            if not good:
-                found = None
+            if not is_valid:
+                next_frame = None
                 if data[begin] in _MAGICS and (begin or scan is _NEW_SCAN):
-                    found = self._examine(data, begin)[2]
-                if found is None:
-                    found = self._search(data, begin, _NEW_SCAN if begin else scan)
+                    _, _, next_frame = self._examine(data, begin)
+                if next_frame is None:
+                    next_frame = self._search(data, begin, _NEW_SCAN if begin else scan)
                 if self._unknown:
                     frames += self._take_unknown(now)
-                if found is None:
+                if next_frame is None:
                     break
-                begin, end, message_id, sequence, key = found
+                begin, end, message_id, sequence, key = next_frame
             try:
                 source = sources[key]
             except KeyError:
@@ -163,10 +165,10 @@ class PythonFramer:
                 source.expected += 1
             else:
                 out_of_order = out_of_order or []
-                if verdict := source.out_of_order(sequence, now):
-                    out_of_order.append((len(frames), verdict, sequence << 16 | key))
+                if ordering := source.out_of_order(sequence, now):
+                    out_of_order.append((len(frames), ordering, sequence << 16 | key))
             if wanted is None or message_id in wanted:
-                if good:
+                if is_valid:
                     frame = Frame()
                     frame.body = body
                     frame.checksum = checksum
@@ -203,12 +205,12 @@ class PythonFramer:
 
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
         # Frames of unwanted messages are not in `frames`, so there may be a different frame at that position.
-        for position, verdict, identity in out_of_order:
+        for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
                     continue
-                if verdict == OTHERS:
+                if ordering == OTHERS:
                     self.foreign.append(frame)
                 else:
                     self.late.append(frame)
@@ -219,47 +221,49 @@ class PythonFramer:
         """Return the next valid frame from ``begin`` on, or keep possible beginnings of frames in ``_rest``."""
         size = len(data)
         keep_from = -1  # position from which data is kept
-        unknown = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame
-        examined, candidates, bad_crcs = scan
+        unknown_begin = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame
+        examined_to, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
-        reached = size
-        new = ((match.start(), _NOISE, 0) for match in _magics(data, max(begin, examined)))
-        for here, verdict, end in chain(candidates, new, ((size, _NOISE, size),)):
-            if unknown >= 0 and here >= unknown_end:
+        new_candidates = ((match.start(), _NOISE, 0) for match in _magics(data, max(begin, examined_to)))
+        examined_to = size
+        end_of_data = (size, _NOISE, size)
+        for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):
+            if unknown_begin >= 0 and position >= unknown_end:
                 if unknown_end == size or data[unknown_end] in _MAGICS:
-                    self._count_skipped(begin, unknown, bad_crcs)
-                    self._skip_unknown(data, unknown, unknown_end)
+                    self._count_skipped(begin, unknown_begin, bad_crcs)
+                    self._skip_unknown(data, unknown_begin, unknown_end)
                     begin = unknown_end
-                    keep_from, pending = -1, []
-                    bad_crcs = [place for place in bad_crcs if place >= begin]
-                unknown = -1
-            if here >= size:
+                    keep_from = -1
+                    pending = []
+                    bad_crcs = [bad_crc for bad_crc in bad_crcs if bad_crc >= begin]
+                unknown_begin = -1
+            if position >= size:
                 break
             if end <= size and verdict != _UNKNOWN:
-                verdict, end, found = self._examine(data, here)
+                verdict, end, frame = self._examine(data, position)
                 if verdict == _GOOD:
-                    self._count_skipped(begin, here, bad_crcs)
-                    return found
+                    self._count_skipped(begin, position, bad_crcs)
+                    return frame
             if verdict == _BAD_CRC:
-                bad_crcs.append(here)
+                bad_crcs.append(position)
             elif verdict != _NOISE:
-                pending.append((here, verdict, end))
+                pending.append((position, verdict, end))
             if verdict == _WAIT:
-                keep_from = _earliest(keep_from, unknown, here)
-                reached = here + 1
+                keep_from = _earliest(keep_from, unknown_begin, position)
+                examined_to = position + 1
                 break
             if verdict == _IMPLAUSIBLE and keep_from < 0:
-                keep_from = here
-            elif verdict == _UNKNOWN and keep_from < 0 and unknown < 0:
-                unknown, unknown_end = here, end
+                keep_from = position
+            elif verdict == _UNKNOWN and keep_from < 0 and unknown_begin < 0:
+                unknown_begin, unknown_end = position, end
         keep = size if keep_from < 0 else keep_from
         self._count_skipped(begin, keep, bad_crcs)
         self._rest = data[keep:]
         self._scan = (
-            reached - keep,
-            [(here - keep, verdict, end - keep) for here, verdict, end in pending if here >= keep],
-            [here - keep for here in bad_crcs if here >= keep],
+            examined_to - keep,
+            [(position - keep, verdict, end - keep) for position, verdict, end in pending if position >= keep],
+            [bad_crc - keep for bad_crc in bad_crcs if bad_crc >= keep],
         )
         return None
 
@@ -276,7 +280,7 @@ class PythonFramer:
             _, _, _, sequence, key, message_id = _HEADER_V2(data, begin)
         else:
             _, sequence, key, message_id = _HEADER_V1(data, begin)
-        self.statistics.unknown(message_id & 0xFFFFFF)
+        self.statistics.count_unknown(message_id & 0xFFFFFF)
         source = self._sources.get(key)
         if source is not None and source.expected & 0xFF == sequence:
             source.skip(1)
@@ -285,13 +289,13 @@ class PythonFramer:
         # Bytes outside frames are counted. Bytes that are kept are not counted yet, because they may become a frame.
         self.statistics.bad_bytes += end - begin
         if bad_crcs:
-            self.statistics.bad_crcs += sum(place < end for place in bad_crcs)
+            self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
         """Return (verdict, end, frame if valid) for the magic byte at ``begin``."""
         size = len(data)
         if data[begin] == MAGIC_V2:
-            if size - begin < 3:  # the flags have not arrived yet
+            if size - begin < 3:  # The flags have not arrived yet.
                 return _WAIT, begin + 3, None
             if size - begin < _MIN_LENGTH_V2:
                 are_flags_known = data[begin + 2] <= SIGNED
@@ -299,33 +303,36 @@ class PythonFramer:
             _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None
-            message_id, body = message_id & 0xFFFFFF, begin + 10
-            end = body + length + 2 + (SIGNATURE_LENGTH if flags else 0)
+            message_id &= 0xFFFFFF
+            payload = begin + 10
+            end = payload + length + 2 + (SIGNATURE_LENGTH if flags else 0)
         else:
             if size - begin < _MIN_LENGTH_V1:
                 return _WAIT, begin + _MIN_LENGTH_V1, None
             length, sequence, key, message_id = _HEADER_V1(data, begin)
-            body, flags = begin + 6, 0
-            end = body + length + 2
+            payload = begin + 6
+            end = payload + length + 2
         row = self._rows.get(message_id)
         if row is None:
             return (_UNKNOWN if end <= size else _IMPLAUSIBLE), end, None
         extra, base_length, full_length = row
-        if body - begin == 6 and not base_length <= length <= full_length:
+        is_v1 = data[begin] == MAGIC_V1
+        if is_v1 and not base_length <= length <= full_length:
             return _NOISE, size, None  # A MAVLink 1 payload is neither truncated nor longer than its definition.
         if end > size:
             return (_WAIT if length <= full_length else _IMPLAUSIBLE), end, None
-        payload_end = body + length
-        if x25(data[begin + 1 : payload_end] + bytes((extra,))) != _CHECKSUM(data, payload_end)[0]:
+        payload_end = payload + length
+        (checksum,) = _CHECKSUM(data, payload_end)
+        if x25(data[begin + 1 : payload_end] + bytes((extra,))) != checksum:
             return _BAD_CRC, end, None
         return _GOOD, end, (begin, end, message_id, sequence, key)
 
 
-def _earliest(keep_from: int, unknown: int, here: int) -> int:
-    """Return the start of the data to keep: the earliest candidate for a frame, at ``here`` or before (-1: none)."""
-    if unknown >= 0:  # `unknown` is only set while `keep_from` is not set, so it is the earlier position.
-        return unknown
-    return here if keep_from < 0 else keep_from
+def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
+    """Return the earliest of three candidates for the beginning of a frame. The first two may be missing (-1)."""
+    if unknown_begin >= 0:  # It is only set while `keep_from` is missing, so it is the earlier of the two.
+        return unknown_begin
+    return position if keep_from < 0 else keep_from
 
 
 if TYPE_CHECKING or wire is None:
@@ -341,6 +348,7 @@ else:
             self._out_of_order: list[tuple[int, int, int]] = []
 
         def _find(self, data: bytes, begin: int, kept: int, now: float, frames: list[Frame]) -> int | None:
+            """Return the start of the next valid frame from ``begin`` on, or None. Add unknown frames to ``frames``."""
             # `kept` comes from compiled code. It is 0 if no data was kept from earlier calls, 1 if the kept data is the
             # beginning of one plausible frame, and 2 if `_scan` describes the kept data.
             scan = _NEW_SCAN
@@ -348,17 +356,20 @@ else:
                 scan = self._scan
             elif kept == 1:
                 scan = (1, [(0, _WAIT, 0)], [])
-            found = self._search(data, begin, scan)
+            next_frame = self._search(data, begin, scan)
             if self._unknown:
                 frames += self._take_unknown(now)
-            return None if found is None else found[0]
+            if next_frame is None:
+                return None
+            frame_begin, *_ = next_frame
+            return frame_begin
 
         def _add_source(self, key: int, sequence: int, now: float) -> SourceStatistics:
             return self.statistics.add_source(key, sequence, self._limit.make_room(now))
 
         def _count_out_of_order(self, source: SourceStatistics, key: int, sequence: int, now: float, at: int) -> None:
-            if verdict := source.out_of_order(sequence, now):
-                self._out_of_order.append((at, verdict, sequence << 16 | key))
+            if ordering := source.out_of_order(sequence, now):
+                self._out_of_order.append((at, ordering, sequence << 16 | key))
 
         def _sort_out_of_order(self, frames: list[Frame]) -> None:
             out_of_order, self._out_of_order = self._out_of_order, []

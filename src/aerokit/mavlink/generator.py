@@ -58,7 +58,7 @@ def with_added_messages(
     for added in (message for dialect in additions for message in dialect.messages):
         existing = merged.get(added.id)
         if existing is not None:
-            added = _with_first_origin(replace(existing, fields=_fields(existing, added)), added)
+            added = _with_first_origin(replace(existing, fields=_merged_fields(existing, added)), added)
         merged[added.id] = added
     return list(merged.values())
 
@@ -73,7 +73,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
     for added in (enum for dialect in additions for enum in dialect.enums):
         existing = merged.get(added.name)
         if existing is not None:
-            entries = _entries(existing, added)
+            entries = _merged_entries(existing, added)
             added = _with_first_origin(replace(existing, entries=entries, own_prefix=existing.prefix), added)
         merged[added.name] = added
     return list(merged.values())
@@ -89,7 +89,7 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
     return replace(existing, origin=origin, remarks=added.remarks or existing.remarks)
 
 
-def _fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
+def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:
         existing_field = fields.get(field.name)
@@ -99,17 +99,18 @@ def _fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[Fiel
     return tuple(fields.values())
 
 
-def _entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
+def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
     by_name = {entry.name: entry for entry in existing.entries}
-    merged = {entry.name: _entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
+    merged = {entry.name: _merged_entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
         merged.setdefault(name, entry)
     # Sorting is stable, so the additions, which are first in `merged`, stay first among several names for one value.
     return tuple(sorted(merged.values(), key=lambda entry: entry.value))
 
 
-def _entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
-    params = {param[0]: param for param in (*existing.params, *added.params)}  # Added params replace existing ones.
+def _merged_entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
+    # Added params replace existing params with the same number.
+    params = {number: (number, label, units, text) for number, label, units, text in (*existing.params, *added.params)}
     return replace(
         existing,
         value=added.value,
@@ -375,7 +376,7 @@ def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
     head = _MESSAGES_HEAD.format(name=stems[0], more=_other_files(stems), helpers=helpers)
     if "Sequence[" not in text:
         head = head.replace("    from collections.abc import Sequence\n\n", "")
-    return head + _all(message.class_name for message in messages) + "\n" + text
+    return head + _render_all(message.class_name for message in messages) + "\n" + text
 
 
 def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
@@ -396,7 +397,7 @@ def _enums_module(module: str, stems: Sequence[str], enums: Sequence[EnumDefinit
 def _enums_stub(module: str, enums: Sequence[EnumDefinition]) -> str:
     bases = sorted({"IntFlag" if enum.bitmask else "IntEnum" for enum in enums})
     head = f"from enum import {', '.join(bases)}\n\n" if bases else ""
-    return head + _all(enum.class_name for enum in enums) + "\n" + "\n".join(map(render_enum_stub, enums))
+    return head + _render_all(enum.class_name for enum in enums) + "\n" + "\n".join(map(render_enum_stub, enums))
 
 
 def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
@@ -411,10 +412,10 @@ def _reexports(package: str, names: dict[str, str]) -> str:
     for module in sorted(set(names.values())):
         imports = "".join(f"    {name} as {name},\n" for name in sorted(names) if names[name] == module)
         stub += f"from aerokit.mavlink.{package}.{module} import (\n{imports})\n"
-    return stub + "\n" + _all(sorted(names))
+    return stub + "\n" + _render_all(sorted(names))
 
 
-def _all(names: Iterable[str]) -> str:
+def _render_all(names: Iterable[str]) -> str:
     return "__all__ = [\n" + "".join(f'    "{name}",\n' for name in names) + "]\n"
 
 

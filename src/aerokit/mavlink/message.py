@@ -47,7 +47,7 @@ SIZES = {
     "float": 4,
     "double": 8,
 }
-# Character of each number type in formats of the module struct.
+# Format character of each number type in Python's ``struct``.
 STRUCT_CODES: dict[str, str] = {
     "int8_t": "b",
     "uint8_t": "B",
@@ -157,18 +157,18 @@ def offset_of(message_type: type[Message], field: str) -> int:
     https://mavlink.io/en/guide/serialization.html#field_reordering
     """
     offset = 0
-    for name, type_, array_length, *_ in _wire_rows(message_type):
-        if name == field:
+    for wire_field in _wire_fields(message_type):
+        if wire_field.name == field:
             return offset
-        offset += SIZES[type_] * (array_length or 1)
+        offset += SIZES[wire_field.type] * (wire_field.array_length or 1)
     raise InvalidArgument(f"{message_type.NAME} has no field {field!r}")
 
 
-def _wire_rows(message_type: type[Message]) -> list[tuple[Any, ...]]:
-    """Return the rows of ``_FIELDS`` in the order of the fields on the wire."""
-    # A row has the arguments of `Field`. row[1] is the type; row[7] is True if the field is an extension.
-    base = sorted((row for row in message_type._FIELDS if not row[7]), key=lambda row: -SIZES[row[1]])
-    return [*base, *(row for row in message_type._FIELDS if row[7])]
+def _wire_fields(message_type: type[Message]) -> list[Field]:
+    """Return the fields in the order in which they are sent: largest types first, then extensions."""
+    fields = [Field(*row) for row in message_type._FIELDS]
+    base = sorted((field for field in fields if not field.extension), key=lambda field: -SIZES[field.type])
+    return [*base, *(field for field in fields if field.extension)]
 
 
 def layout_of(message_type: type[Message]) -> Any:
@@ -181,18 +181,17 @@ def layout_of(message_type: type[Message]) -> Any:
 
 
 def _new_layout(message_type: type[Message]) -> Any:
-    rows = tuple((row[0], _wire_code(row), row[2]) for row in _wire_rows(message_type))  # name, code, array length
+    rows = tuple((field.name, _wire_code(field), field.array_length) for field in _wire_fields(message_type))
     numbers = message_type.ID, message_type.CRC_EXTRA, message_type.LENGTH, message_type.BASE_LENGTH
     return wire.layout(message_type, *numbers, rows)
 
 
-def _wire_code(row: tuple[Any, ...]) -> str:
-    """Return the code of a field in ``_wire.c``: "s" for a text, "p" for bytes, else the code of the module struct."""
-    type_, array_length = row[1:3]
-    carries_bytes = row[8:] == (True,)
-    if type_ == "char":
-        return "p" if carries_bytes else "s"
-    return "p" if type_ == "uint8_t" and array_length else STRUCT_CODES[type_]
+def _wire_code(field: Field) -> str:
+    """Return the code of a field in ``_wire.c``: "s" for a text, "p" for bytes, else the code in ``struct``."""
+    if field.is_text:
+        return "s"
+    is_bytes = field.type == "char" or (field.type == "uint8_t" and field.array_length > 0)
+    return "p" if is_bytes else STRUCT_CODES[field.type]
 
 
 def decoder_of(message_type: type[MessageT]) -> Callable[[bytes, Frame | None], MessageT]:
@@ -214,7 +213,7 @@ class Message:
     Messages are equal if their classes and fields are; NaN equals NaN.
     """
 
-    if not TYPE_CHECKING:  # type checkers take a slot for a class attribute of the same name
+    if not TYPE_CHECKING:  # Type checkers take a slot for a class attribute of the same name.
         __slots__ = ("received_frame",)
         __match_args__ = ()  # overridden by each class, and inferred by type checkers, for `match`
     __hash__: ClassVar[None]  # type: ignore[assignment]
@@ -322,7 +321,7 @@ def _same(left: Any, right: Any) -> bool:
 
 
 def _number_problem(value: Any, kind: str) -> str | None:
-    """Explain why a value does not fit into this type, or return None. The module struct decides what is a number."""
+    """Explain why a value does not fit into this type, or return None. A number is what ``struct`` accepts."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
         try:  # With the largest type, this fails only for a huge number, or for a value that is no integer.

@@ -229,7 +229,7 @@ def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
         if message_class is None:
             continue
         if row is None:
-            return _checked(message_class, _decoder_for(message_class))
+            return _with_checksum_check(message_class, _decoder_for(message_class))
         crc_extra, *_ = row
         if message_class.crc_extra == crc_extra:
             return _decoder_for(message_class)
@@ -317,9 +317,11 @@ class _Received:
         return _restored, (self._decoded_class, state)
 
     def create_header(self) -> Any:
-        frame, body = self._frame, self._frame.body
+        frame = self._frame
+        flags = frame.incompat_flags, frame.compat_flags
+        payload_length = frame.body[0]
         source = frame.system_id, frame.component_id
-        return self._header_class(frame.message_id, body[1], body[2], body[0], body[3], *source)
+        return self._header_class(frame.message_id, *flags, payload_length, frame.sequence, *source)
 
     def create_msgbuf(self) -> bytearray:
         return bytearray(self._frame.raw)
@@ -361,7 +363,7 @@ def _restored(message_class: Any, state: dict[str, Any]) -> Any:
 
 
 # -------------------------------------------------------------------------------- unknown messages
-def _checked(message_class: Any, decode: Decoder) -> Decoder:
+def _with_checksum_check(message_class: Any, decode: Decoder) -> Decoder:
     # The framer cannot verify the checksum of a message that the standard does not have. The program's dialect has the
     # message, so the checksum is verified here.
 

@@ -22,14 +22,14 @@ _MAX_UNPACKED_LENGTH = 4
 def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
     """Render the class of one message with its Struct. ``docs=False`` keeps only the first docstring line."""
     lines = [
-        f"_S{message.id} = Struct({_format(message)!r})",
+        f"_S{message.id} = Struct({_struct_format(message)!r})",
         "",
         "",
         f"class {message.class_name}(Message):",
     ]
     lines += _docstring(_message_doc(message) if docs else [f"{message.name} ({message.id})."], "    ")
     names = [field.attribute for field in message.fields]
-    lines += ["", *_tuple("__slots__", names), *_tuple("__match_args__", names)]
+    lines += ["", *_render_tuple("__slots__", names), *_render_tuple("__match_args__", names)]
     lines += [
         f"    ID: ClassVar[int] = {message.id}",
         f"    NAME: ClassVar[str] = {_quoted(message.name)}",
@@ -43,7 +43,7 @@ def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
     for field in message.fields:
         lines += ["", f"    {field.attribute}: {_annotation(field)}"]
         lines += _docstring([_field_doc(field)], "    ") if docs else []
-    lines += ["", *_init(message), "", *_decode(message), "", *_encode(message)]
+    lines += ["", *_render_init(message), "", *_render_decode(message), "", *_render_encode(message)]
     return "\n".join(lines) + "\n"
 
 
@@ -69,18 +69,18 @@ def render_enum_stub(enum: EnumDefinition) -> str:
 # ------------------------------------------------------------------------------------------ texts
 
 
-def _page(origin: str, name: str) -> str:
+def _page_url(origin: str, name: str) -> str:
     return f"https://mavlink.io/en/messages/{origin}.html#{name}"
 
 
 def _message_doc(message: MessageDefinition) -> list[str]:
     first = f"{message.name} ({message.id}): {message.description or 'no description in the standard.'}"
-    return [first, *message.remarks, _page(message.origin, message.name)]
+    return [first, *message.remarks, _page_url(message.origin, message.name)]
 
 
 def _enum_doc(enum: EnumDefinition) -> list[str]:
     first = f"{enum.name}: {enum.description or 'no description in the standard.'}"
-    return [first, *enum.remarks, _page(enum.origin, enum.name)]
+    return [first, *enum.remarks, _page_url(enum.origin, enum.name)]
 
 
 def _field_doc(field: FieldDefinition) -> str:
@@ -120,7 +120,8 @@ def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
         texts[-1] += " "
     wrapped: list[str] = []
     for number, text in enumerate(texts):
-        wrapped += [""] if number else []
+        if number:  # An empty line separates paragraphs.
+            wrapped.append("")
         wrapped += textwrap.wrap(text, _WIDTH - len(indent) - 6, break_long_words=False, break_on_hyphens=False)
     if len(wrapped) == 1:
         return [f'{indent}"""{wrapped[0]}"""']
@@ -135,7 +136,7 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)  # JSON strings are valid Python strings
 
 
-def _tuple(name: str, items: list[str]) -> list[str]:
+def _render_tuple(name: str, items: list[str]) -> list[str]:
     return _filled(f"    {name} = (", [_quoted(item) for item in items], ")", "    ")
 
 
@@ -160,15 +161,15 @@ def _field_row(field: FieldDefinition) -> str:
     )
 
 
-def _code(field: FieldDefinition) -> str:
+def _struct_code(field: FieldDefinition) -> str:
     """Return the part of a struct format for one field."""
     if field.type == "char" or (field.type == "uint8_t" and field.array_length):
         return f"{field.array_length or 1}s"
     return f"{field.array_length or ''}{STRUCT_CODES[field.type]}"
 
 
-def _format(message: MessageDefinition) -> str:
-    return "<" + "".join(_code(field) for field in message.wire_fields)
+def _struct_format(message: MessageDefinition) -> str:
+    return "<" + "".join(_struct_code(field) for field in message.wire_fields)
 
 
 def _is_tuple(field: FieldDefinition) -> bool:
@@ -200,7 +201,7 @@ def _default(field: FieldDefinition) -> str:
     return " = 0"
 
 
-def _init(message: MessageDefinition) -> list[str]:
+def _render_init(message: MessageDefinition) -> list[str]:
     # A parameter without a default that follows one with a default must be keyword-only in Python, i.e. follow a "*".
     arguments: list[str] = []
     optional = False
@@ -217,7 +218,7 @@ def _init(message: MessageDefinition) -> list[str]:
     return [*lines, "        self.received_frame: Frame | None = None"]
 
 
-def _decode(message: MessageDefinition) -> list[str]:
+def _render_decode(message: MessageDefinition) -> list[str]:
     """Render ``decode_body``, which unpacks all fields in one statement, and then converts arrays and texts."""
     unpacked = f"_S{message.id}.unpack_from(body, {HEADER_LENGTH})"
     lines = [
@@ -230,7 +231,7 @@ def _decode(message: MessageDefinition) -> list[str]:
         return [*lines, "        return self"]
     fields = message.wire_fields
     if any(_is_tuple(field) and field.array_length > _MAX_UNPACKED_LENGTH for field in fields):
-        return [*lines, *_decode_by_index(fields, unpacked), "        return self"]
+        return [*lines, *_render_decode_by_index(fields, unpacked), "        return self"]
     targets: list[str] = []
     conversions: list[str] = []
     for number, field in enumerate(fields):
@@ -241,14 +242,14 @@ def _decode(message: MessageDefinition) -> list[str]:
             conversions.append(f"        self.{field.attribute} = ({', '.join(parts)}{comma})")
         elif field.is_text:
             targets.append(f"v{number}")
-            conversions.append(f"        self.{field.attribute} = {_text(f'v{number}')}")
+            conversions.append(f"        self.{field.attribute} = {_text_expression(f'v{number}')}")
         else:
             targets.append(f"self.{field.attribute}")
     lines += _filled("        (", targets, f") = {unpacked}", "        ")
     return [*lines, *conversions, "        return self"]
 
 
-def _decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[str]:
+def _render_decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[str]:
     """Render the statements for a message with long arrays, which are slices of the unpacked values."""
     lines = [f"        values = {unpacked}"]
     index = 0
@@ -257,16 +258,16 @@ def _decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[s
             value, count = f"values[{index}:{index + field.array_length}]", field.array_length
         else:
             value, count = f"values[{index}]", 1
-        lines.append(f"        self.{field.attribute} = {_text(value) if field.is_text else value}")
+        lines.append(f"        self.{field.attribute} = {_text_expression(value) if field.is_text else value}")
         index += count
     return lines
 
 
-def _text(value: str) -> str:
+def _text_expression(value: str) -> str:
     return f'{value}.partition(b"\\0")[0].decode("utf-8", "replace")'
 
 
-def _encode(message: MessageDefinition) -> list[str]:
+def _render_encode(message: MessageDefinition) -> list[str]:
     arguments: list[str] = []
     for field in message.wire_fields:
         value = f"self.{field.attribute}"

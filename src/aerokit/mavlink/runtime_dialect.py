@@ -56,8 +56,8 @@ def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> Load
     if classes is None:
         raise InvalidArgument(f"{module.__name__} is not a pymavlink dialect: it has no mavlink_map")
     # Negative ids are those of pseudo messages such as BAD_DATA.
-    definitions = [_message(cls) for _, cls in sorted(classes.items()) if cls.id >= 0]
-    enums = [_enum(name, entries) for name, entries in getattr(module, "enums", {}).items()]
+    definitions = [_message_definition(cls) for _, cls in sorted(classes.items()) if cls.id >= 0]
+    enums = [_enum_definition(name, entries) for name, entries in getattr(module, "enums", {}).items()]
     name = module.__name__.rpartition(".")[2]
     return _load(name, definitions, [enum for enum in enums if enum.entries], standard)
 
@@ -68,7 +68,7 @@ def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message
     Raises:
         InvalidArgument: the fields of pymavlink's class do not match its CRC_EXTRA.
     """
-    definition = _message(message_class)
+    definition = _message_definition(message_class)
     return _standard_class(definition, standard) or compile_message(definition)
 
 
@@ -147,7 +147,7 @@ def _import(name: str) -> ModuleType:
     raise InvalidArgument(f"there is no pymavlink dialect {name!r}: tried {', '.join(candidates)}")
 
 
-def _message(cls: Any) -> MessageDefinition:
+def _message_definition(cls: Any) -> MessageDefinition:
     order = list(cls.ordered_fieldnames)
     message_name = getattr(cls, "msgname", None) or cls.name
     fields = []
@@ -182,7 +182,7 @@ def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra:
     raise InvalidArgument(f"{definition.name}: the fields do not match CRC_EXTRA {crc_extra}")
 
 
-def _enum(name: str, entries: dict[int, Any]) -> EnumDefinition:
+def _enum_definition(name: str, entries: dict[int, Any]) -> EnumDefinition:
     end_marker = f"{name}_ENUM_END"  # pymavlink adds this entry to each enum.
     definitions = [
         EntryDefinition(entry.name, value, entry.description)

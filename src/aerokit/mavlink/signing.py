@@ -57,6 +57,12 @@ def is_signed_with_a_key(frame: Frame) -> bool:
     )
 
 
+def _stream_and_timestamp(frame: Frame) -> tuple[tuple[int, int, int], int]:
+    """Return the stream (system id, component id, link id) and the timestamp of a signed frame."""
+    link_id, *timestamp = frame.raw[-SIGNATURE_LENGTH:-_HASH_LENGTH]
+    return (frame.system_id, frame.component_id, link_id), int.from_bytes(timestamp, "little")
+
+
 class SigningKey:
     """The shared secret of 32 bytes. ``repr`` shows only a short fingerprint, so that logs do not reveal the key."""
 
@@ -198,11 +204,11 @@ class Signing:
         Raises:
             InvalidArgument: no later timestamp fits into 48 bits, so another key is needed.
         """
-        stamp = self.timestamp_now(now)
-        if stamp > LAST_TIMESTAMP:
+        timestamp = self.timestamp_now(now)
+        if timestamp > LAST_TIMESTAMP:
             raise InvalidArgument(f"the timestamps of {self.key!r} are exhausted: use another key")
-        self._advance(stamp + 1)  # The next frame must have a later timestamp.
-        link_and_timestamp = bytes((self.link_id,)) + stamp.to_bytes(6, "little")
+        self._advance(timestamp + 1)  # The next frame must have a later timestamp.
+        link_and_timestamp = bytes((self.link_id,)) + timestamp.to_bytes(6, "little")
         return link_and_timestamp + self._hash(frame + link_and_timestamp)
 
     def accepts(self, frame: Frame, now: float = 0.0) -> bool:
@@ -239,11 +245,10 @@ class Signing:
         return self._refusal(frame, now) is None
 
     def _check_signature(self, frame: Frame, now: float) -> Refusal | None:
+        """Like `_refusal`, but store the timestamp of a valid signature, so that the frame cannot be replayed."""
         refusal = self._refusal(frame, now)
         if refusal is None:
-            signature = frame.raw[-SIGNATURE_LENGTH:]
-            stamp = int.from_bytes(signature[1:7], "little")
-            self._store_stream((frame.system_id, frame.component_id, signature[0]), stamp)
+            self._store_timestamp(*_stream_and_timestamp(frame))
         return refusal
 
     def _refusal(self, frame: Frame, now: float) -> Refusal | None:
@@ -252,23 +257,21 @@ class Signing:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
             return Refusal.WRONG_SIGNATURE
-        signature = frame.raw[-SIGNATURE_LENGTH:]
-        stamp = int.from_bytes(signature[1:7], "little")
-        stream = (frame.system_id, frame.component_id, signature[0])
+        stream, timestamp = _stream_and_timestamp(frame)
         last = self.streams.get(stream)
         if last is None:
-            if stamp + ONE_MINUTE < self.timestamp_now(now):
+            if timestamp + ONE_MINUTE < self.timestamp_now(now):
                 return Refusal.TOO_OLD
-        elif stamp <= last:
+        elif timestamp <= last:
             return Refusal.REPLAYED
         return None
 
-    def _store_stream(self, stream: tuple[int, int, int], stamp: int) -> None:
+    def _store_timestamp(self, stream: tuple[int, int, int], timestamp: int) -> None:
         # A stream that is removed here counts as new at its next frame, whose timestamp is then compared with ours.
         if stream not in self.streams and len(self.streams) >= MAX_STREAMS:
             del self.streams[min(self.streams, key=self.streams.__getitem__)]
-        self.streams[stream] = stamp
-        self._advance(max(self.timestamp, stamp))
+        self.streams[stream] = timestamp
+        self._advance(max(self.timestamp, timestamp))
 
     def _advance(self, timestamp: int) -> None:
         # Store the timestamp before using it, so that the next program starts with a later timestamp even after a

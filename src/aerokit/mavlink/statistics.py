@@ -36,11 +36,11 @@ class SourceStatistics(SourceFields):
         "_alternated_at",
         "_alternations",
         "_last_expected",
-        "_late_at",
+        "_late_count",
         "_late_run",
         "_late_sequence",
         "_missing",
-        "_missing_at",
+        "_missing_base",
         "_other_at",
         "_other_count",
         "_other_expected",
@@ -70,14 +70,16 @@ class SourceStatistics(SourceFields):
         # Number of steps by which `expected` has advanced without a received frame. `received` is `expected` minus this
         # number, so a received frame only has to increase `expected`.
         self._unreceived = sequence
-        self._missing = 0  # bit n is set if the frame n + 1 before `_missing_at` is missing
-        self._missing_at = sequence
-        self._late_sequence = self._late_at = -1  # sequence number of the last repeated frame, and `received` then
+        self._missing = 0  # bit n is set if the frame n + 1 before `_missing_base` is missing
+        self._missing_base = sequence
+        self._late_sequence = -1  # sequence number of the last repeated frame
+        self._late_count = -1  # value of `received` at that frame
         self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
         self._stream_start = 0  # value of `received` at the beginning of the current stream
-        self._alternations, self._alternated_at = 0, 0.0
-        # `expected` as the last call of `out_of_order` found it, and the time of the last call that found a new value.
-        self._last_expected, self._advanced_at = sequence, 0.0
+        self._alternations = 0  # how often the two streams have alternated
+        self._alternated_at = 0.0
+        self._last_expected = sequence  # value of `expected` at the last call of `out_of_order`
+        self._advanced_at = 0.0  # time of the last call at which `expected` had advanced
 
     @property
     def received(self) -> int:
@@ -131,22 +133,24 @@ class SourceStatistics(SourceFields):
         self._missing = self._shifted(ahead + 1) | missing_bits & _WINDOW
         self.skip(ahead)
         self.expected += 1
-        self._missing_at = self.expected
+        self._missing_base = self.expected
 
     def _begin_stream(self, now: float) -> None:
         # The position of the previous stream is kept for a while, because that stream may continue.
-        self._other_expected, self._other_count = self.expected & 0xFF, self.received - self._stream_start
+        self._other_expected = self.expected & 0xFF
+        self._other_count = self.received - self._stream_start
         self._other_at = now
-        self._stream_start, self._returns, self._skipped_over = self.received, 0, 0
+        self._stream_start = self.received
+        self._returns = self._skipped_over = 0
 
-    def _shifted(self, further: int) -> int:
-        """Return `_missing` with its bits shifted, so that they are relative to the number `expected` + ``further``."""
-        distance = self.expected - self._missing_at + further
+    def _shifted(self, advance: int) -> int:
+        """Return `_missing` with its bits shifted, so that they are relative to `expected` + ``advance``."""
+        distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _was_missing(self, behind: int) -> bool:
         """Return True if the frame ``behind`` numbers before `expected` counted as lost. It no longer does."""
-        self._missing, self._missing_at = self._shifted(0), self.expected
+        self._missing, self._missing_base = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
         self._missing &= ~bit
@@ -155,7 +159,7 @@ class SourceStatistics(SourceFields):
     def _on_repeated(self, sequence: int, now: float) -> int:
         # A single frame with an old number is a repetition. Several in direct succession show that the sender rebooted.
         follows = sequence == (self._late_sequence + 1) & 0xFF
-        is_direct_succession = follows and self._late_at == self.received
+        is_direct_succession = follows and self._late_count == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
         # A link may repeat two or three recent frames, which are no reboot. It hardly ever repeats old frames.
@@ -165,17 +169,23 @@ class SourceStatistics(SourceFields):
             self._continue_at(sequence)
             return IN_ORDER
         # Repeated frames whose numbers follow each other may come from a second sender, so they count as alternations
-        # between two streams. Any other repeated frame resets the count to 0.
-        self._count_alternations(now, 1 if follows else -self._alternations)
+        # between two streams. Any other repeated frame resets the count.
+        if follows:
+            self._count_alternation(now)
+        else:
+            self._alternations = 0
+            self._alternated_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
-        self._late_sequence, self._late_at = sequence, self.received
+        self._late_sequence = sequence
+        self._late_count = self.received
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
         """Make this sequence number the newest, without counting the numbers before it as lost."""
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
-        self._missing, self._missing_at, self._skipped_over = 0, self.expected, 0
+        self._missing_base = self.expected
+        self._missing = self._skipped_over = 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
         # Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
@@ -183,7 +193,7 @@ class SourceStatistics(SourceFields):
         count = self.received - self._stream_start
         is_other_longer = self._other_count > count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
-        self._count_alternations(now, 1)
+        self._count_alternation(now)
         if is_other_longer:
             self._returns += 1
         if is_over or self._returns >= _MIN_RETURNS:
@@ -193,7 +203,8 @@ class SourceStatistics(SourceFields):
             # The frame is in the gap before the current stream, which was counted as lost.
             self.lost -= 1
             self._skipped_over -= 1
-        self._other_expected, self._other_count = (sequence + 1) & 0xFF, self._other_count + 1
+        self._other_expected = (sequence + 1) & 0xFF
+        self._other_count += 1
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # The frame does not count as one of the current stream.
@@ -204,15 +215,18 @@ class SourceStatistics(SourceFields):
         # The gap before the current stream was no loss, so it is subtracted. Frames of the gap may have arrived late,
         # so the result could be negative without max().
         self.lost = max(0, self.lost - self._skipped_over)
-        self._other_expected, self._other_count, self._other_at = self.expected & 0xFF, count, now
-        self._stream_start, self._returns = self.received - other_count, 0
+        self._other_expected = self.expected & 0xFF
+        self._other_count = count
+        self._other_at = now
+        self._stream_start = self.received - other_count
+        self._returns = 0
         self._continue_at(sequence)
 
-    def _count_alternations(self, now: float, count: int) -> None:
-        """Add to the count of alternations between two streams. It starts again from 0 if the last was too long ago."""
+    def _count_alternation(self, now: float) -> None:
+        """Count an alternation between two streams. The count starts again if the last alternation is too old."""
         if now - self._alternated_at > _EXPIRY_S:
             self._alternations = 0
-        self._alternations = max(0, self._alternations + count)
+        self._alternations += 1
         self._alternated_at = now
 
     def __repr__(self) -> str:
@@ -307,7 +321,8 @@ class FramerStatistics(CounterFields):
         """Create the counters of a new sender. If ``may_stay`` is False, the counters are not kept."""
         source = SourceStatistics(key & 0xFF, key >> 8, sequence)
         if may_stay:
-            self._by_key[key] = self.sources[source.system_id, source.component_id] = source
+            self._by_key[key] = source
+            self.sources[source.system_id, source.component_id] = source
         else:
             self._others += 1
         return source
@@ -321,7 +336,7 @@ class FramerStatistics(CounterFields):
         self._last_received = {key: source.received for key, source in self._by_key.items()}
         return len(silent)
 
-    def unknown(self, message_id: int) -> None:
+    def count_unknown(self, message_id: int) -> None:
         """Count a frame of an unknown message."""
         self.unknown_ids += 1
         counts = self.unknown_messages

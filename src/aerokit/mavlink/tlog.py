@@ -20,7 +20,7 @@ _MAGICS = (MAGIC_V1, MAGIC_V2)
 _BLOCK = 1 << 16
 _MAX_RECORD = 8 + 280
 # After garbage, the search for the next record ignores times before the year 2000, because zeros in the header of a
-# frame look like such a time. Where a record is expected, such a time is accepted, because the computer's clock may
+# frame look like an early time. Where a record is expected, an early time is accepted, because the computer's clock may
 # have been wrong.
 _FIRST_TIME = 946_684_800_000_000  # the year 2000
 _LAST_TIME = 4_102_444_800_000_000  # the year 2100; a larger number is not a timestamp
@@ -45,9 +45,11 @@ _compiled: Any = None if wire is None else wire.tlog_records
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
-    begin: int
-    data, begin, is_at_end, min_time = b"", 0, False, 0
+    data = b""
+    begin: int = 0  # position of the next record in `data`
     end: int | None
+    is_at_end = False  # True if the whole file has been read
+    min_time = 0  # A record with an earlier time is garbage; see _FIRST_TIME.
     while True:
         # `data` must contain a whole record and the header of the next one, so that the record can be verified.
         if not is_at_end and len(data) - begin < 2 * _MAX_RECORD:
@@ -95,7 +97,7 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if this record is an error: inside it, a record begins that another one follows directly."""
+    """Return True if a true record begins inside this one. A true record is followed directly by the next record."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:

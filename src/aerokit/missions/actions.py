@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, overload
 
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavCmd, MavMountMode
+from aerokit.mavlink.enums import MavCmd, MavMountMode, MavVtolState
 from aerokit.missions.item import action_item, in_range, place_item, whole_number
 
 if TYPE_CHECKING:
@@ -163,10 +163,10 @@ def vtol_transition(to: Literal["multicopter", "fixed_wing"]) -> MissionItem:
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_VTOL_TRANSITION
     """
-    states = {"multicopter": 3.0, "fixed_wing": 4.0}
+    states = {"multicopter": MavVtolState.MC, "fixed_wing": MavVtolState.FW}
     if to not in states:
         raise InvalidArgument(f"to = {to!r} is not allowed: it must be {', '.join(map(repr, states))}")
-    return action_item(MavCmd.DO_VTOL_TRANSITION, states[to])
+    return action_item(MavCmd.DO_VTOL_TRANSITION, float(states[to]))
 
 
 def land_start() -> MissionItem:

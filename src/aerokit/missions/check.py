@@ -56,7 +56,7 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
 
 def check_count(count: int, *, home_is_item_0: bool = False) -> None:
     """Raise :class:`InvalidArgument` if there are more items than the protocol can count."""
-    limit = MAX_ITEMS - home_is_item_0
+    limit = MAX_ITEMS - 1 if home_is_item_0 else MAX_ITEMS
     if count > limit:
         raise InvalidArgument(f"{count} items are too many: at most {limit} are possible")
 

@@ -130,9 +130,9 @@ _PX4: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: ("f",),
 }
 
-_PX4_JUMP = ("sUfffff",)
+_PX4_JUMP = "sUfffff"
 
-_PX4_OTHERS = ("fffffff",)
+_PX4_OTHERS = "fffffff"
 
 _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000, 0x7FFF)}
 
@@ -140,23 +140,27 @@ _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000
 def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Iterator[float]:
     """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
-    # The slice of one letter is empty for a field that has none, and `_convert` takes the empty text for "not stored".
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
         for letters in _ARDUPILOT.get(item.command, ("",)):
-            yield from _convert(letters[number : number + 1], value)
+            yield from _convert(_letter_at(letters, number), value)
     if storage in (ItemStorage.PX4, ItemStorage.ANY):
-        yield from _convert(_px4_letters(item)[number : number + 1], value)
+        yield from _convert(_letter_at(_px4_letters(item), number), value)
+
+
+def _letter_at(letters: str, number: int) -> str:
+    return letters[number] if number < len(letters) else "-"
 
 
 def _px4_letters(item: MissionItem) -> str:
-    if item.frame != MavFrame.MISSION:
-        return _PX4.get(item.command, ("",))[0]
-    return (_PX4_JUMP if item.command == MavCmd.DO_JUMP else _PX4_OTHERS)[0]
+    if item.frame == MavFrame.MISSION:
+        return _PX4_JUMP if item.command == MavCmd.DO_JUMP else _PX4_OTHERS
+    (letters,) = _PX4.get(item.command, ("",))
+    return letters
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
     """Yield the converted value. Yield nothing if the conversion overflows, because the result is undefined in C."""
-    if letter in ("", "-"):  # not stored
+    if letter == "-":  # not stored
         yield 0.0
     elif letter == "2":  # always 2
         yield 2.0
@@ -323,7 +327,8 @@ def _same_place(
 def _float_step(value: float) -> float:
     """Return the distance between a 32-bit float and its neighbour."""
     significant_bits = 24
-    return math.ldexp(1.0, math.frexp(value)[1] - significant_bits)
+    _, exponent = math.frexp(value)
+    return math.ldexp(1.0, exponent - significant_bits)
 
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:

@@ -307,14 +307,14 @@ def altitude_and_frame(
         ("altitude_amsl_m", amsl_m, MavFrame.GLOBAL),
         ("altitude_terrain_m", terrain_m, MavFrame.GLOBAL_TERRAIN_ALT),
     )
-    given = [(name, value, frame) for name, value, frame in candidates if value is not None]
-    if len(given) != 1:
-        names = " and ".join(name for name, _, _ in given)
+    given_altitudes = [(name, value, frame) for name, value, frame in candidates if value is not None]
+    if len(given_altitudes) != 1:
+        names = " and ".join(name for name, _, _ in given_altitudes)
         raise InvalidArgument(
             "give exactly one of altitude_relative_m (above home), altitude_amsl_m (above mean sea level) and"
             f" altitude_terrain_m (above the ground), not {names or 'none'}"
         )
-    name, value, frame = given[0]
+    [(name, value, frame)] = given_altitudes
     in_range(name, value, -MAX_ALTITUDE_M, MAX_ALTITUDE_M)
     return float(value), frame
 

@@ -136,11 +136,10 @@ class FenceCircle(Snapshot):
 
 
 class Fence(Snapshot):
-    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``. ``Fence()`` is an
-    empty fence.
+    """A geofence: ``Fence(polygons=[FencePolygon([...])], circles=[FenceCircle(home, 300.0)])``.
 
-    ``return_point`` is the destination after a breach (Plane, and PX4 if configured). Both sequences are converted to
-    tuples.
+    ``Fence()`` is an empty fence. ``return_point`` is the destination after a breach (Plane, and PX4 if configured).
+    Both sequences are converted to tuples.
     """
 
     MISSION_TYPE: ClassVar[int] = 1
@@ -164,11 +163,11 @@ class Fence(Snapshot):
     def to_items(self, *, home_is_item_0: bool = False) -> tuple[MissionItem, ...]:
         """Return the items: vertices, each with the size of its polygon, then circles, then the return point."""
         items = [
-            _item(_POLYGON[polygon.inclusion], place, float(len(polygon.vertices)))
+            _fence_item(_POLYGON[polygon.inclusion], place, float(len(polygon.vertices)))
             for polygon in self.polygons
             for place in polygon.vertices
         ]
-        items += [_item(_CIRCLE[circle.inclusion], circle.center, circle.radius_m) for circle in self.circles]
+        items += [_fence_item(_CIRCLE[circle.inclusion], circle.center, circle.radius_m) for circle in self.circles]
         if self.return_point is not None:
             items.append(_return_item(self.return_point))
         return tuple(items)
@@ -208,13 +207,13 @@ class Fence(Snapshot):
                     raise InvalidArgument(f"{name}[{index}] = {value!r} is not a {kind.__name__}")
 
 
-def _item(command: MavCmd, place: Position, param1: float) -> MissionItem:
+def _fence_item(command: MavCmd, place: Position, param1: float) -> MissionItem:
     x, y = round(place.latitude_deg * 1e7), round(place.longitude_deg * 1e7)
     return MissionItem(command, MavFrame.GLOBAL, param1, x=x, y=y)
 
 
 def _return_item(place: Position) -> MissionItem:
-    item = _item(MavCmd.NAV_FENCE_RETURN_POINT, place, 0.0)
+    item = _fence_item(MavCmd.NAV_FENCE_RETURN_POINT, place, 0.0)
     if place.altitude_relative_m is not None:
         return item.replace(frame=MavFrame.GLOBAL_RELATIVE_ALT, z=place.altitude_relative_m)
     return item.replace(z=place.altitude_amsl_m or 0.0)

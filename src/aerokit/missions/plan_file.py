@@ -108,7 +108,7 @@ def format_plan(plan: Plan | Mission) -> str:
 
 
 def _document(plan: Plan) -> dict[str, Any]:
-    """Return the JSON object of a file: that of ``plan.source``, in which only the changed parts are replaced."""
+    """Return the JSON object of a file: the object in ``plan.source``, in which only changed parts are replaced."""
     document: dict[str, Any]
     if plan.source:
         document, old = json.loads(plan.source), parse_plan(plan.source)
@@ -267,11 +267,12 @@ def _required_place(value: JsonValue) -> Position:
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
     """Return the place; None if coordinates are null. ``altitude`` is its reference: "amsl" or "relative"."""
-    elements = value.elements(2, 3)
-    latitude, longitude = elements[0].number(-90, 90, null=True), elements[1].number(-180, 180, null=True)
+    latitude_value, longitude_value, *altitude_values = value.elements(2, 3)
+    latitude = latitude_value.number(-90, 90, null=True)
+    longitude = longitude_value.number(-180, 180, null=True)
     if math.isnan(latitude) or math.isnan(longitude):
         return None
-    height = elements[2].number(null=True) if len(elements) == 3 else math.nan
+    height = altitude_values[0].number(null=True) if altitude_values else math.nan
     place = Position(latitude, longitude)
     if math.isnan(height):
         return place

@@ -200,15 +200,15 @@ def _jump_ids(
 def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
     command, frame = value["command"].integer(0, 0xFFFF), value["frame"].integer(0, 0xFF)
     params = value["params"].elements(7)
-    numbers = [param.number(null=True) for param in params]
+    param1, param2, param3, param4, latitude, longitude, z = (param.number(null=True) for param in params)
+    first_param, _, _, _, latitude_param, longitude_param, _ = params
     if xy_scale(command, frame) == DEGREE_SCALE:  # These calls raise an error for coordinates out of range.
-        params[4].number(-90, 90, null=True)
-        params[5].number(-180, 180, null=True)
+        latitude_param.number(-90, 90, null=True)
+        longitude_param.number(-180, 180, null=True)
     if command == MavCmd.DO_JUMP:
-        numbers[0] = _jump_target(params[0], ids)
-    if math.isnan(numbers[6]) and has_place(command):  # The file has no altitude in `params`.
-        frame, numbers[6] = _planned_altitude(value, frame)
-    param1, param2, param3, param4, latitude, longitude, z = numbers
+        param1 = _jump_target(first_param, ids)
+    if math.isnan(z) and has_place(command):  # The file has no altitude in `params`.
+        frame, z = _planned_altitude(value, frame)
     x, y = (from_degrees(number, command, frame) for number in (latitude, longitude))
     return MissionItem(command, frame, param1, param2, param3, param4, x, y, z, value["autoContinue"].boolean())
 

@@ -61,14 +61,14 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     """Parse the text of a file. Errors begin with ``name``."""
     numbered_lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     numbered_lines = [(number, line) for number, line in numbered_lines if line and not line.startswith("#")]
-    first_line = numbered_lines[0][1] if numbered_lines else "nothing"
-    header = first_line.split()
-    if header not in (["QGC", "WPL", "110"], ["QGC", "WPL", "120"]):
+    _, first_line = numbered_lines[0] if numbered_lines else (0, "nothing")
+    *file_type, version = first_line.split() or [""]
+    if file_type != ["QGC", "WPL"] or version not in ("110", "120"):
         raise FileFormatError(f"{name}: line 1: expected 'QGC WPL 110', found {first_line[:40]!r}")
     rows = [
         _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(numbered_lines[1:])
     ]
-    may_begin_with_home = header[2] == "110"
+    may_begin_with_home = version == "110"
     if not rows or not may_begin_with_home or not rows[0].is_home():
         return Mission([row.item() for row in rows])
     # In the file, jump targets count home as an item, unlike in `Mission`.
@@ -81,7 +81,7 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
 
     Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
     (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north. A .plan file
-    stores such values as null.
+    stores NaN as null.
 
     Raises:
         InvalidArgument: ``mission`` is no mission, a number is infinite, the altitude of a place is NaN, or the version

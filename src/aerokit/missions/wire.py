@@ -160,13 +160,17 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
     0°, 0° for the current position. This place is replaced by the destination of the previous item, in the first item
     by ``here`` (latitude and longitude in degrees, None if unknown).
     """
-    current_xy = None if here is None else (round(here[0] * 1e7), round(here[1] * 1e7))
+    current_xy: tuple[int, int] | None = None
+    if here is not None:
+        latitude_deg, longitude_deg = here
+        current_xy = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
     for item in items:
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
             if current_xy is not None and item.x == item.y == 0:
-                item = item.replace(x=current_xy[0], y=current_xy[1])
+                x, y = current_xy
+                item = item.replace(x=x, y=y)
             elif DEFAULT_XY not in (item.x, item.y):
                 current_xy = round(item.x), round(item.y)
         yield item
@@ -190,12 +194,12 @@ class PlanHeader(NamedTuple):
 
     mission_type: int
     options: int
-    first: int
-    items: int
+    first_index: int
+    item_count: int
 
     @property
     def length(self) -> int:
-        return HEADER.size + self.items * _ITEM_LENGTH
+        return HEADER.size + self.item_count * _ITEM_LENGTH
 
 
 def pack_items(
@@ -254,7 +258,7 @@ def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionI
         raise RemoteProtocolError(f"packed plan: expected MAV_MISSION_TYPE {mission_type}, found {header.mission_type}")
     if len(data) != header.length:
         raise RemoteProtocolError(
-            f"packed plan: expected {header.length} bytes for {header.items} items, received {len(data)} bytes"
+            f"packed plan: expected {header.length} bytes for {header.item_count} items, received {len(data)} bytes"
         )
     starts = range(HEADER.size, header.length, _ITEM_LENGTH)
     return tuple(from_wire(messages.MissionItemInt.decode(data[start : start + _ITEM_LENGTH])) for start in starts)

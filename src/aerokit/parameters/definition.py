@@ -159,7 +159,8 @@ class CameraDefinition(Snapshot):
 
     def options(self, name: str, values: Values) -> tuple[SettingOption, ...]:
         """Return the options that a setting has now; empty if every value in its range is allowed."""
-        return self._options(name, values)[0]
+        options, _ = self._options(name, values)
+        return options
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
         """Return the options of a setting, and the selected options of other settings that restrict them."""

@@ -136,7 +136,7 @@ def parameter_file_text(
         raise InvalidArgument(
             f"format = {format!r} is not allowed: it must be missionplanner, mavproxy or qgroundcontrol"
         )
-    rows = sorted(_rows(values), key=lambda row: row[0])
+    rows = sorted(_rows(values))  # by name, which is unique
     if not rows:
         raise InvalidArgument("there are no parameters to write")
     lines: list[str] = []
@@ -162,8 +162,9 @@ def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -
         if len(fields) != 2:
             hint = _directive_hint(fields)
             raise FileFormatError(f"{place}: {line.strip()!r} is not NAME,VALUE or NAME VALUE{hint}")
-        _add_value(values, place, fields[0], fields[1], ParameterType.REAL32)
-        places[fields[0]] = place
+        name, value_text = fields
+        _add_value(values, place, name, value_text, ParameterType.REAL32)
+        places[name] = place
     _, first_line = lines[0]
     file_format: FileFormat = "missionplanner" if "," in first_line else "mavproxy"
     return ParameterFile(values, format=file_format, comments=comments, places=places)
@@ -194,9 +195,12 @@ def _parse_qgroundcontrol(
 def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]:
     """Split a line of a QGroundControl file into component id, name, value as text, and type."""
     fields = line.strip().split("\t")
-    if len(fields) != 5 or not all(text.isascii() and text.isdigit() for text in (fields[0], fields[1], fields[4])):
-        raise FileFormatError(f"{place}: {line.strip()!r} is not {_COLUMNS}")
-    _, component_id, name, value, type_number = fields
+    error = FileFormatError(f"{place}: {line.strip()!r} is not {_COLUMNS}")
+    if len(fields) != 5:
+        raise error
+    system_id, component_id, name, value, type_number = fields
+    if not all(text.isascii() and text.isdigit() for text in (system_id, component_id, type_number)):
+        raise error
     kind = int(type_number)
     if not 1 <= kind <= 10:
         raise FileFormatError(f"{place}: type {kind} is not a MAV_PARAM_TYPE (1 to 10)")

@@ -237,7 +237,10 @@ def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
 
 def _range(text: str) -> tuple[float | None, float | None]:
     bounds = text.replace(",", " ").split()
-    return (_number(bounds[0]), _number(bounds[1])) if len(bounds) == 2 else (None, None)
+    if len(bounds) != 2:
+        return None, None
+    low, high = bounds
+    return _number(low), _number(high)
 
 
 # ------------------------------------------------------------------------------------------- PX4

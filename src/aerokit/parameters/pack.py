@@ -13,7 +13,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Container, Iterable, Iterator, Mapping
 from struct import Struct
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.parameters.encoding import to_bits
@@ -85,7 +85,7 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
 
     Raises:
         RemoteProtocolError: the file is damaged, or its number of parameters differs from that in its header. ArduPilot
-            sends such a file once after its list has changed; download the file again.
+            sends a wrong number once, after its list has changed; download the file again.
     """
     magic, count, total = read_header(data)  # `total` also counts the parameters before `start`.
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
@@ -112,8 +112,10 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
     body = bytearray()
     previous_name = b""
     for parameter in rows:
-        name, code = check_name(parameter.name).encode("ascii"), _code_of(parameter)
-        body += _entry(name, previous_name, code, checked_value(parameter.name, parameter.value, _CODES[code][0]))
+        name = check_name(parameter.name).encode("ascii")
+        code = _code_of(parameter)
+        stored_type, _ = _CODES[code]
+        body += _entry(name, previous_name, code, checked_value(parameter.name, parameter.value, stored_type))
         previous_name = name
     length = HEADER.size + len(body)
     if length > _MAX_SIZE:
@@ -151,7 +153,8 @@ def pack_for_download(
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
         # The value (and its default) at the end of the entry must not be split between two blocks.
-        unsplit_size = _CODES[code][1].size * (len(values) if whole_defaults else 1)
+        _, value_format = _CODES[code]
+        unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
         if 0 < size_in_next_block < unsplit_size:
             file += bytes(unsplit_size - size_in_next_block)  # These zeros move the value into the next block.
@@ -179,13 +182,13 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     code, flags = data[position] & 0x0F, data[position] & 0xF0
     has_default = bool(flags & _HAS_DEFAULT)
     if code not in _CODES or flags & ~_HAS_DEFAULT:
-        _raise_damaged(position, f"invalid type {code} or flags {flags >> 4}")
+        raise _damaged(position, f"invalid type {code} or flags {flags >> 4}")
     if position + 1 == len(data):
         return None
     # The name begins with characters of the previous name, which the file does not repeat. 1 to 16 more follow.
     common_length, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
     if common_length > len(previous_name) or common_length + own_length > NAME_LENGTH:
-        _raise_damaged(position, f"invalid name length {common_length} + {own_length} after {previous_name!r}")
+        raise _damaged(position, f"invalid name length {common_length} + {own_length} after {previous_name!r}")
     kind, format_ = _CODES[code]
     start = position + 2 + own_length
     end = start + format_.size * (2 if has_default else 1)
@@ -198,15 +201,17 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
-    position, previous_name = _skip_padding(data, HEADER.size), b""
+    position = _skip_padding(data, HEADER.size)
+    previous_name = b""
     while position < len(data):
         entry = read_entry(data, position, previous_name)
         if entry is None:
-            _raise_damaged(position, "it ends inside an entry")
+            raise _damaged(position, "it ends inside an entry")
         # A file with defaults omits each default that equals the value.
         default = entry.value if entry.default is None and with_defaults else entry.default
         yield Parameter(_text(entry.name, position), entry.value, entry.type, default, index)
-        position, previous_name = _skip_padding(data, entry.end), entry.name
+        position = _skip_padding(data, entry.end)
+        previous_name = entry.name
         index += 1
 
 
@@ -218,12 +223,12 @@ def _skip_padding(data: bytes, position: int) -> int:
 
 def _text(name: bytes, position: int) -> str:
     if not all(0x20 < byte < 0x7F for byte in name):
-        _raise_damaged(position, f"invalid name {name!r}")
+        raise _damaged(position, f"invalid name {name!r}")
     return name.decode("ascii")
 
 
-def _raise_damaged(position: int, problem: str) -> NoReturn:
-    raise RemoteProtocolError(f"param.pck is damaged at byte {position}: {problem}")
+def _damaged(position: int, problem: str) -> RemoteProtocolError:
+    return RemoteProtocolError(f"param.pck is damaged at byte {position}: {problem}")
 
 
 # --------------------------------------------------------------------------------------- writing
@@ -238,11 +243,12 @@ def _code_of(parameter: Parameter) -> int:
 
 
 def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:
-    common, pack = _common_length(name, previous_name), _CODES[code][1].pack
+    common = _common_length(name, previous_name)
+    _, value_format = _CODES[code]
     type_and_flags = code | (_HAS_DEFAULT if len(values) > 1 else 0)
     # Four bits for the shared characters, and four for the number of own characters minus 1.
     lengths = common | (len(name) - common - 1) << 4
-    return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(pack, values))
+    return bytes((type_and_flags, lengths)) + name[common:] + b"".join(map(value_format.pack, values))
 
 
 def _common_length(name: bytes, previous_name: bytes) -> int:

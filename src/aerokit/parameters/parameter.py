@@ -231,8 +231,9 @@ def setting_bytes(value: SettingValue, type: int) -> bytes:  # noqa: A002
 
 
 def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noqa: A002
-    """Convert a value to the form in which a component stores it in this type: an int, a 32-bit float, a string or
-    bytes.
+    """Convert a value to the form in which a component stores it in this type.
+
+    The result is an int, a 32-bit float, a string or bytes.
 
     Raises:
         InvalidArgument: the type cannot hold the value: 300 as a UINT8, 1.5 as an integer, a string for a number, a

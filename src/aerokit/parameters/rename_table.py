@@ -46,7 +46,7 @@ _HORIZONTAL = "P I D FF FLTE FLTD"
 _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 
 
-def _position(prefix: str) -> tuple[tuple[int, str], ...]:
+def _position_controller(prefix: str) -> tuple[tuple[int, str], ...]:
     """Return the pairs of the position controller, which changed from north-east-up in cm to north-east-down in m."""
     moved = (
         _same(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _HORIZONTAL),
@@ -98,12 +98,12 @@ GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (_COPTER_AND_SUB, 100, _prefixed("LOIT_", "LOIT_", _LOITER)),
     (_COPTER_AND_SUB, 100, _prefixed("ATC_", "ATC_", _ATTITUDE)),
     (_COPTER_AND_SUB, 100, "ANGLE_MAX>ATC_ANGLE_MAX CIRCLE_RADIUS>CIRCLE_RADIUS_M"),
-    *((_COPTER_AND_SUB, divisor, pairs) for divisor, pairs in _position("PSC_")),
+    *((_COPTER_AND_SUB, divisor, pairs) for divisor, pairs in _position_controller("PSC_")),
     (_PLANE, 100, _prefixed("Q_WP_", "Q_WP_", _WAYPOINT)),
     (_PLANE, 100, _prefixed("Q_LOIT_", "Q_LOIT_", _LOITER)),
     (_PLANE, 100, _prefixed("Q_A_", "Q_A_", _ATTITUDE)),
     (_PLANE, 100, "Q_ANGLE_MAX>Q_A_ANGLE_MAX"),
-    *((_PLANE, divisor, pairs) for divisor, pairs in _position("Q_P_")),
+    *((_PLANE, divisor, pairs) for divisor, pairs in _position_controller("Q_P_")),
     (_PLANE, 1, "GLIDE_SLOPE_MIN>ALT_SLOPE_MIN GLIDE_SLOPE_THR>ALT_SLOPE_MAXHGT"),
     (("Sub",), 1, _same("ORIGIN_", "AHRS_ORIGIN_", "LAT LON ALT")),
 )

@@ -102,7 +102,7 @@ class _Writer(UploadedFile):
     def announced_size(self, data: bytes) -> int:
         with suppress(RemoteProtocolError):
             header = read_header(data)
-            return header.length if header.items < INVALID_INDEX else 0
+            return header.length if header.item_count < INVALID_INDEX else 0
         return 0
 
     def close(self) -> None:
@@ -118,7 +118,7 @@ class _Writer(UploadedFile):
         if has_extra_item or _EMPTY in items:
             raise FileFault(EINVAL)
         clear = not header.options & NO_CLEAR
-        result = self._store.replace(self._type, items, start=header.first, clear=clear)
+        result = self._store.replace(self._type, items, start=header.first_index, clear=clear)
         if result != MavMissionResult.ACCEPTED:
             raise FileFault(EINVAL)
 

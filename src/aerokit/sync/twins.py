@@ -450,7 +450,7 @@ class Connection(ConnectionTwin):
         return self.aio.now()
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Return how many frames of this system were received, and how many were lost by sequence number."""
+        """Return how many frames of this system were received, and how many sequence numbers are missing."""
         return self._loop.call(self.aio.counts, system_id)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Literal, NoReturn
+from typing import Literal
 
 from aerokit._internal.formatting import did_you_mean
 from aerokit._internal.values import Snapshot
@@ -164,17 +164,17 @@ class _Parser:
     def parse(self) -> LinkAddress:
         text = self.text.strip()
         if not text:
-            self.fail("it is empty")
+            raise self.error("it is empty")
         if "\0" in text:
-            self.fail("it contains a NUL character")
+            raise self.error("it contains a NUL character")
         if text.lower() == "pty" or text.lower().startswith("pty:"):  # The rest is a path, without any options.
             return LinkAddress("pty", path=text[len("pty:") :])
         scheme, after_scheme = self.split_scheme(text)
         if scheme in _SCHEMES:
-            return self.with_scheme(scheme, after_scheme)
+            return self.parse_with_scheme(scheme, after_scheme)
         if scheme:
-            self.fail_scheme(scheme)
-        return self.bare(text)
+            raise self.scheme_error(scheme)
+        return self.parse_bare(text)
 
     def split_scheme(self, text: str) -> tuple[str, str]:
         """Return the scheme in lower case ("" if there is none), and the text after it."""
@@ -186,95 +186,95 @@ class _Parser:
             return match[1].lower(), match[2]
         return "", text
 
-    def with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
+    def parse_with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
         kind = _SCHEMES[scheme]
         target, _, query = after_scheme.partition("?")
-        options = self.options(kind, query)
+        options = self.parse_options(kind, query)
         if kind == "serial":
-            return self.serial(target, options, decode=True)
+            return self.parse_serial(target, options, decode=True)
         if kind == "replay":
             if scheme == "file" and re.match(r"/[a-z]:[/\\]", target, re.IGNORECASE):
                 target = target[1:]  # In file:///C:/…, the slash before a Windows drive is not part of the path.
-            return self.replay(_unquote(target), options)
+            return self.parse_replay(_unquote(target), options)
         if kind in _ZENOH_KINDS:
-            return self.zenoh(kind, target.removesuffix("/"), options)
-        return self.network(kind, target.removesuffix("/"), options)
+            return self.parse_zenoh(kind, target.removesuffix("/"), options)
+        return self.parse_network(kind, target.removesuffix("/"), options)
 
-    def bare(self, text: str) -> LinkAddress:
+    def parse_bare(self, text: str) -> LinkAddress:
         """Parse an address without a scheme: a recording, a serial port, or host:port to listen on."""
         if _RECORDING.fullmatch(text):
             end = text.lower().rindex(".tlog") + len(".tlog")
-            return self.replay(text[:end], self.options("replay", text[end + 1 :]))
+            return self.parse_replay(text[:end], self.parse_options("replay", text[end + 1 :]))
         if _DATAFLASH.fullmatch(text):
-            self.fail("this is a log in the autopilot's own format, not a MAVLink recording (.tlog)")
+            raise self.error("this is a log in the autopilot's own format, not a MAVLink recording (.tlog)")
         if match := _WITHOUT_COLON.match(text):
-            self.fail_without_colon(match[1].lower(), match[0], text)
+            raise self.missing_colon_error(match[1].lower(), match[0], text)
         if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
-            return self.serial(text, {}, decode=False)
+            return self.parse_serial(text, {}, decode=False)
         if ":" not in text:
-            self.fail("it is neither host:port nor the path of a serial port or of a .tlog file")
+            raise self.error("it is neither host:port nor the path of a serial port or of a .tlog file")
         if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
-            self.fail_scheme(text.partition(":")[0])  # e.g. "upd:127.0.0.1:14550"
-        return self.network("udpin", text, {})
+            raise self.scheme_error(text.partition(":")[0])  # e.g. "upd:127.0.0.1:14550"
+        return self.parse_network("udpin", text, {})
 
-    def network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+    def parse_network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
         """Parse the part of a network address after its scheme: ``host:port``."""
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
-                self.fail(f"{text!r} does not start with an IPv6 address in brackets")
+                raise self.error(f"{text!r} does not start with an IPv6 address in brackets")
         else:
             host, colon, port = text.rpartition(":")
             if not colon:  # Without a colon, rpartition() returns the whole text as the last part.
                 host, port = text, ""
             tail = colon + port
             if _is_ipv6(host):
-                self.fail("an IPv6 address needs brackets, as in [::1]:14550")
+                raise self.error("an IPv6 address needs brackets, as in [::1]:14550")
             if host.isdigit() and not tail:  # The text is only a port, e.g. in "udpin:14550".
-                self.fail(f"the host is missing, as in {kind}:127.0.0.1:{host}")
+                raise self.error(f"the host is missing, as in {kind}:127.0.0.1:{host}")
         if not host and kind in _LISTENING:
             host = "0.0.0.0"
         if not host:
-            self.fail("the host is missing")
+            raise self.error("the host is missing")
         if kind == "udpbcast" and _is_ipv6(host):
-            self.fail("broadcast exists in IPv4 only")
+            raise self.error("broadcast exists in IPv4 only")
         if not _is_ipv6(host) and not _HOST.fullmatch(host):
-            self.fail(f"{host!r} is not a host")
-        return LinkAddress(kind, host=host, port=self.port(kind, tail), options=tuple(sorted(options.items())))
+            raise self.error(f"{host!r} is not a host")
+        return LinkAddress(kind, host=host, port=self.parse_port(kind, tail), options=tuple(sorted(options.items())))
 
-    def zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
+    def parse_zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
         """Parse the part of a zenoh address after its scheme: ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
         for key in ("connect", "listen"):
             for endpoint in filter(None, options.get(key, "").split(",")):
                 if not _ENDPOINT.fullmatch(endpoint):
-                    self.fail(f"{key}={endpoint} is not a zenoh endpoint such as tcp/10.0.0.5:7447")
+                    raise self.error(f"{key}={endpoint} is not a zenoh endpoint such as tcp/10.0.0.5:7447")
         fleet, slash, name = text.partition("/")
         if not slash:
-            self.fail(f"the name of the vehicle is missing, as in {kind}://fleet/alpha")
+            raise self.error(f"the name of the vehicle is missing, as in {kind}://fleet/alpha")
         try:
             check_name("the fleet", fleet)
             check_name("the name", name)
             if "client" in options:
                 check_name("client", options["client"])
         except InvalidArgument as error:
-            self.fail(str(error))
+            raise self.error(str(error)) from None
         return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
 
-    def port(self, kind: LinkKind, tail: str) -> int:
+    def parse_port(self, kind: LinkKind, tail: str) -> int:
         """Parse the text after a host, which must be ``:port``."""
         if tail in ("", ":"):
-            self.fail("the port is missing")
+            raise self.error("the port is missing")
         if not tail.startswith(":"):
-            self.fail(f"{tail!r} follows the host, not :port")
-        port = self.whole_number("the port", tail[1:])
+            raise self.error(f"{tail!r} follows the host, not :port")
+        port = self.parse_whole_number("the port", tail[1:])
         min_port = 0 if kind in _LISTENING else 1
         if not min_port <= port <= 65535:
-            self.fail(f"the port {port} is out of range ({min_port} to 65535)")
+            raise self.error(f"the port {port} is out of range ({min_port} to 65535)")
         return port
 
-    def serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
+    def parse_serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
         """Parse a serial port and its baud rate. ``decode`` is True for an address with a scheme."""
         # In an address without a scheme, only the name of a COM port may be followed by a colon and the baud rate.
         # Other names may contain colons themselves.
@@ -289,18 +289,18 @@ class _Parser:
         baud_text = options.pop("baud", baud_text)
         device = _unquote(device) if decode else device
         if not device.strip("/"):
-            self.fail("the serial port is missing")
-        baud = None if baud_text is None else self.whole_number("the baud rate", baud_text)
+            raise self.error("the serial port is missing")
+        baud = None if baud_text is None else self.parse_whole_number("the baud rate", baud_text)
         if baud == 0:
-            self.fail("the baud rate is 0")
+            raise self.error("the baud rate is 0")
         return LinkAddress("serial", device=device, baud=baud, options=tuple(sorted(options.items())))
 
-    def replay(self, path: str, options: dict[str, str]) -> LinkAddress:
+    def parse_replay(self, path: str, options: dict[str, str]) -> LinkAddress:
         if not path.strip():
-            self.fail("the path of the recording is missing")
+            raise self.error("the path of the recording is missing")
         return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
 
-    def options(self, kind: LinkKind, query: str) -> dict[str, str]:
+    def parse_options(self, kind: LinkKind, query: str) -> dict[str, str]:
         options: dict[str, str] = {}
         allowed = _OPTIONS.get(kind, ())
         if kind not in _NEVER_COSTLY:
@@ -311,54 +311,54 @@ class _Parser:
             if key not in allowed:
                 names = ", ".join(allowed) or "none"
                 suggestion = did_you_mean(key, allowed)
-                self.fail(f"{key!r} is not an option of {kind} links (they have: {names}){suggestion}")
+                raise self.error(f"{key!r} is not an option of {kind} links (they have: {names}){suggestion}")
             if key in _CASE_SENSITIVE:
                 options[key] = _unquote(value.strip())
                 if not options[key]:
-                    self.fail(f"{key}= is empty")
+                    raise self.error(f"{key}= is empty")
             else:
-                options[key] = self.option_value(key, value.strip().lower())
+                options[key] = self.checked_option(key, value.strip().lower())
         # An option with its default value is left out, so that equal links have equal addresses.
         defaults = (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 
-    def option_value(self, key: str, value: str) -> str:
+    def checked_option(self, key: str, value: str) -> str:
         """Check the value of an option, and return its canonical form."""
-        if key == "baud":  # `serial` checks the number.
+        if key == "baud":  # `parse_serial` checks the number.
             return value
         if key in _CHOICES:
             if value not in _CHOICES[key]:
-                self.fail(f"{key}={value} is not one of {', '.join(_CHOICES[key])}")
+                raise self.error(f"{key}={value} is not one of {', '.join(_CHOICES[key])}")
             return value
         if key in ("rtscts", "costly"):
             if value not in _YES_AND_NO:
-                self.fail(f"{key}={value} must be 1 (yes) or 0 (no)")
+                raise self.error(f"{key}={value} must be 1 (yes) or 0 (no)")
             return str(int(_YES_AND_NO[value]))
         try:
             number = float("inf" if value == "max" else value)
         except ValueError:
             number = math.nan
         if not number > 0 or (key == "timeout" and math.isinf(number)):
-            self.fail(f"{key}={value} is not a number above 0")
+            raise self.error(f"{key}={value} is not a number above 0")
         return repr(number).removesuffix(".0")
 
-    def whole_number(self, what: str, text: str) -> int:
+    def parse_whole_number(self, what: str, text: str) -> int:
         if not (text.isascii() and text.isdigit() and len(text) <= 9):
-            self.fail(f"{what} {text!r} is not a whole number")
+            raise self.error(f"{what} {text!r} is not a whole number")
         return int(text)
 
-    def fail_without_colon(self, scheme: str, begin: str, text: str) -> NoReturn:
+    def missing_colon_error(self, scheme: str, begin: str, text: str) -> InvalidArgument:
         if scheme not in _SCHEMES:
-            self.fail(f"it is neither host:port nor the path of a serial port{did_you_mean(scheme, _SCHEMES)}")
-        self.fail(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
+            return self.error(f"it is neither host:port nor the path of a serial port{did_you_mean(scheme, _SCHEMES)}")
+        return self.error(f"a colon is missing: write {scheme}://{text[len(begin) :]}")
 
-    def fail_scheme(self, scheme: str) -> NoReturn:
+    def scheme_error(self, scheme: str) -> InvalidArgument:
         reason = "supported by pymavlink, not by aerokit" if scheme in _PYMAVLINK_ONLY else "unknown kind of link"
-        self.fail(f"{scheme}: {reason}{did_you_mean(scheme, _SCHEMES)}")
+        return self.error(f"{scheme}: {reason}{did_you_mean(scheme, _SCHEMES)}")
 
-    def fail(self, reason: str) -> NoReturn:
-        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # hide the password of a broker's URL
-        raise InvalidArgument(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
+    def error(self, reason: str) -> InvalidArgument:
+        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # This hides the password of a broker's URL.
+        return InvalidArgument(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
 
 
 def _is_ipv6(text: str) -> bool:

@@ -43,13 +43,13 @@ def create_link(address: str | LinkAddress, *, baud: int = 57600, peers: PeerFil
 
         return PtyLink(parsed.path)
     if parsed.kind in ("zenoh", "zenohin"):
-        return _zenoh(parsed)
+        return _create_zenoh(parsed)
     if parsed.kind in ("tcp", "tcpin"):
-        return _tcp(parsed, peers)
-    return _udp(parsed, peers)
+        return _create_tcp(parsed, peers)
+    return _create_udp(parsed, peers)
 
 
-def _tcp(parsed: LinkAddress, peers: PeerFilter | None) -> Link:
+def _create_tcp(parsed: LinkAddress, peers: PeerFilter | None) -> Link:
     from aerokit.transport.tcp import CONNECT_TIMEOUT_S, TcpConnect, TcpListen
 
     if parsed.kind == "tcpin":
@@ -74,7 +74,7 @@ def _endpoints(comma_separated: str | None) -> tuple[str, ...]:
     return tuple(endpoint for endpoint in (comma_separated or "").split(",") if endpoint)
 
 
-def _zenoh(parsed: LinkAddress) -> Link:
+def _create_zenoh(parsed: LinkAddress) -> Link:
     fleet, _, name = parsed.path.partition("/")
     options = network_options(parsed)
     if parsed.kind == "zenohin":
@@ -93,7 +93,7 @@ def _zenoh(parsed: LinkAddress) -> Link:
     )
 
 
-def _udp(parsed: LinkAddress, peers: PeerFilter | None) -> Link:
+def _create_udp(parsed: LinkAddress, peers: PeerFilter | None) -> Link:
     from aerokit.transport.udp import UdpBroadcast, UdpConnect, UdpListen
 
     if parsed.kind == "udpin":

@@ -51,7 +51,7 @@ class OrderRefusalListener(Receiver, Protocol):
         """Called when a message with this name was not forwarded to the vehicle.
 
         ``lease_holder`` is the client that has control, if its control is the reason. ``answers`` are the frames by
-        which a vehicle would reject the command, if there are such frames.
+        which a vehicle would reject the command; empty if there are none.
         """
 
 
@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called at the end of a burst, after its last ``bytes_received`` and before that of any later data."""
+        """Called at the end of a burst, after its last ``bytes_received`` and before the next."""
 
 
 @runtime_checkable
@@ -364,7 +364,8 @@ class MemoryLink(BaseLink):
             self._wake_up.cancel()
         self._wake_up = None
         self._inbox.clear()
-        was_open, self._loop = self._loop is not None, None
+        was_open = self._loop is not None
+        self._loop = None
         if was_open and self._far is not None:
             self._far._post(None, self)  # The far end reports its loss after the data that was written before.
 
@@ -380,17 +381,17 @@ class MemoryLink(BaseLink):
 
     def _schedule(self, loop: asyncio.AbstractEventLoop) -> None:
         if not loop.is_closed():
-            due = self._inbox[0][0]
+            due, _ = self._inbox[0]
             self._wake_up = loop.call_at(due, self._arrive) if self._latency_s else loop.call_soon(self._arrive)
 
     def _arrive(self) -> None:
         self._wake_up = None
         if self._loop is None or not self._inbox:
             return
-        now = max(self._loop.time(), self._inbox[0][0])  # A timer may fire early by the clock's resolution.
+        first_due, _ = self._inbox[0]
+        now = max(self._loop.time(), first_due)  # A timer may fire early by the clock's resolution.
         # Due items are counted before the delivery, because the receiver may write data that is due at once. This data
-        # must arrive in a later loop iteration.
-        # The first item is always due, which saves the count for a single item.
+        # must arrive in a later loop iteration. The first item is always due, which saves the count for a single item.
         due_count = 1 if len(self._inbox) == 1 else sum(due <= now for due, _ in self._inbox)
         for _ in range(due_count):
             if not self._inbox:  # The receiver has closed the link in its callback.

@@ -77,7 +77,8 @@ class MultiLink(Link):
         # For each link, the peers that the receiver keeps. After a reopening, `keep_peer` is called again for them.
         self._kept: list[set[Peer]] = [set() for _ in self._links]
         self._openings: set[asyncio.Task[None]] = set()
-        self._foreign: set[int] = set()  # link objects that are open elsewhere, so that they must not be closed here
+        # Indices of links that another connection has opened, and that must not be closed here.
+        self._foreign: set[int] = set()
         self._is_opening = False
         self._last_loss: LinkLost | None = None
         self._lost_at: float | None = None
@@ -220,7 +221,8 @@ class MultiLink(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _retry_opening(self, index: int) -> None:
-        backoff, is_reported = Backoff(), False
+        backoff = Backoff()
+        is_reported = False
         while not self._is_closed:
             await asyncio.sleep(backoff.next_delay())
             error = await self._open_one(index)
@@ -269,7 +271,8 @@ class MultiLink(Link):
             self._links[index].keep_peer(peer)
         self._notify_availability(index)
         if self._lost_at is not None:
-            away_s, self._lost_at = asyncio.get_running_loop().time() - self._lost_at, None
+            away_s = asyncio.get_running_loop().time() - self._lost_at
+            self._lost_at = None
             if isinstance(self._receiver, InterruptionListener):
                 self._receiver.link_restored(away_s)
 

@@ -43,7 +43,7 @@ class Outbox:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._send, self._pending, self._limit = send, pending, limit
-        self._dropped, self._on_stalled = dropped, stalled
+        self._on_dropped, self._on_stalled = dropped, stalled
         self._waiting: deque[tuple[float, bytes]] = deque()  # (deadline, frame)
         self._waiting_bytes = 0
         self._forwarded_bytes = 0  # number of bytes written to the transport
@@ -64,7 +64,7 @@ class Outbox:
     def write(self, data: bytes) -> None:
         """Forward data to the transport, buffer it, or drop it if there is no room. Never blocks."""
         if self._is_closed:
-            self._dropped(1)
+            self._on_dropped(1)
             return
         if self._is_full or self._is_stalled or self._waiting:
             self._buffer(bytes(data))
@@ -89,11 +89,11 @@ class Outbox:
 
     def discard(self) -> None:
         """Drop the data in this buffer, but not data that was already forwarded to the transport."""
-        self._dropped(len(self._waiting))
+        self._on_dropped(len(self._waiting))
         self._waiting.clear()
         self._waiting_bytes = 0
 
-    def reclaimed(self, count: int) -> None:
+    def record_reclaimed(self, count: int) -> None:
         """Record that this many bytes were removed from the transport or the kernel without being sent."""
         self._forwarded_bytes -= count
 
@@ -107,12 +107,12 @@ class Outbox:
             self.discard()
         self._drop_outdated()
         while self._waiting:
-            self._forward(self._joined())
+            self._forward(self._take_joined())
 
     def _buffer(self, data: bytes) -> None:
         # An empty buffer accepts even a frame that is larger than the limit.
         if self._waiting and self._waiting_bytes + len(data) > self._limit:
-            self._dropped(1)
+            self._on_dropped(1)
             return
         self._waiting.append((self._loop.time() + WRITE_TIMEOUT_S, data))
         self._waiting_bytes += len(data)
@@ -124,27 +124,30 @@ class Outbox:
     def _flush(self) -> None:
         self._drop_outdated()
         while self._waiting and not self._is_full and not self._is_stalled and not self._is_closed:
-            self._forward(self._joined())
+            self._forward(self._take_joined())
 
-    def _joined(self) -> bytes:
+    def _take_joined(self) -> bytes:
         """Remove the next write and return it, joined with following writes up to `_MAX_JOINED_BYTES`."""
-        data = self._pop_oldest()
-        while self._waiting and len(data) + len(self._waiting[0][1]) <= _MAX_JOINED_BYTES:
-            data += self._pop_oldest()
-        return data
+        joined = self._pop_oldest()
+        while self._waiting:
+            _, next_write = self._waiting[0]
+            if len(joined) + len(next_write) > _MAX_JOINED_BYTES:
+                break
+            joined += self._pop_oldest()
+        return joined
 
     def _pop_oldest(self) -> bytes:
-        data = self._waiting.popleft()[1]
+        _, data = self._waiting.popleft()
         self._waiting_bytes -= len(data)
         return data
 
     def _drop_outdated(self) -> None:
-        now, count = self._loop.time(), 0
-        while self._waiting and self._waiting[0][0] <= now:
+        now = self._loop.time()
+        outdated = sum(deadline <= now for deadline, _ in self._waiting)  # The deadlines are in order.
+        for _ in range(outdated):
             self._pop_oldest()
-            count += 1
-        if count:
-            self._dropped(count)
+        if outdated:
+            self._on_dropped(outdated)
 
     # ------------------------------------------------------------------- stall detection
 

@@ -40,7 +40,8 @@ class Backoff:
         self._next_s = min_s
 
     def next_delay(self) -> float:
-        delay_s, self._next_s = self._next_s, min(2 * self._next_s, self._max_s)
+        delay_s = self._next_s
+        self._next_s = min(2 * delay_s, self._max_s)
         return delay_s
 
     def reset(self) -> None:
@@ -68,8 +69,9 @@ class ReconnectingLink(Link):
     """Link that is reopened after a loss, with increasing delays of 0.2 s to 5 s, until it is closed.
 
     The first opening is not retried. ``link_lost`` is called only at the end of a recording, and if ``make_link``
-    raises. Data written while the link is lost is dropped and counted in `dropped_writes`. Loss and recovery are logged
-    once each (WARNING, INFO). A link also counts as lost if the server closes each connection just after accepting it.
+    raises. Data written while the link is lost is dropped and counted in `dropped_writes`. Each loss is logged as
+    WARNING, each recovery as INFO. A link also counts as lost if the server closes each connection just after accepting
+    it.
 
     ``make_link`` is called at once and for each attempt, and must return a new link each time.
     """
@@ -132,7 +134,7 @@ class ReconnectingLink(Link):
         try:
             await self._link.open(current)
         except BaseException:
-            self._cancel_reopening()  # running if the link was lost while it was being opened
+            self._cancel_reopening()  # It is running if the link was lost while it was being opened.
             self._receiver = self._current = self._lost_at = None
             self._was_opened = False
             raise
@@ -246,7 +248,8 @@ class ReconnectingLink(Link):
         self._cancel_stable_timer()
         if self._lost_at is None:
             return
-        away_s, self._lost_at = asyncio.get_running_loop().time() - self._lost_at, None
+        away_s = asyncio.get_running_loop().time() - self._lost_at
+        self._lost_at = None
         self._backoff.reset()
         logger.info("%s is back after %.1f s", self.address, away_s)
         if isinstance(self._receiver, InterruptionListener):

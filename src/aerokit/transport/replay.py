@@ -38,7 +38,7 @@ class Replay(BaseLink):
         self._path, self._speed = path, factor
         self._loop: asyncio.AbstractEventLoop | None = None
         self._records: Iterator[tuple[float, bytes]] = iter(())
-        self._next: tuple[float, bytes] | None = None
+        self._next: tuple[float, bytes] | None = None  # (time stamp, frame)
         self._due = 0.0  # time of the next frame, on the loop's clock
         self._wake_up: asyncio.Handle | None = None
 
@@ -77,6 +77,7 @@ class Replay(BaseLink):
             self._wake_up = self._loop.call_at(max(now, self._due), self._play)
 
     def _advance(self, stamp: float) -> None:
+        """Read the next frame, and schedule it after the frame with this time stamp."""
         if self._receiver is None:  # The receiver has closed the link in its callback.
             return
         try:
@@ -86,5 +87,6 @@ class Replay(BaseLink):
             self._lose(reason, error, RecordingEnded)
             return
         if self._next is not None:
-            gap = min(max(self._next[0] - stamp, 0.0), MAX_GAP_S)
-            self._due += gap / self._speed
+            next_stamp, _ = self._next
+            gap_s = min(max(next_stamp - stamp, 0.0), MAX_GAP_S)
+            self._due += gap_s / self._speed

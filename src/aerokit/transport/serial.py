@@ -42,7 +42,7 @@ _MAX_BUFFER_S = 2.0  # The write buffer holds data for this time. Older data wou
 
 
 class AddressError(SerialException, InvalidArgument):  # type: ignore[misc]  # pyserial has no types
-    """An invalid connection string. It is also a SerialException, which pymavlink raises for such a string."""
+    """An invalid connection string. It is also a SerialException, which pymavlink raises for it."""
 
 
 class SerialLink(BaseLink):
@@ -82,7 +82,7 @@ class SerialLink(BaseLink):
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
-        self._outbox.reclaimed(discarded_bytes)
+        self._outbox.record_reclaimed(discarded_bytes)
         # It is unknown how many writes these bytes contain, so they count as one dropped write.
         if discarded_bytes > 0:
             self._drop(1)
@@ -188,7 +188,7 @@ class _SerialProtocol(asyncio.Protocol):
             with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._link._loop.call_soon(self._link._outbox.resume)
 
-    # The replaced methods report their errors themselves. This is called for all other errors.
+    # The replaced methods report their errors themselves. This method is called for all other errors.
     def connection_lost(self, exc: Exception | None) -> None:
         self._link._lose(f"the device failed: {exc}", exc)
 
@@ -263,7 +263,7 @@ class PtyLink(BaseLink):
     def __init__(self, path: str = "") -> None:
         super().__init__(f"pty:{path}" if path else "pty")
         self._path = path
-        self._ends: tuple[int, ...] = ()
+        self._ends: tuple[int, ...] = ()  # file descriptors: our end, the other end
         self._loop: asyncio.AbstractEventLoop | None = None
         self._has_symlink = False
 
@@ -272,7 +272,8 @@ class PtyLink(BaseLink):
         if not self._ends or not data:
             return
         try:
-            written = os.write(self._ends[0], data)
+            our_end, _ = self._ends
+            written = os.write(our_end, data)
         except OSError:
             written = 0
         if written < len(data):
@@ -285,7 +286,8 @@ class PtyLink(BaseLink):
 
         self._loop = asyncio.get_running_loop()
         # The other end is kept open here, because reading our end fails while no process has the other end open.
-        ours, theirs = self._ends = os.openpty()
+        ours, theirs = os.openpty()
+        self._ends = ours, theirs
         tty.setraw(theirs)
         os.set_blocking(ours, False)
         name = os.ttyname(theirs)
@@ -303,8 +305,9 @@ class PtyLink(BaseLink):
         self._has_symlink = True
 
     def _read(self) -> None:
+        our_end, _ = self._ends
         try:
-            data = os.read(self._ends[0], _READ_SIZE)
+            data = os.read(our_end, _READ_SIZE)
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -315,7 +318,8 @@ class PtyLink(BaseLink):
     def _release(self) -> None:
         ends, self._ends = self._ends, ()
         if self._loop is not None and ends and not self._loop.is_closed():
-            self._loop.remove_reader(ends[0])
+            our_end, _ = ends
+            self._loop.remove_reader(our_end)
         for end in ends:
             os.close(end)
         if self._has_symlink:

@@ -228,7 +228,8 @@ class TcpListen(_TcpLink):
     async def _connect(self) -> None:
         self._socket = sock = await bound_socket(self._host, self._port, socket.SOCK_STREAM)
         self._local_address = sock.getsockname()[:2]
-        self.address: str = f"tcpin:{host_and_port(self._host, self._local_address[1])}"
+        _, port = self._local_address
+        self.address: str = f"tcpin:{host_and_port(self._host, port)}"
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: _Stream(self), sock=sock, backlog=16, start_serving=False)
         self._socket = None  # The server now owns the socket and closes it.

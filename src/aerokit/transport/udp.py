@@ -22,7 +22,7 @@ from aerokit.transport.sockets import (
     SocketAddress,
     bind_to,
     bound_socket,
-    has_more,
+    readable_check,
     resolve,
 )
 
@@ -57,8 +57,7 @@ class _UdpLink(BaseLink):
         self._socket: socket.socket | None = None
         self._transport: asyncio.DatagramTransport | None = None  # used only on loops without add_reader
         self._transport_owns_socket = False
-        # Function that returns whether another datagram can be read. The default, `bool`, returns False: no socket yet.
-        self._has_more: Callable[[], object] = bool
+        self._has_more: Callable[[], object] = lambda: False  # returns a true value if a datagram can be read
         self._burst_listener: BurstListener | None = None
 
     @property
@@ -77,7 +76,7 @@ class _UdpLink(BaseLink):
         self._transport_owns_socket = False
         self._burst_listener = self._receiver if isinstance(self._receiver, BurstListener) else None
         self._socket = sock = await self._make_socket()
-        self._has_more = has_more(sock)
+        self._has_more = readable_check(sock)
         _enlarge_buffer(sock)
         try:
             self._loop.add_reader(sock, self._on_readable)
@@ -197,7 +196,8 @@ class UdpListen(_UdpLink):
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
         if source != self._last_source:  # Consecutive datagrams of one sender are checked once, to save time.
-            if source not in self._peers and not self._allowed.allows(source[0]):
+            host, *_ = source
+            if source not in self._peers and not self._allowed.allows(host):
                 return
             self._last_source = source
             if not self._keeps_peers:
@@ -284,8 +284,9 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         # Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames
         # before it accepts the port by `keep_peer`.
-        is_same_host = self._keeps_peers and self._remote is not None and source[0] == self._remote[0]
-        return (is_same_host or self._is_remote_silent()) and self._allowed.allows(source[0])
+        host, *_ = source
+        is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
+        return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 
 
 class _DatagramProtocol(asyncio.DatagramProtocol):

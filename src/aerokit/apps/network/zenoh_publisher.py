@@ -115,7 +115,7 @@ async def discover(
             else:
                 keys.discard(key)
 
-        all_names = KeySpace(fleet, "*").alive()
+        all_names = KeySpace(fleet, "*").vehicle_token()
         subscribers.append(session.liveliness().declare_subscriber(all_names, on_sample, history=True))
 
     options = NetworkOptions(tuple(connect), tuple(listen), "", config)

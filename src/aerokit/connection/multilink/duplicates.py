@@ -29,10 +29,11 @@ COPY_WINDOW_FRAMES = 128
 
 
 class _Seen:
-    __slots__ = ("at", "count", "is_accepted", "is_admitted", "links")
+    __slots__ = ("at", "count", "is_accepted", "is_admitted", "link_bits")
 
-    def __init__(self, at: float, links: int, count: int) -> None:
-        self.at, self.links = at, links  # links: one bit for each link
+    def __init__(self, at: float, link_bit: int, count: int) -> None:
+        self.at = at
+        self.link_bits = link_bit  # has one bit for each link over which the frame arrived
         self.count = count  # number of the sender's frames, this one included, when it arrived
         self.is_admitted = self.is_accepted = False
 
@@ -56,14 +57,15 @@ class Copies:
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
-        earlier, link_bit = self._seen.get(key), 1 << link
+        earlier = self._seen.get(key)
+        link_bit = 1 << link
         self.is_late = False
         if earlier is not None:
             age_s = frame.received_at - earlier.at
-            is_other_link = not earlier.links & link_bit
+            is_other_link = not earlier.link_bits & link_bit
             is_recent = age_s <= COPY_WINDOW_S and count - earlier.count < COPY_WINDOW_FRAMES
             if is_recent and is_other_link:
-                earlier.links |= link_bit
+                earlier.link_bits |= link_bit
                 self._current = earlier
                 return True
             self.is_late = is_other_link and earlier.is_accepted and age_s <= LATE_COPY_WINDOW_S
@@ -97,7 +99,7 @@ class Copies:
             self._current.is_accepted = True
 
 
-# After a switch to another link, answers to earlier requests may still arrive over the former link for this time.
+# After a switch to another link, answers to earlier requests may still arrive over the previous link for this time.
 ANSWER_TIMEOUT_S = 3.0
 
 # A component counts as reachable over a link until it has sent nothing over this link for this time.
@@ -122,11 +124,11 @@ ACKNOWLEDGEMENTS = frozenset(message_type.ID for message_type in (m.CommandAck, 
 class _Stream:
     """State of the frames that one component sends over all links."""
 
-    __slots__ = ("acknowledgements", "newest", "received_at")
+    __slots__ = ("acknowledgements", "newest_sequence", "received_at")
 
-    def __init__(self, links: int) -> None:
-        self.received_at = [-math.inf] * links
-        self.newest = -1  # sequence number of the newest accepted frame; -1: none
+    def __init__(self, link_count: int) -> None:
+        self.received_at = [-math.inf] * link_count
+        self.newest_sequence = -1  # sequence number of the newest accepted frame; -1: none
         # Acknowledgement's payload → how often each link delivered it since the last switch to another link.
         self.acknowledgements: dict[bytes, list[int]] = {}
 
@@ -144,25 +146,28 @@ class MergedStreams:
     link in use are accepted, because frames of the other link may be older. ``choices`` has the links to each system.
     """
 
-    def __init__(self, links: int, choices: Mapping[int, LinkChoice]) -> None:
-        self._count, self._choices = links, choices
-        self._streams: dict[int, _Stream] = {}
+    def __init__(self, link_count: int, choices: Mapping[int, LinkChoice]) -> None:
+        self._link_count, self._choices = link_count, choices
+        self._streams: dict[int, _Stream] = {}  # the key is component id << 8 | system id
         self.copies: Copies = Copies()
 
     def reset(self, system_id: int) -> None:
         self._streams = {key: stream for key, stream in self._streams.items() if key & 0xFF != system_id}
 
     def was_accepted(self, frame: Frame, link: int) -> bool:
-        """Return True if this frame is a copy of a frame that was accepted over another link."""
+        """Return True if this frame is a copy of a frame that was accepted over another link.
+
+        Also record what a copy proves: its link works, and may lead to the vehicle.
+        """
         if not self.copies.is_copy(frame, link):
             return False
         choice = self._choices.get(frame.system_id)
         # Equal frames prove that both links lead to one vehicle if they contain the time since boot. Frames without
         # that time, such as heartbeats, may be equal although they come from two vehicles.
         if choice is not None and boot_time_ms(frame):
-            links = {link} if choice.used is None else {link, choice.used.link}
-            for index in links:
-                if (candidate := choice.candidates.get(index)) is not None:
+            links_to_vehicle = {link} if choice.used is None else {link, choice.used.link}
+            for link_to_vehicle in links_to_vehicle:
+                if (candidate := choice.candidates.get(link_to_vehicle)) is not None:
                     candidate.record_copy(frame.received_at)
         if not self.copies.was_accepted:
             return False
@@ -181,7 +186,7 @@ class MergedStreams:
         if candidate is not None and not choice.may_be_used(candidate):
             return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
-            return False  # This telemetry may be older than the last telemetry that the former link delivered.
+            return False  # This telemetry may be older than the last telemetry that the previous link delivered.
         if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):
@@ -192,7 +197,7 @@ class MergedStreams:
             is_repeated = stream.is_repeated(frame.payload, link)
             if is_repeated and link != choice.used.link:
                 return False
-        stream.newest = frame.sequence
+        stream.newest_sequence = frame.sequence
         self.copies.accept()
         return True
 
@@ -203,7 +208,7 @@ class MergedStreams:
         if stream is None:
             if len(self._streams) >= MAX_STREAMS:
                 del self._streams[next(iter(self._streams))]
-            stream = self._streams[key] = _Stream(self._count)
+            stream = self._streams[key] = _Stream(self._link_count)
         return stream
 
 
@@ -215,13 +220,14 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
     if choice.is_shared(candidate, frame.received_at):
         # Both links carry the same stream. The link in use has lost this frame, or delivers it later. Telemetry is
         # refused if a newer frame was already accepted; an answer is valid in any case.
-        is_overtaken = stream.newest >= 0 and (frame.sequence - stream.newest) & 0xFF >= 128
+        newest = stream.newest_sequence
+        is_overtaken = newest >= 0 and (frame.sequence - newest) & 0xFF >= 128
         return is_answer or not is_overtaken
     # The links carry separate streams. The frame is needed if only this link reaches the component, or if it answers a
     # request that was sent before the switch to the link in use.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S
     is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
-    return not is_on_used_link or (is_answer and candidate is choice.former and is_after_change)
+    return not is_on_used_link or (is_answer and candidate is choice.previous and is_after_change)
 
 
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:

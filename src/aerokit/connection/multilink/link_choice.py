@@ -22,7 +22,7 @@ MIN_CLOCK_MATCHES = 3
 
 # A vehicle that answers this many TIMESYNC probes after the request for its hardware id, but not the request itself,
 # has no hardware id to report.
-MAX_TIMES_WITHOUT_HARDWARE = 3
+MAX_ANSWERS_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
 
@@ -110,8 +110,8 @@ class Candidate:
         self._hardware_requests = self._answers_since_request = 0
         self._clock_matches = self._clock_mismatches = self._copies = 0
 
-    def request_hardware(self) -> bool:
-        """Count a request for the hardware id, and return True if it is to be sent now."""
+    def should_request_hardware(self) -> bool:
+        """Return True if the hardware id is to be requested over this link, and count the request."""
         if (
             self.hardware is not None
             or self.answered_at == -math.inf
@@ -124,7 +124,7 @@ class Candidate:
     @property
     def is_hardware_pending(self) -> bool:
         """True while an answer to a request for the hardware id can still be expected."""
-        return self._hardware_requests > 0 and self._answers_since_request < MAX_TIMES_WITHOUT_HARDWARE
+        return self._hardware_requests > 0 and self._answers_since_request < MAX_ANSWERS_WITHOUT_HARDWARE
 
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
@@ -135,7 +135,7 @@ class Candidate:
             self.is_doubted = False
         self.is_other_hardware = is_other
 
-    def record_time(self) -> None:
+    def count_answer(self) -> None:
         """Count a TIMESYNC answer after a request for the hardware id."""
         if self._hardware_requests:
             self._answers_since_request += 1
@@ -164,7 +164,7 @@ class Candidate:
     @property
     def cost_s(self) -> float:
         """Expected seconds for a command and its answer, including retries after losses."""
-        loss = min(0.9, self.loss or 0.0)
+        loss = min(0.9, self.loss or 0.0)  # A loss of 1 would make the cost infinite.
         round_trip_s = 0.1 if self.round_trip_s is None else self.round_trip_s
         # Adding 0.05 s makes links with round trips of a few milliseconds cost about the same. The exponent is 2,
         # because both the command and its answer must arrive.
@@ -202,11 +202,11 @@ class LinkChoice:
         self._hardware_link = -1  # link over which `hardware` was received; the next id over it replaces `hardware`
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
-        self.former: Candidate | None = None
+        self.previous: Candidate | None = None
         """The link in use before the last switch. Answers may still arrive over it."""
         self.changed_at: float = -math.inf
         self.fresh_after: float = -math.inf
-        """Telemetry that arrives before this time may be older than the last telemetry of the former link."""
+        """Telemetry that arrives before this time may be older than the last telemetry of the previous link."""
         self._better: Candidate | None = None  # link that is better than the link in use, since `_better_since`
         self._better_since = 0.0
         self._command_at = -math.inf  # time of the last command to the system
@@ -244,7 +244,7 @@ class LinkChoice:
                 for affected in self.candidates.values():
                     affected.reset_mismatches()
         else:
-            candidate.record_time()
+            candidate.count_answer()
             matches = self.clock.matches(at, vehicle_s, round_trip_s)
             if not matches and is_used_silent:
                 # While the link in use is silent, the vehicle may have rebooted, so a different clock does not prove
@@ -310,9 +310,9 @@ class LinkChoice:
         Over the link in use, an attached vehicle object (``is_attached``) requests the id itself.
         """
         if candidate is not self.used:
-            return not candidate.is_proven and candidate.request_hardware()
+            return not candidate.is_proven and candidate.should_request_hardware()
         has_other_links = len(self.candidates) > 1  # With a single link, there is no other id to compare with.
-        return has_other_links and not is_attached and candidate.request_hardware()
+        return has_other_links and not is_attached and candidate.should_request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
         """Return True if the link was proven before, its hardware id matches, and no other link is alive."""
@@ -343,14 +343,17 @@ class LinkChoice:
 
     def _change(self, chosen: Candidate, reason: str, now: float) -> str:
         """Use this link from now on; return ``reason``."""
-        former = self.used
-        if former is not None:
-            # Before `fresh_after`, telemetry over the new link may be older than the last telemetry of the former link.
-            extra_transit_s = ((chosen.round_trip_s or 0.0) - (former.round_trip_s or 0.0)) / 2
-            self.fresh_after = former.received_at + extra_transit_s + JITTER_S
-            # A link is chosen only if it leads to the same vehicle as the former link. The choice therefore also proves
-            # the former link, unless its hardware id belongs to another vehicle.
-            former.is_proven = not former.is_other_hardware
-        self.former, self.used, self.changed_at, self._better = former, chosen, now, None
+        previous = self.used
+        if previous is not None:
+            # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.
+            extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
+            self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
+            # A link is chosen only if it leads to the same vehicle as the previous link. The choice therefore also
+            # proves the previous link, unless its hardware id belongs to another vehicle.
+            previous.is_proven = not previous.is_other_hardware
+        self.previous = previous
+        self.used = chosen
+        self.changed_at = now
+        self._better = None
         self._adopt_hardware(chosen)
         return reason

@@ -83,20 +83,21 @@ class LinkProbes:
         # The answer contains `ts1`, which identifies the probe. It is our time in nanoseconds. The last three digits
         # are a number of the system and the link, because several probes may be sent at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
-        # `ts1` is invalid, or belongs to another pending probe. The next call tries again.
         if ts1 <= 0 or ts1 in self._pending:
-            return
+            return  # The number is invalid, or belongs to another pending probe. The next call tries again.
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = system_id, candidate.link, now
-        self._send(m.Timesync(0, ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
+        self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
         if choice.should_request_hardware(candidate, is_attached=is_attached):
-            message_id = float(m.AutopilotVersion.ID)
-            request = m.CommandLong(system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, 0, message_id, 0, 0, 0, 0, 0, 0)
+            request = m.CommandLong(
+                system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
+                param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
+            )  # fmt: skip
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes over any link. Record such an answer."""
+        """Return True if this TIMESYNC answers one of our probes over any link, and record the answer."""
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
         if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:
@@ -131,7 +132,7 @@ class LinkProbes:
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
         """Return the seconds since the probe; None if the probe was sent to another system, or over another link."""
-        probed_system, probed_link, sent_at = self._pending.get(answer.ts1, (0, 0, 0.0))
+        probed_system, probed_link, sent_at = self._pending[answer.ts1]
         if (probed_system, probed_link) != (system_id, link):
             return None
         del self._pending[answer.ts1]

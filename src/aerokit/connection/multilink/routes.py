@@ -64,7 +64,9 @@ class LinkStates:
         before, self._states[link] = self._states[link], state
         if before is not state:
             self._updated_at = -math.inf
-            self._publish(MemberLinkStateChanged(now, 0, self._link.names[link], before, state))
+            self._publish(
+                MemberLinkStateChanged(now, system_id=0, link=self._link.names[link], before=before, after=state)
+            )
 
     def set_cell(self, now: float) -> None:
         self._updated_at = now
@@ -145,19 +147,19 @@ class MultiLinkRoutes:
 
     def record_heartbeat(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
         """See :meth:`Routes.record_heartbeat`. Also return False for system id 0."""
-        if not frame.system_id or not self._routes[_link(peer)].record_heartbeat(frame, peer, counters):
+        if not frame.system_id or not self._routes[_link_index(peer)].record_heartbeat(frame, peer, counters):
             return False
         heartbeat = self._bus.dialect.decode(frame)
         is_autopilot = getattr(heartbeat, "autopilot", MavAutopilot.INVALID) != MavAutopilot.INVALID
         choice = self._choices.get(frame.system_id)
         if choice is None:
             choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
-        is_costly = _link(peer) in self._link.costly
-        candidate = choice.record_heartbeat(_link(peer), frame.received_at, is_costly=is_costly)
+        is_costly = _link_index(peer) in self._link.costly
+        candidate = choice.record_heartbeat(_link_index(peer), frame.received_at, is_costly=is_costly)
         if is_autopilot and not choice.needs_proof:  # So far, only other components of this system were received.
             choice.start_with(candidate)
         if counters is not None:
-            self._counters.setdefault((frame.system_id, _link(peer)), {})[frame.component_id] = counters
+            self._counters.setdefault((frame.system_id, _link_index(peer)), {})[frame.component_id] = counters
         if choice.used is None:
             self._choose(frame.system_id, choice, frame.received_at)
         return True
@@ -169,10 +171,10 @@ class MultiLinkRoutes:
         return any(routes.is_outdated(frame) for routes in self._routes)
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
-        return self._routes[_link(peer)].arrived_on_other_peer(frame, peer)
+        return self._routes[_link_index(peer)].arrived_on_other_peer(frame, peer)
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        return self._routes[_link(peer)].claims_route(frame, peer, counters, is_signed)
+        return self._routes[_link_index(peer)].claims_route(frame, peer, counters, is_signed)
 
     def record_duplicate_sender(self, frame: Frame) -> None:
         self._routes[0].record_duplicate_sender(frame)
@@ -183,7 +185,7 @@ class MultiLinkRoutes:
 
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
         for index, routes in enumerate(self._routes):
-            evictable = routes.evictable_peers((peer for peer in peers if _link(peer) == index), now)
+            evictable = routes.evictable_peers((peer for peer in peers if _link_index(peer) == index), now)
             if evictable:
                 return evictable
         return []
@@ -218,7 +220,7 @@ class MultiLinkRoutes:
         """
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
-        link = _link(peer)
+        link = _link_index(peer)
         if not self._merged.was_accepted(frame, link):
             return False
         # A copy is not delivered. It still proves that this link works, and which vehicle the link leads to.
@@ -230,7 +232,7 @@ class MultiLinkRoutes:
 
     def accepts(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
         """Return True if the frame is to be delivered. Heartbeats of links not in use are recorded here."""
-        link = _link(peer)
+        link = _link_index(peer)
         if frame.message_id == m.Timesync.ID and self._probes.is_answer(frame, link):
             return False
         self._probes.record_hardware(frame, link)
@@ -258,7 +260,7 @@ class MultiLinkRoutes:
                 self._choose(system_id, choice, now)
 
     def link_open_failed(self, link: int, error: LinkOpenError) -> None:
-        self._bus.publish(MemberLinkOpenFailed(self._now(), 0, self._link.names[link], error))
+        self._bus.publish(MemberLinkOpenFailed(self._now(), system_id=0, link=self._link.names[link], error=error))
 
     async def watch(self) -> None:
         while True:
@@ -332,14 +334,14 @@ class MultiLinkRoutes:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
-            name, former = self._link.names[used.link], self._link.names[before.link]
+            name, previous = self._link.names[used.link], self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
             log(
                 "system %d: switched to %s, because %s is %s",
                 system_id,
                 name,
-                former,
-                _DISADVANTAGE_OF_FORMER.get(reason, reason),
+                previous,
+                _DISADVANTAGE_OF_PREVIOUS.get(reason, reason),
             )
         self._bus.publish(
             LinkSelected(
@@ -359,10 +361,10 @@ class MultiLinkRoutes:
                 self._probes.probe(system_id, choice, candidate, peer, now, is_attached=is_attached)
 
 
-# Maps the reason for a switch, which describes the new link, to the word that describes the former link in the log.
-_DISADVANTAGE_OF_FORMER = {"better": "worse", "cheaper": "costly"}
+# Maps the reason for a switch, which describes the new link, to the word that describes the previous link in the log.
+_DISADVANTAGE_OF_PREVIOUS = {"better": "worse", "cheaper": "costly"}
 
 
-def _link(peer: Peer) -> int:
+def _link_index(peer: Peer) -> int:
     assert isinstance(peer, LinkPeer)
     return peer.link

@@ -31,7 +31,7 @@ class VehicleClock:
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
         """True if the last sample was as expected from the speed; False after a pause or reboot."""
-        self._former_speed: tuple[float, float] | None = None  # speed before the last pause or reboot, and its time
+        self._previous_speed: tuple[float, float] | None = None  # speed before the last pause or reboot, and its time
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
@@ -42,7 +42,7 @@ class VehicleClock:
         self.is_steady = continues and self._fits(at, vehicle_s, round_trip_s) is not False
         if not self.is_steady:
             if (speed := self._measured_speed) is not None:
-                self._former_speed = speed, at
+                self._previous_speed = speed, at
             self._samples.clear()  # The pause would make the speed measured over older samples too small.
         self._samples.append((at, vehicle_s))
         return continues
@@ -82,7 +82,8 @@ class VehicleClock:
         return min_advance_s - tolerance_s <= advance_s <= expected_s + tolerance_s
 
     def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
-        drift_s = min(MAX_SPEED_ERROR * abs(at - self._samples[-1][0]), MAX_DRIFT_S)
+        last_at, _ = self._samples[-1]
+        drift_s = min(MAX_SPEED_ERROR * abs(at - last_at), MAX_DRIFT_S)
         return (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
 
     @property
@@ -90,10 +91,11 @@ class VehicleClock:
         """The measured speed. Shortly after a pause or reboot it is the speed from before; None if neither is known."""
         if self._measured_speed is not None:
             return self._measured_speed
-        if self._former_speed is None:
+        if self._previous_speed is None:
             return None
-        speed, measured_at = self._former_speed
-        return speed if self._samples[-1][0] - measured_at <= SPEED_MAX_AGE_S else None
+        speed, measured_at = self._previous_speed
+        last_at, _ = self._samples[-1]
+        return speed if last_at - measured_at <= SPEED_MAX_AGE_S else None
 
     @property
     def _measured_speed(self) -> float | None:

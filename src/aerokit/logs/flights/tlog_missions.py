@@ -79,7 +79,7 @@ class RecordedMission:
         self._is_file_open = False
         if not header.options & NO_CLEAR:
             self._items.clear()
-        for number, item in enumerate(items, header.first):
+        for number, item in enumerate(items, header.first_index):
             self._add(to_wire(item, number, target_system=0, target_component=0))
 
     def _add(self, message: m.MissionItemInt | m.MissionItem) -> None:

@@ -86,7 +86,7 @@ class ZenohConnect(NetworkLink):
         # True until a beacon shows that this client has control, so that the request is repeated.
         self._takes_control = control == "take"
         self._tracker = VehicleSideTracker(random.getrandbits(32), "never" if control == "never" else "free")
-        self._alive: set[str] = set()  # keys of the vehicle sides that are alive, as reported by the network
+        self._vehicle_tokens: set[str] = set()  # keys of the vehicle sides that are alive, as reported by the network
         self._publisher: Any = None
         self._first_beacon = asyncio.Event()
 
@@ -125,7 +125,7 @@ class ZenohConnect(NetworkLink):
     def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
         # This function and its callbacks run on threads of zenoh, so each callback posts its sample to the event loop.
         # A sample that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
-        def posting(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
+        def callback_for(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
                 is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)
                 if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -138,15 +138,15 @@ class ZenohConnect(NetworkLink):
             queue.post(partial(self._on_liveliness, str(sample.key_expr), is_put))
 
         keys, client = self._keys, self.client
-        on_frames, liveliness = posting(self._on_frames), session.liveliness()
+        on_frames, liveliness = callback_for(self._on_frames), session.liveliness()
         self._declared = [
             session.declare_subscriber(keys.to_all_clients, on_frames),
             session.declare_subscriber(keys.from_vehicle(client), on_frames),
-            session.declare_subscriber(keys.notices(client), posting(self._on_notice)),
-            session.declare_subscriber(keys.beacon, posting(self._on_beacon)),
+            session.declare_subscriber(keys.notices(client), callback_for(self._on_notice)),
+            session.declare_subscriber(keys.beacon, callback_for(self._on_beacon)),
             # The vehicle sides of the whole fleet are tracked, because the error text for a wrong name lists them.
-            liveliness.declare_subscriber(KeySpace(keys.fleet, "*").alive(), on_liveliness, history=True),
-            liveliness.declare_token(keys.client(client)),
+            liveliness.declare_subscriber(KeySpace(keys.fleet, "*").vehicle_token(), on_liveliness, history=True),
+            liveliness.declare_token(keys.client_token(client)),
         ]
         self._publisher = session.declare_publisher(
             keys.to_vehicle(client), congestion_control=zenoh.CongestionControl.DROP
@@ -158,14 +158,18 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- receiving
 
     def _on_frames(self, data: bytes, attachment: bytes, _is_put: bool) -> None:
-        epoch_and_time = decode_sent_at(attachment)
-        if epoch_and_time is not None and self._tracker.accepts(*epoch_and_time, self._now()):
-            self._deliver(data)
+        sent_at = decode_sent_at(attachment)
+        if sent_at is not None:
+            epoch, sent_s = sent_at
+            if self._tracker.accepts(epoch, sent_s, self._now()):
+                self._deliver(data)
 
     def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
         if not is_put:  # A vehicle side that closes deletes its beacon.
-            epoch_and_time = decode_sent_at(attachment)
-            if epoch_and_time is not None and epoch_and_time[0] == self._tracker.epoch:
+            closed_epoch = None
+            if (sent_at := decode_sent_at(attachment)) is not None:
+                closed_epoch, _ = sent_at
+            if closed_epoch is not None and closed_epoch == self._tracker.epoch:
                 self._tracker.reset()
                 self._lose("the vehicle side was closed")
             return
@@ -189,9 +193,9 @@ class ZenohConnect(NetworkLink):
 
     def _on_liveliness(self, key: str, is_alive: bool) -> None:
         if is_alive:
-            self._alive.add(key)
+            self._vehicle_tokens.add(key)
         else:
-            self._alive.discard(key)
+            self._vehicle_tokens.discard(key)
 
     # ---------------------------------------------------------------------------------- sending
 
@@ -200,7 +204,7 @@ class ZenohConnect(NetworkLink):
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
-        stamp = self._tracker.stamp(self._now(), mode)
+        stamp = self._tracker.make_stamp(self._now(), mode)
         if stamp is None:
             self._drop(1)
             return
@@ -221,7 +225,7 @@ class ZenohConnect(NetworkLink):
         tracker, now = self._tracker, self._now()
         if tracker.epoch is not None and tracker.is_silent(now):
             # The end of the liveliness token shows a loss earlier than a long silence does.
-            if self._keys.alive(tracker.epoch) not in self._alive:
+            if self._keys.vehicle_token(tracker.epoch) not in self._vehicle_tokens:
                 self._lose("the vehicle side has left the network")
                 return
             if now - tracker.received_at > LOST_AFTER_S:
@@ -230,7 +234,7 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        names = sorted({key.split("/")[2] for key in self._alive})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
+        names = sorted({key.split("/")[2] for key in self._vehicle_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:
             return f"{keys.name} is on the network, but sent nothing for {self._open_timeout_s:g} s"

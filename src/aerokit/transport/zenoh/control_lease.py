@@ -72,7 +72,7 @@ _TEXT_PREFIX = "network: "
 
 _MAX_TEXT_LENGTH = 50  # length of the text in STATUSTEXT
 
-_MAX_KINDS = 64
+_MAX_NOTICES = 64  # maximum number of message names whose last notice is remembered
 
 _READ_IDS = frozenset(message_id for message_id, (class_name, *_) in INDEX.items() if class_name in READ_MESSAGES)
 
@@ -185,7 +185,7 @@ class ClientFilter:
         return b"".join(accepted), notices
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
-        """Return True if another program recently used this client name, unless this program takes control."""
+        """Return True if another program recently used this client name. A program that takes control replaces it."""
         is_other_program = self._nonce not in (None, nonce)
         is_recent = now - self._nonce_at <= LEASE_TIMEOUT_S
         if is_other_program and is_recent and mode != "take":
@@ -216,6 +216,7 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
+        """Count a refused frame. Return a notice, or nothing if a notice about this message was sent recently."""
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
@@ -224,7 +225,7 @@ class ClientFilter:
         if not answer and now - noticed_at < NOTICE_INTERVAL_S:
             self._notices[name] = (noticed_at, unreported + 1)
             return []
-        if len(self._notices) >= _MAX_KINDS:
+        if len(self._notices) >= _MAX_NOTICES:
             self._notices.clear()
         self._notices[name] = (now, 0)
         return [RefusalNotice(name, reason, holder, answer, unreported + 1)]
@@ -241,7 +242,7 @@ def _decoded(frame: Frame) -> Message | None:
 
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
-    """Return the frames by which a vehicle would reject a message. Empty for broadcasts, or without such frames."""
+    """Return the frames by which a vehicle would reject a message. Empty if it is a broadcast or needs no answer."""
     fields: object = message  # The type is `object`, because the class Message does not declare these fields.
     system: int = getattr(fields, "target_system", 0)
     # A message for all components (0) is answered by the autopilot (1).
@@ -250,7 +251,14 @@ def _answer(frame: Frame, message: Message, reason: str) -> bytes:
     if message.NAME in COMMANDS:
         command: int = getattr(fields, "command", 0)
         result = MavResult.TEMPORARILY_REJECTED
-        answer = CommandAck(command, result, 0, 0, frame.system_id, frame.component_id)
+        answer = CommandAck(
+            command,
+            result,
+            progress=0,
+            result_param2=0,
+            target_system=frame.system_id,
+            target_component=frame.component_id,
+        )
     elif message.NAME in _MISSION_WRITES:
         mission_type: int = getattr(fields, "mission_type", 0)
         answer = MissionAck(frame.system_id, frame.component_id, MavMissionResult.DENIED, mission_type)
@@ -284,7 +292,7 @@ class FreshnessChecker:
         self._sent: deque[tuple[int, float]] = deque()  # (number, send time) of the beacons that stamps may refer to
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()
 
-    def beacon(self, now: float, lease_holder: str | None = None) -> Beacon:
+    def make_beacon(self, now: float, lease_holder: str | None = None) -> Beacon:
         self._expire(now)
         self._number += 1
         self._sent.append((self._number, now))
@@ -313,7 +321,10 @@ class FreshnessChecker:
         return oldest_number <= stamp.beacon <= newest_number
 
     def _expire(self, now: float) -> None:
-        while self._sent and now - self._sent[0][1] > MAX_DELAY_S:
+        while self._sent:
+            _, sent_at = self._sent[0]
+            if now - sent_at <= MAX_DELAY_S:
+                return
             self._sent.popleft()
 
 
@@ -354,7 +365,7 @@ class VehicleSideTracker:
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
         self._nonce, self._mode = nonce, mode
-        self._beacon = 0  # number of the last valid beacon; 0: none
+        self._beacon_number = 0  # number of the last valid beacon; 0: none
         self._sequence = 0  # number of the last datagram sent
         self._delays = DelayEstimator()
 
@@ -367,13 +378,17 @@ class VehicleSideTracker:
             if self.epoch is not None and not self.is_silent(now):
                 self.foreign += 1
                 return False
-            self.epoch, self._beacon, self._delays = beacon.epoch, 0, DelayEstimator()
-        elif beacon.number <= self._beacon:  # A newer beacon was already received.
+            self.epoch = beacon.epoch
+            self._beacon_number = 0
+            self._delays = DelayEstimator()
+        elif beacon.number <= self._beacon_number:  # A newer beacon was already received.
             return False
         if self._delays.delay(beacon.clock_s, now) > MAX_DELAY_S:
             self.late += 1
             return False
-        self._beacon, self.received_at, self.lease_holder = beacon.number, now, beacon.lease_holder
+        self._beacon_number = beacon.number
+        self.received_at = now
+        self.lease_holder = beacon.lease_holder
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
@@ -386,15 +401,16 @@ class VehicleSideTracker:
             return False
         return True
 
-    def stamp(self, now: float, mode: ControlMode | None = None) -> Stamp | None:
+    def make_stamp(self, now: float, mode: ControlMode | None = None) -> Stamp | None:
         """Make the stamp for a datagram. Return None if no datagram may be sent, because beacons are missing."""
         if self.epoch is None or self.is_silent(now):
             return None
         self._sequence += 1
-        return Stamp(self.epoch, self._beacon, self._nonce, self._sequence, mode or self._mode)
+        return Stamp(self.epoch, self._beacon_number, self._nonce, self._sequence, mode or self._mode)
 
     def is_silent(self, now: float) -> bool:
-        return self._beacon == 0 or now - self.received_at > MAX_DELAY_S
+        return self._beacon_number == 0 or now - self.received_at > MAX_DELAY_S
 
     def reset(self) -> None:
-        self.epoch, self._beacon, self.lease_holder = None, 0, None
+        self.epoch = self.lease_holder = None
+        self._beacon_number = 0

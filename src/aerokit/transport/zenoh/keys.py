@@ -84,14 +84,15 @@ class KeySpace(Snapshot):
     def notices(self, client: str) -> str:
         return f"{self.root}/refused/{client}"
 
-    def alive(self, epoch: int | None = None) -> str:
+    def vehicle_token(self, epoch: int | None = None) -> str:
+        """Return the key of a vehicle side's liveliness token; without an epoch, a pattern for all of its runs."""
         return f"{self.root}/alive/{'*' if epoch is None else format(epoch, '08x')}"
 
-    def client(self, client: str = "*") -> str:
+    def client_token(self, client: str = "*") -> str:
         return f"{self.root}/client/{client}"
 
     def state(self, name: str) -> str:
-        """Return the key under which a state is published as JSON. ``state`` is e.g. "1/position", or "**" for all."""
+        """Return the key under which a state is published as JSON. ``name`` is e.g. "1/position", or "**" for all."""
         return f"{self.root}/state/{name}"
 
 

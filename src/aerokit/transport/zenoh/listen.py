@@ -33,7 +33,7 @@ from aerokit.transport.zenoh.session import (
 )
 
 MAX_CLIENTS = 64
-"""Maximum number of clients. A further one is ignored unless a client has been silent for `CLIENT_TIMEOUT_S`."""
+"""Maximum number of clients. A new client is then ignored, unless a client has been silent for `CLIENT_TIMEOUT_S`."""
 
 CLIENT_TIMEOUT_S = 30.0
 """A client may be replaced by a new client after this silence."""
@@ -134,8 +134,8 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
-        tokens = session.liveliness().get(self._keys.alive(), timeout=_RIVAL_QUERY_TIMEOUT_S)
-        self._may_have_rival = any(True for _ in tokens)
+        tokens = session.liveliness().get(self._keys.vehicle_token(), timeout=_RIVAL_QUERY_TIMEOUT_S)
+        self._may_have_rival = bool(list(tokens))
 
     def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
         """Declare the subscribers, publisher and token that clients need.
@@ -159,8 +159,8 @@ class ZenohListen(NetworkLink):
         )
         self._declared += [
             session.declare_subscriber(keys.to_vehicle(), on_datagram),
-            liveliness.declare_subscriber(keys.client(), on_liveliness, history=True),
-            liveliness.declare_token(keys.alive(self._freshness.epoch)),
+            liveliness.declare_subscriber(keys.client_token(), on_liveliness, history=True),
+            liveliness.declare_token(keys.vehicle_token(self._freshness.epoch)),
         ]
 
     def _on_release(self, session: Any) -> None:
@@ -168,7 +168,7 @@ class ZenohListen(NetworkLink):
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            # The deletion of the beacon, with a sending time of 0, tells clients that we have closed.
+            # Clients recognise by the deletion of the beacon, with a send time of 0, that the vehicle side was closed.
             goodbye = encode_sent_at(self._freshness.epoch, 0.0)
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
@@ -181,7 +181,8 @@ class ZenohListen(NetworkLink):
         if client is None:
             return
         client.received_at = now
-        stamp, late_before = Stamp.decode(attachment), self._freshness.late
+        stamp = Stamp.decode(attachment)
+        late_before = self._freshness.late
         if not self._freshness.accepts(name, stamp, now) or stamp is None:
             # A duplicate needs no notice, because its first copy was processed.
             is_late = self._freshness.late > late_before
@@ -238,7 +239,7 @@ class ZenohListen(NetworkLink):
 
     def _send_beacon(self) -> None:
         self._beacon_at = now = self._now()
-        self._put(self._keys.beacon, self._freshness.beacon(now, self._lease.holder(now)).encode(), b"")
+        self._put(self._keys.beacon, self._freshness.make_beacon(now, self._lease.holder(now)).encode(), b"")
         self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
     def _send_notices(self, client: str, notices: list[RefusalNotice]) -> None:

@@ -166,8 +166,8 @@ def zenoh_module(address: str) -> Any:
     return import_optional(address, "zenoh", "eclipse-zenoh", "zenoh")
 
 
-async def open_session(address: str, options: NetworkOptions, prepare: Callable[[Any, Any], object]) -> Any:
-    """Open a session, and call ``prepare(zenoh, session)`` in the same thread, where declarations may block.
+async def open_session(address: str, options: NetworkOptions, declare: Callable[[Any, Any], object]) -> Any:
+    """Open a session, and call ``declare(zenoh, session)`` in the same thread, where declarations may block.
 
     Raises:
         LinkOpenError: zenoh is not installed, or the session could not be opened.
@@ -179,7 +179,7 @@ async def open_session(address: str, options: NetworkOptions, prepare: Callable[
     def work() -> Any:
         session = zenoh.open(config)
         try:
-            prepare(zenoh, session)
+            declare(zenoh, session)
         except BaseException:
             session.close()
             raise
@@ -200,7 +200,7 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
 
     try:
         future = asyncio.get_running_loop().run_in_executor(None, work)
-    except RuntimeError:  # the loop is closed or closing
+    except RuntimeError:  # The loop is closed or closing.
         work()
         closed()
     else:
