@@ -53,7 +53,7 @@ def wait_for_listeners(vehicle: dronekit.Vehicle) -> None:
 
 
 def notified(vehicle: dronekit.Vehicle, fc: FlightController, name: str, value: float, **more: Any) -> None:
-    """Send a value from the flight controller and wait until it is stored."""
+    """Send a value from the flight controller, or from another ``source``, and wait until it is processed."""
     observed = threading.Event()
 
     def listener(*_: Any) -> None:
@@ -61,7 +61,10 @@ def notified(vehicle: dronekit.Vehicle, fc: FlightController, name: str, value: 
 
     vehicle.add_message_listener("DEBUG", listener)
     wait_for_listeners(vehicle)
-    fc.parameters.values[name] = value
+    if "source" in more:  # The flight controller keeps its own value, which a repeated request may read meanwhile.
+        more["param_value"] = value
+    else:
+        fc.parameters.values[name] = value
     fc.parameters.report(name, **more)
     fc.report("DEBUG", ind=1)
     assert observed.wait(LIMIT_S)
@@ -226,10 +229,16 @@ def test_parameter_listeners_are_called_once_per_parameter(fc: FlightController)
     with connected(fc, _initialize=False) as vehicle:
         observed: list[tuple[object, str, object]] = []
         vehicle.parameters.add_attribute_listener("*", lambda *event: observed.append(event))
-        vehicle.add_attribute_listener("parameters", lambda *event: observed.append(event))
+        is_complete = threading.Event()
+
+        @vehicle.on_attribute("parameters")
+        def on_parameters(*event: Any) -> None:
+            observed.append(event)
+            is_complete.set()
+
         vehicle.initialize(rate=None)
         vehicle.parameters.wait_ready()
-        wait_for_listeners(vehicle)
+        assert is_complete.wait(LIMIT_S)
         parameters = vehicle.parameters
         assert observed[:-1] == [
             (parameters, "FOO", 1.0),

@@ -4,9 +4,11 @@ import asyncio
 import gc
 import os
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import anyio
 import pytest
 from free_ports import free_port
 from link_harness import Recorder, each_loop
@@ -123,8 +125,12 @@ async def test_name_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
                 patched.setattr(zenoh_listen, "_RIVAL_TIMEOUT_S", 100.0)
                 async with serving(port, how="connect"):
                     pass
-        async with serving(port, how="connect"):
-            pass
+        with anyio.fail_after(100):
+            while True:
+                # On a busy machine, a beacon of the first program may arrive after its end.
+                with suppress(LinkOpenError):
+                    async with serving(port, how="connect"):
+                        break
 
 
 async def test_zenoh_link_is_opened_once(tmp_path: Path) -> None:

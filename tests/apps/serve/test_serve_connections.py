@@ -158,12 +158,12 @@ async def test_flood_from_one_address_keeps_connection_of_another() -> None:
 
 
 async def test_missing_headers_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     whole = b"GET /api HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     async with open_server() as server:
-        silent, half, second = [await server.connect(first=first) for first in (b"", HALF, whole + HALF)]
         idle = await server.connect()
         assert await ask(idle, whole) == 200
+        monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+        silent, half, second = [await server.connect(first=first) for first in (b"", HALF, whole + HALF)]
         assert await end_of(silent) == await end_of(half) == b""
         await asyncio.sleep(0.5)
         assert await ask(idle, whole) == 200, "between requests it may wait"
@@ -184,9 +184,10 @@ async def test_slow_headers_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("noise", [b"\x16\x03\x01 TLS\r\n\r\n", b"GET /" + b"x" * 100_000, b"\xfd" * 1000])
 async def test_non_http_request_is_refused(noise: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
     async with open_server() as server:
-        assert (await end_of(await server.connect(first=noise)))[9:12] in (b"400", b"")
+        with monkeypatch.context() as patched:
+            patched.setattr(connections, "REQUEST_TIMEOUT_S", 0.3)
+            assert (await end_of(await server.connect(first=noise)))[9:12] in (b"400", b"")
         assert await server.order(await server.connect()) in GIVEN
 
 
