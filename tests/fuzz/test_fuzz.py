@@ -28,6 +28,7 @@ def edited(data: bytes, changes: list[tuple[float, int, bytes]]) -> bytes:
     return data
 
 
+@pytest.mark.exhaustive
 @for_each("path", sorted(CORPUS.glob("*/*")))
 def test_known_fuzz_inputs(path: Path) -> None:
     TARGETS[path.parent.name](path.read_bytes())

@@ -73,8 +73,7 @@ def session(kind: str) -> Callable[[], Awaitable[None]]:
 each_kind = pytest.mark.parametrize("kind", ["tcp", "udpin", "udpout", "serial"])
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.sampled(2)
+@pytest.mark.exhaustive
 @each_kind
 def test_cancelled_at_any_iteration_leaves_no_socket(kind: str) -> None:
     for turns in range(32):

@@ -257,6 +257,7 @@ def test_pymavlink_dialect_equals_xml_dialect(name: str) -> None:
         assert [field.extension for field in one.FIELDS] == [field.extension for field in other.FIELDS]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", DIALECTS)
 def test_private_message_bytes_match_pymavlink(name: str) -> None:
     module, dialect = loaded(name)

@@ -61,6 +61,7 @@ def test_version_2_matches_pymavlink(message_class: type[Message]) -> None:
     check(message_class, 2)
 
 
+@pytest.mark.exhaustive
 @for_each("message_class", SMALL)
 def test_version_1_matches_pymavlink(message_class: type[Message]) -> None:
     check(message_class, 1)

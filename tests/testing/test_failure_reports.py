@@ -40,6 +40,7 @@ def run(pytester: pytest.Pytester, source: str, *arguments: str) -> pytest.RunRe
     return pytester.runpytest_inprocess(*plugins, "-p", "no:cacheprovider", "--assert=plain", *arguments)
 
 
+@pytest.mark.exhaustive
 def test_failed_test_saves_recording_and_report(pytester: pytest.Pytester) -> None:
     pytest.importorskip("plotly")
     result = run(pytester, FAILING, "--flight-pictures", "kept")

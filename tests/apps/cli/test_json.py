@@ -105,7 +105,7 @@ GROUPS = {
 }
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("group", GROUPS)
 def test_json_records_match_documentation(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("m.waypoints").write_text(MISSION)

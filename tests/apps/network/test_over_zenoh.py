@@ -41,6 +41,7 @@ async def copter_at(port: int) -> AsyncIterator[SimulatedCopter]:
             yield copter
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("any_delay")
 async def test_zenoh_link_supports_whole_api() -> None:
     port = free_port()

@@ -126,6 +126,7 @@ async def test_partial_anonymous_requests_do_not_block_command(first: bytes) -> 
         assert server.open_connections() <= MAX_ANONYMOUS_CONNECTIONS + 2
 
 
+@pytest.mark.exhaustive
 async def test_idle_anonymous_connections_do_not_block_command() -> None:
     async with open_server() as server:
         request = b"GET /api/vehicles HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"

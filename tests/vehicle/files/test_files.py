@@ -275,6 +275,7 @@ async def test_local_disk_errors_propagate(ardupilot: Bench, tmp_path: Path) -> 
 # ------------------------------------------------------------------ errors and cancellation
 
 
+@pytest.mark.exhaustive
 async def test_cancellation_at_any_time_closes_the_session(bench: Bench) -> None:
     path = bench.put("long", DATA)
     for milliseconds in range(0, 400, 23):

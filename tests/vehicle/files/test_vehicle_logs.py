@@ -252,6 +252,7 @@ async def test_erase_removes_logs(bench: Bench) -> None:
     assert await bench.logs.list() == ()
 
 
+@pytest.mark.exhaustive
 async def test_cancellation_at_any_time_ends_the_transfer(bench: Bench) -> None:
     entry = (await bench.logs.list())[0]
     for milliseconds in range(0, 300, 37):
