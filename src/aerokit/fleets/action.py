@@ -46,7 +46,7 @@ async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
     Return the seconds by which the whole wait exceeds ``delay_s``.
 
     Raises:
-        OperationRejected: the computer slept meanwhile, so that the order would be late, or the member is unavailable.
+        OperationRejected: the computer slept during the wait, or the member is unavailable.
         HeartbeatTimeout: the member is silent.
     """
     connection = member.vehicle.connection
@@ -96,15 +96,15 @@ class FleetAction:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
-        self._outcomes: dict[str, Any] = {}
+        self._outcomes: dict[str, Any] = {}  # by member name: the returned value, or the error
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._orders: dict[str, PolicyOrder] = {}
+        self._policy_orders: dict[str, PolicyOrder] = {}
         # System id and name of the failed member for which the policy was applied; None if it was not applied.
         self._policy_trigger: tuple[int, str] | None = None
-        self._order_errors: dict[str, str] = {}
-        self._pending_orders = 0
+        self._policy_order_errors: dict[str, str] = {}
+        self._pending_policy_orders = 0
         self._last_start_at = -math.inf  # when the last member started
         self._is_applying_policy = False
         self._finished = asyncio.Event()
@@ -138,7 +138,7 @@ class FleetAction:
     @property
     def orders(self) -> dict[str, str]:
         """The policy's orders by member name. Empty if no member failed, or if the policy lets the others continue."""
-        return dict(self._orders)
+        return dict(self._policy_orders)
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -243,28 +243,39 @@ class FleetAction:
             order = orders.get(member.name)
             if order is None:
                 continue
-            if not member.is_flown_by_program:
-                is_disarmed = member.vehicle.is_confirmed_disarmed
-                skipped[member.name] = "it is disarmed" if is_disarmed else "this program does not fly it"
+            if member.is_flown_by_program:
+                self._policy_orders[member.name] = order
+            elif member.vehicle.is_confirmed_disarmed:
+                skipped[member.name] = "it is disarmed"
             else:
-                self._orders[member.name] = order
+                skipped[member.name] = "this program does not fly it"
+            has_finished = member.name in self._outcomes
             # If a member has finished the action and gets no order, its outcome stays.
-            if member.name in self._orders or member.name not in self._outcomes:
-                self._set_stopped(member, failed, self._orders.get(member.name))
+            if member.name in self._policy_orders or not has_finished:
+                self._set_stopped(member, failed, self._policy_orders.get(member.name))
+        system_id, name = self._policy_trigger
         self._context.publish(
-            PolicyApplied(self._context.now(), *self._policy_trigger, self.name, dict(self._orders), skipped)
+            PolicyApplied(
+                at=self._context.now(),
+                system_id=system_id,
+                member=name,
+                action=self.name,
+                orders=dict(self._policy_orders),
+                skipped=skipped,
+            )
         )
-        self._pending_orders = len(self._orders)
+        self._pending_policy_orders = len(self._policy_orders)
         for member in available:
-            if member.name in self._orders:
+            if member.name in self._policy_orders:
                 self._context.background.start(
-                    partial(self._send_order, member, self._orders[member.name]), f"aerokit policy {member.name}"
+                    partial(self._send_order, member, self._policy_orders[member.name]), f"aerokit policy {member.name}"
                 )
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
-        ordered = [member for member in available if member.name in orders]
-        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, ordered)
-        if not self._orders:
+        # Members that are skipped above stop, too.
+        stopping = [member for member in available if member.name in orders]
+        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
+        if not self._policy_orders:
             self._publish_completed()
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
@@ -296,19 +307,25 @@ class FleetAction:
             else:
                 await member.vehicle.hold()
         except AerokitError as error:
-            self._order_errors[member.name] = str(error)
+            self._policy_order_errors[member.name] = str(error)
             member.refresh()  # the order may have failed because of a lost link or a takeover
         finally:
-            self._pending_orders -= 1
-            if not self._pending_orders:
+            self._pending_policy_orders -= 1
+            if not self._pending_policy_orders:
                 self._publish_completed()
                 self._check_finished()
 
     def _publish_completed(self) -> None:
         assert self._policy_trigger is not None
+        system_id, name = self._policy_trigger
         self._context.publish(
             PolicyCompleted(
-                self._context.now(), *self._policy_trigger, self.name, dict(self._orders), dict(self._order_errors)
+                at=self._context.now(),
+                system_id=system_id,
+                member=name,
+                action=self.name,
+                orders=dict(self._policy_orders),
+                errors=dict(self._policy_order_errors),
             )
         )
 
@@ -322,7 +339,7 @@ class FleetAction:
 
     def _check_finished(self) -> None:
         """End `run` once every member has an outcome and all orders of the policy have ended."""
-        if not self._tasks and not self._pending_orders and len(self._outcomes) == len(self._members):
+        if not self._tasks and not self._pending_policy_orders and len(self._outcomes) == len(self._members):
             self._finished.set()
 
     def _on_program_error(self, error: Exception) -> None:

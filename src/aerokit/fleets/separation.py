@@ -160,7 +160,8 @@ def separate_by_time(
     if not conflicts:
         return Deconfliction("clear", "no paths come too close", min_distance_m)
     resting_paths = _resting_paths(stationary)
-    sequence, refusal = list(routes), ""
+    refusal = ""
+    sequence = list(routes)
     for _ in routes:  # at most one try for each route
         delays, blocked_route, blocker = _delays(
             sequence, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s
@@ -237,7 +238,7 @@ def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPo
             for other, other_point in {**points, **obstacles}.items():
                 distance = math.dist(point[:2], other_point[:2])
                 if other != name and distance < min_distance_m:
-                    return f"the {end} of {name} is {distance:.1f} m from that of {other} horizontally: too close"
+                    return f"the {end} of {name} is horizontally {distance:.1f} m from that of {other}: too close"
     return ""
 
 
@@ -262,8 +263,10 @@ def _is_layer_blocked(
 
 
 def _find_blocker(path: Path, others: Sequence[Path], min_distance_m: float, slack_s: float) -> str | None:
+    """Return the name of the first of the other paths that the path comes too close to; None if there is none."""
     for other in others:
-        if min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m).distance_m < min_distance_m:
+        approach = min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m)
+        if approach.distance_m < min_distance_m:
             return other.name
     return None
 

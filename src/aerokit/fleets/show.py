@@ -82,7 +82,7 @@ class Show(Snapshot):
         parsed: dict[str, Path] = {}
         for name, points in tracks.items():
             try:
-                parsed[name] = Path(name, [PathPoint(*map(float, row)) for row in points])
+                parsed[name] = Path(name, [PathPoint(*map(float, point)) for point in points])
             except (TypeError, ValueError) as error:
                 raise InvalidArgument(f"track {name!r}: {error}") from None
         return cls(parsed)

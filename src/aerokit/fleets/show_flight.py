@@ -99,7 +99,8 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
         if frame is None or sent_at is None or not is_answer or frame.component_id != vehicle.component_id:
             return
         round_trip_s = frame.received_at - sent_at
-        measurements.append((round_trip_s, message.tc1 / 1e9 - (sent_at + round_trip_s / 2)))
+        answered_at = sent_at + round_trip_s / 2  # if both directions take the same time
+        measurements.append((round_trip_s, message.tc1 / 1e9 - answered_at))
 
     detach = connection.bus.attach(Timesync, on_timesync, system_id=vehicle.system_id)
     try:
@@ -107,7 +108,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
             now = connection.now()
             timestamp = int(now * 1e9) | 1  # odd, so that it usually differs from the link's own requests
             sent_at_by_timestamp[timestamp] = now
-            connection.send(Timesync(0, timestamp), to=vehicle.system_id)
+            connection.send(Timesync(tc1=0, ts1=timestamp), to=vehicle.system_id)
             await anyio.sleep(TIMESYNC_INTERVAL_S)
         deadline = connection.now() + TIMESYNC_TIMEOUT_S
         while sent_at_by_timestamp and not measurements and connection.now() < deadline:
@@ -185,8 +186,8 @@ def max_relative_error(
     It is computed at 61 times of the show, with positions that are interpolated between samples.
     """
     largest_m: float | None = None
-    for number in range(RELATIVE_ERROR_SAMPLES + 1):
-        at_s = duration_s * number / RELATIVE_ERROR_SAMPLES
+    for index in range(RELATIVE_ERROR_SAMPLES + 1):
+        at_s = duration_s * index / RELATIVE_ERROR_SAMPLES
         errors: list[LocalPoint] = []
         for name, path in paths.items():
             point = _interpolate(samples.get(name, ()), at_s)
@@ -307,7 +308,8 @@ class Shows(Travel):
             InvalidArgument: a track has no member.
             ValueUnknownError: the position of the first member is unknown.
         """
-        return self._start_positions(show, *self._local_origin(show, origin))
+        local_origin, origin_amsl_m = self._local_origin(show, origin)
+        return self._start_positions(show, local_origin, origin_amsl_m)
 
     async def fly_show(
         self,
@@ -346,7 +348,8 @@ class Shows(Travel):
         names = tuple(show.tracks)
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
-        arrived = await self.go_to(self._start_positions(show, local_origin, origin_amsl_m), speed_m_s=speed_m_s)
+        start_positions = self._start_positions(show, local_origin, origin_amsl_m)
+        arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         begin_at = self._context.now() + start_in_s
         with ExitStack() as stack:
@@ -366,9 +369,13 @@ class Shows(Travel):
         tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
         lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
         offsets = {name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)}
-        spread_s = max(lags) - min(lags) if lags else None
-        relative_m = max_relative_error(show.tracks, samples, show.duration_s)
-        return ShowReport(result, tracks, offsets, spread_s, relative_m)
+        return ShowReport(
+            result=result,
+            tracks=tracks,
+            clocks=offsets,
+            lag_spread_s=max(lags) - min(lags) if lags else None,
+            max_relative_error_m=max_relative_error(show.tracks, samples, show.duration_s),
+        )
 
     # --------------------------------------------------------------------------------------- private
 

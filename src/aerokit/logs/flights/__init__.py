@@ -102,11 +102,14 @@ def _complete(flight: FlightLog) -> None:
     _, last_disarmed_s = flight.armed[-1] if flight.armed else (0.0, 0.0)
     is_armed_at_end = math.isinf(last_disarmed_s)
     flight.set_armed(flight.duration_s, armed=False)  # ends an open span
-    if flight.home is None and len(flight.track):  # use the position at the first arming, or else the first position
-        first_armed_s, _ = flight.armed[0] if flight.armed else (-math.inf, -math.inf)
-        row = max(flight.track.index_at(first_armed_s), 0)
-        columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
-        flight.set_home(flight.track.times[row], *(flight.track[name][row] for name in columns))
+    track = flight.track
+    if flight.home is None and len(track):  # use the position at the first arming, or else the first position
+        row = 0
+        if flight.armed:
+            first_armed_s, _ = flight.armed[0]
+            row = max(track.index_at(first_armed_s), 0)
+        latitude, longitude = track["latitude_deg"][row], track["longitude_deg"][row]
+        flight.set_home(track.times[row], latitude, longitude, track["altitude_amsl_m"][row])
     _complete_altitudes(flight)
     if is_armed_at_end:
         flight.notes.append(_armed_at_end_note(flight))

@@ -218,4 +218,5 @@ def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
     if gcs_meanings is not None:
         return gcs_meanings.get(value, "")
     meanings = _ACTIONS.get(firmware, {}).get(parameter, ())
-    return meanings[int(value)] if value in range(len(meanings)) else ""
+    is_known = value in range(len(meanings))  # False for a fraction, too
+    return meanings[int(value)] if is_known else ""
