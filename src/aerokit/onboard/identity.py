@@ -121,7 +121,8 @@ class IdentityMessages:
         if not self.metadata:
             return []
         checksum = self.update_files()
-        return [m.ComponentMetadata(self._host.time_boot_ms, checksum, f"mftp://{GENERAL_PATH}")]
+        uri = f"mftp://{GENERAL_PATH}"
+        return [m.ComponentMetadata(time_boot_ms=self._host.time_boot_ms, file_crc=checksum, uri=uri)]
 
     def add_metadata(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
         """Serve a metadata file. ``content()`` returns its content; it is called again for each COMPONENT_METADATA."""

@@ -128,7 +128,8 @@ def command_long(
     _check_target(target_system, command)
     if len(params) > 7:
         raise InvalidArgument(f"{command_name(command)} takes at most 7 parameters, {len(params)} were given")
-    return CommandLong(target_system, target_component, command, 0, *_checked_params(command, params, 7))
+    confirmation = 0  # the first transmission
+    return CommandLong(target_system, target_component, command, confirmation, *_checked_params(command, params, 7))
 
 
 def command_int(
@@ -158,7 +159,21 @@ def command_int(
             raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not an integer of 32 bits")
     param1, param2, param3, param4 = _checked_params(command, params, 4)
     z = _checked_number(command, "z", z)
-    return CommandInt(target_system, target_component, frame, command, 0, 0, param1, param2, param3, param4, x, y, z)
+    return CommandInt(
+        target_system,
+        target_component,
+        frame,
+        command,
+        current=0,
+        autocontinue=0,
+        param1=param1,
+        param2=param2,
+        param3=param3,
+        param4=param4,
+        x=x,
+        y=y,
+        z=z,
+    )
 
 
 class CommandExchange(Exchange[CommandAck]):
@@ -243,7 +258,7 @@ class CommandExchange(Exchange[CommandAck]):
     def start(self, now: float) -> None:
         self._started_at = now
         self._send(now)
-        if self._is_sent:
+        if self._is_sent:  # The caller itself sends the first message.
             self._outbox.clear()
 
     def receive(self, message: Message, now: float) -> None:
@@ -308,6 +323,7 @@ class CommandExchange(Exchange[CommandAck]):
             self.deadline = min(now + POLL_INTERVAL_S, give_up_at)
 
     def _why_not_repeated(self) -> str:
+        """Return the end of the error text: why the order was not sent more often; empty after the last attempt."""
         if self._sent_count < self._attempts:
             return "; not sent again: no HEARTBEAT received since then"
         if self._attempts == 1 and max_attempts(self._message.command, _params_of(self._message)) == 1:

@@ -243,7 +243,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         transmissions = 2 if self._window == 1 else 1
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions
         items = tuple(self._items[seq] for seq in self._indices)
-        self._finish(DownloadResult(items, self._count or 0, self._opaque_id))
+        self._finish(DownloadResult(items, count=self._count or 0, opaque_id=self._opaque_id))
 
     def _time_out(self, now: float) -> None:
         """Cancel the download and fail, because the vehicle has stopped answering."""
@@ -253,7 +253,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the download:"
-                f" {details} ({now - self._progress_at:.1f} s)",
+                f" {details}; nothing new for {now - self._progress_at:.1f} s",
                 missing=tuple(seq - self.offset for seq in missing if seq >= self.offset),
             )
         )

@@ -93,8 +93,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _reset(self) -> None:
         self._is_accepted = False
-        # The vehicle has all items before `_confirmed_end`. All items before `_sent_end` were sent at least once.
-        self._confirmed_end = self._sent_end = self._first
+        self._confirmed_end = self._first  # The vehicle has all items before this one.
+        self._sent_end = self._first  # All items before this one were sent at least once.
         self._sent_at: dict[int, float] = {}
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
@@ -204,7 +204,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
             if self._is_accepted and self._sent_end == self._end:
-                self._succeed(not self._was_tail_repeated, ack.opaque_id, now)
+                self._succeed(now, is_confirmed=not self._was_tail_repeated, opaque_id=ack.opaque_id)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_accepted:
                 # The vehicle already has the item that was sent, or an item before it was lost.
@@ -237,7 +237,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
             if self._sent_end == self._end:
                 # All items were sent, so the upload may be complete. The caller must read the plan back.
-                self._succeed(False, 0, now)
+                self._succeed(now, is_confirmed=False, opaque_id=0)
             else:
                 self._refuse(MavMissionResult.ERROR)
 
@@ -265,9 +265,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         self.is_refusal_ambiguous = self._sent_end - self._confirmed_end > 1
         self._reject(result, seq=self._confirmed_end if self._is_accepted else None)
 
-    def _succeed(self, is_confirmed: bool, opaque_id: int, now: float) -> None:
+    def _succeed(self, now: float, *, is_confirmed: bool, opaque_id: int) -> None:
         self._report_progress(now, len(self._items), len(self._items))
-        self._finish(UploadResult(is_confirmed, opaque_id, max(0, self._confirmed_end - self.offset)))
+        first_unconfirmed = max(0, self._confirmed_end - self.offset)
+        self._finish(UploadResult(is_confirmed, opaque_id, item=first_unconfirmed))
 
     def _time_out(self, now: float) -> None:
         """Cancel the upload and fail, because the vehicle has stopped answering."""
@@ -277,7 +278,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the upload: {details}"
-                f" ({self._attempt} attempts, {now - self._progress_at:.1f} s)",
+                f"; nothing new for {now - self._progress_at:.1f} s after {self._attempt} attempts",
                 missing=tuple(seq - self.offset for seq in missing),
             )
         )

@@ -134,6 +134,6 @@ def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
         pieces.append(b"")
     flags = (sequence & 0x1F) << 3 | is_split
     return [
-        GpsRtcmData(flags | number << 1, len(piece), piece.ljust(FRAGMENT_SIZE, b"\0"))
+        GpsRtcmData(flags=flags | number << 1, len=len(piece), data=piece.ljust(FRAGMENT_SIZE, b"\0"))
         for number, piece in enumerate(pieces)
     ]

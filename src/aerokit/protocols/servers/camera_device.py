@@ -179,7 +179,8 @@ class Captures:
     def switch_off(self) -> None:
         """End the series and the video at once, as a power failure does. The image log is kept."""
         self._remaining = 0
-        self._is_exposing = self._is_late = False
+        self._is_exposing = False
+        self._is_late = False
         self._recording_since = math.nan
         self._series += 1
 
@@ -358,5 +359,7 @@ class Tracking:
         x, y, radius = self.place if is_point else (_UNKNOWN,) * 3
         is_rectangle = self.mode == CameraTrackingMode.RECTANGLE
         left, top, right, bottom = self.place if is_rectangle else (_UNKNOWN,) * 4
-        mode = int(self.mode)
-        return m.CameraTrackingImageStatus(self.flags, mode, Target.IN_STATUS, x, y, radius, left, top, right, bottom)
+        return m.CameraTrackingImageStatus(
+            tracking_status=self.flags, tracking_mode=int(self.mode), target_data=Target.IN_STATUS, point_x=x,
+            point_y=y, radius=radius, rec_top_x=left, rec_top_y=top, rec_bottom_x=right, rec_bottom_y=bottom,
+        )  # fmt: skip

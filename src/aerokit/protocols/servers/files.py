@@ -162,6 +162,8 @@ _Folder = dict[str, "_File | _Folder"]
 
 
 class _Opened(FileHandle):
+    """An open file in memory; it is read-only if ``tree`` is None."""
+
     def __init__(self, tree: FileTree | None, file: _File) -> None:
         self._tree = tree
         self._file = file

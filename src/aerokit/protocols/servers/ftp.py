@@ -250,7 +250,8 @@ class SessionFtpServer(Generic[FilesT]):
         create = request.opcode == Op.CREATEFILE or (may_create and path not in self.files)
         file = self.files.open(path, writing=not is_reading, create=create)
         number = self._new_number(peer, request)
-        session = peer.sessions[number] = FtpSession(number, file, size, not is_reading)
+        session = FtpSession(number, file, size, is_writing=not is_reading)
+        peer.sessions[number] = session
         self._watch(peer, session)
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
