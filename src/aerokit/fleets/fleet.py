@@ -181,7 +181,7 @@ class Fleet(Selection):
             InvalidArgument: a name is unknown, or none is given.
         """
         if not names:
-            raise InvalidArgument("names is empty: name at least one state; docs/states.md lists them")
+            raise InvalidArgument("names = () is not allowed: give the name of at least one state (docs/states.md)")
         for member in self:
             for name in names:
                 if name not in member.vehicle.telemetry.cells:

@@ -153,7 +153,7 @@ def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[s
                 raise InvalidArgument(f"sources: two sources are named {name!r}")
             sources_by_name[name] = entry
     if not sources_by_name:
-        raise InvalidArgument("sources is empty: a fleet needs at least one address, connection or vehicle")
+        raise InvalidArgument("a fleet needs at least one address, link, connection or vehicle")
     return sources_by_name
 
 

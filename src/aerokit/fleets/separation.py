@@ -115,26 +115,29 @@ def separate_by_altitude(
         return Deconfliction("refused", reason, min_distance_m, conflicts)
     # The lowest layer is at the highest start or target, so that every vehicle climbs to its layer.
     lowest_m = max(max(_altitude_m(route.start), _altitude_m(route.target)) for route in routes)
-    layers: dict[str, int] = {}
-    # Each route gets the lowest layer that no crossing route uses and no stationary vehicle blocks.
-    for route in routes:
-        used_layers = {
-            layers[earlier.name]
-            for earlier in routes
-            if earlier.name in layers and _paths_cross(earlier, route, min_distance_m)
-        }
-        layer, height_m = 0, lowest_m
-        while layer in used_layers or _is_layer_blocked(route, stationary, height_m, min_distance_m):
-            layer += 1
-            height_m = lowest_m + layer * min_distance_m
-        layers[route.name] = layer
-    heights = {name: lowest_m + layer * min_distance_m for name, layer in layers.items()}
+    heights = _layer_heights(routes, stationary, lowest_m, min_distance_m)
     highest = max(heights.values())
     if highest > max_altitude_m:
         reason = f"the paths cross, and the layers would reach {highest:.0f} m, above {max_altitude_m:.0f} m"
         return Deconfliction("refused", reason, min_distance_m, conflicts)
-    reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(layers.values()))} layers"
+    reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(heights.values()))} layers"
     return Deconfliction("layers", reason, min_distance_m, conflicts, heights_m=heights)
+
+
+def _layer_heights(
+    routes: Sequence[Route], stationary: Mapping[str, LocalPoint], lowest_m: float, min_distance_m: float
+) -> dict[str, float]:
+    """Return the height of each route: the lowest layer that no crossing route and no stationary vehicle blocks."""
+    heights: dict[str, float] = {}
+    for route in routes:
+        earlier_routes = [earlier for earlier in routes if earlier.name in heights]
+        used = {heights[earlier.name] for earlier in earlier_routes if _paths_cross(earlier, route, min_distance_m)}
+        layer, height_m = 0, lowest_m
+        while height_m in used or _is_layer_blocked(route, stationary, height_m, min_distance_m):
+            layer += 1
+            height_m = lowest_m + layer * min_distance_m
+        heights[route.name] = height_m
+    return heights
 
 
 def separate_by_time(

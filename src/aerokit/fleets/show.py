@@ -136,7 +136,9 @@ class Show(Snapshot):
             raise InvalidArgument(f"the text is not JSON: {error}") from None
         tracks = data.get("tracks") if isinstance(data, dict) else None
         if not isinstance(tracks, dict) or (data.get("format"), data.get("version")) != (FORMAT, VERSION):
-            raise InvalidArgument(f"the JSON text is not {FORMAT!r} of version {VERSION}")
+            raise InvalidArgument(
+                f'the JSON text is not a show: its "format" must be "{FORMAT}", its "version" {VERSION}'
+            )
         return cls.from_points(tracks)
 
     def to_csv(self) -> str:
@@ -160,7 +162,7 @@ class Show(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "tracks", dict(self.tracks))  # a copy; this object is immutable otherwise
         if not self.tracks:
-            raise InvalidArgument("tracks is empty: a show needs at least one track")
+            raise InvalidArgument("a show needs at least one track")
         for name, track in self.tracks.items():
             if not isinstance(track, Path) or track.begins_at_s < 0:
                 raise InvalidArgument(f"tracks[{name!r}] must be a Path that begins at 0 s or later")

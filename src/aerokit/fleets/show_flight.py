@@ -352,13 +352,12 @@ class Shows(Travel):
         arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         begin_at = self._context.now() + start_in_s
+        recorders: dict[str, TrackRecorder] = {}
         with ExitStack() as stack:
-            recorders = {
-                name: stack.enter_context(
-                    TrackRecorder(self.members[name].vehicle, clocks[name], local_origin, begin_at, origin_amsl_m)
-                )
-                for name in names
-            }
+            for name in names:
+                vehicle = self.members[name].vehicle
+                recorder = TrackRecorder(vehicle, clocks[name], local_origin, begin_at, origin_amsl_m)
+                recorders[name] = stack.enter_context(recorder)
 
             async def fly(member: Member) -> None:
                 track, recorder = show.tracks[member.name], recorders[member.name]

@@ -227,7 +227,7 @@ class Travel(SelectionBase):
                 late_s = await wait_to_start(member, corridors.delays_s[member.name], action)
                 if late_s > corridors.slack_s:
                     raise OperationRejected(
-                        f"{action}: {member.name} would start {late_s:.1f} s late in its corridor; it stays"
+                        f"{action}: {member.name} would start {late_s:.1f} s late, so it stays where it is"
                     )
             await member.vehicle.go_to(
                 targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m

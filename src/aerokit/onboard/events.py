@@ -39,7 +39,7 @@ class EventSender:
             raise InvalidArgument(f"event_id = {event_id} is not allowed: it must be 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:
             raise InvalidArgument(
-                f"arguments has {len(arguments)} bytes; at most {MAX_ARGUMENT_BYTES} fit into the message"
+                f"the arguments of the event have {len(arguments)} bytes; at most {MAX_ARGUMENT_BYTES} fit into EVENT"
             )
         check_severity(severity)
         is_first = self._sequence < 0

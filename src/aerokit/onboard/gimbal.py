@@ -63,7 +63,9 @@ class GimbalDriver:
     ) -> None:
         for name, (low, high) in (("roll_deg", roll_deg), ("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg)):
             if not -360.0 <= low <= high <= 360.0:
-                raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: both must be −360 to 360, in order")
+                raise InvalidArgument(
+                    f"{name} = ({low}, {high}) is not allowed: both must be −360 to 360, the lower first"
+                )
         if not max_rate_deg_s > 0:
             raise InvalidArgument(f"max_rate_deg_s = {max_rate_deg_s} is not allowed: it must be above 0")
         if not 0 <= attitude_hz <= 100:

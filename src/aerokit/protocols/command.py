@@ -160,20 +160,9 @@ def command_int(
     param1, param2, param3, param4 = _checked_params(command, params, 4)
     z = _checked_number(command, "z", z)
     return CommandInt(
-        target_system,
-        target_component,
-        frame,
-        command,
-        current=0,
-        autocontinue=0,
-        param1=param1,
-        param2=param2,
-        param3=param3,
-        param4=param4,
-        x=x,
-        y=y,
-        z=z,
-    )
+        target_system, target_component, frame, command, current=0, autocontinue=0, param1=param1, param2=param2,
+        param3=param3, param4=param4, x=x, y=y, z=z,
+    )  # fmt: skip
 
 
 class CommandExchange(Exchange[CommandAck]):

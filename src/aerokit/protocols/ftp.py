@@ -130,15 +130,9 @@ class FtpMessage(Snapshot):
         data_end = HEADER.size + size if cut else PAYLOAD_SIZE
         data = payload[HEADER.size : data_end]
         return cls(
-            sequence,
-            opcode,
-            session=session,
-            size=size,
-            request_opcode=request_opcode,
-            burst_complete=burst_complete != 0,
-            offset=offset,
-            data=data,
-        )
+            sequence, opcode, session=session, size=size, request_opcode=request_opcode,
+            burst_complete=burst_complete != 0, offset=offset, data=data,
+        )  # fmt: skip
 
     def encode(self) -> bytes:
         """Return the payload of the FILE_TRANSFER_PROTOCOL message: 251 bytes."""

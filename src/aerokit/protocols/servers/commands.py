@@ -147,13 +147,9 @@ class CommandDispatcher:
         """Send an acknowledgement; ``detail`` is its ``result_param2``."""
         system, component = command.sender
         ack = CommandAck(
-            command.command,
-            result,
-            progress=progress,
-            result_param2=detail,
-            target_system=system,
+            command.command, result, progress=progress, result_param2=detail, target_system=system,
             target_component=component,
-        )
+        )  # fmt: skip
         self._host.send(ack, command.channel)
 
 

@@ -145,12 +145,9 @@ class MissionServer:
 
     def current_message(self) -> m.MissionCurrent:
         return m.MissionCurrent(
-            seq=self.current,
-            total=self.count(MavMissionType.MISSION),
-            mission_id=self.id(MavMissionType.MISSION),
-            fence_id=self.id(MavMissionType.FENCE),
-            rally_points_id=self.id(MavMissionType.RALLY),
-        )
+            seq=self.current, total=self.count(MavMissionType.MISSION), mission_id=self.id(MavMissionType.MISSION),
+            fence_id=self.id(MavMissionType.FENCE), rally_points_id=self.id(MavMissionType.RALLY),
+        )  # fmt: skip
 
     def store(self, mission_type: int, items: Sequence[MissionItem]) -> None:
         """Replace a list."""
@@ -256,15 +253,9 @@ class MissionServer:
     def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
         """Register an upload of the items from ``first`` to before ``end``. Nothing is sent."""
         upload = ListUpload(
-            client=sender_of(message),
-            channel=channel,
-            mission_type=message.mission_type,
-            next=first,
-            end=end,
-            received_at=self._host.now,
-            requested_at=self._host.now,
-            uses_int=self.requests_int,
-        )
+            client=sender_of(message), channel=channel, mission_type=message.mission_type, next=first, end=end,
+            received_at=self._host.now, requested_at=self._host.now, uses_int=self.requests_int,
+        )  # fmt: skip
         self._uploads[self._key(upload.mission_type)] = upload
         return upload
 
