@@ -88,8 +88,8 @@ class FleetAction:
         holds_if_cancelled: bool = True,
     ) -> None:
         self.name: str = name
-        self._context, self._execute = context, execute
-        self._timeout, self._stagger_s = timeout, stagger_s or 0.0
+        self._context, self._execute, self._timeout = context, execute, timeout
+        self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
         requested = list(members)
         for member in requested:
@@ -212,7 +212,8 @@ class FleetAction:
         """Record that a member failed. The first failure applies the policy."""
         if member.name in self._failed:
             return
-        self._failed[member.name] = self._outcomes[member.name] = error
+        self._failed[member.name] = error
+        self._outcomes[member.name] = error
         member.record_failure(self.name, error)
         is_policy_applied = self._policy_trigger is not None or self._is_applying_policy
         if self._is_safe or is_policy_applied or self._context.is_closed:
@@ -289,7 +290,8 @@ class FleetAction:
     def _set_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
         order_text = f"; the policy ordered {member.name} to {order}" if order else ""
         error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{order_text}")
-        self._stopped[member.name] = self._outcomes[member.name] = error
+        self._stopped[member.name] = error
+        self._outcomes[member.name] = error
 
     def _cancel_tasks_of(self, members: Iterable[Member]) -> None:
         for member in members:

@@ -141,7 +141,8 @@ def follow_velocity(
     velocity = [speed + gain * distance for speed, distance in zip(target_velocity, distance_vector, strict=True)]
     speed = math.hypot(*velocity)
     scale = 1.0 if speed <= max_speed_m_s else max_speed_m_s / speed
-    return velocity[0] * scale, velocity[1] * scale, velocity[2] * scale
+    north, east, up = (component * scale for component in velocity)
+    return north, east, up
 
 
 @checks_arguments
@@ -167,7 +168,8 @@ class Following:
         self._max_speed_m_s = max_speed_m_s
         self._tasks = BackgroundTasks(self._on_error)
         self._stopped = asyncio.Event()
-        self._was_entered = self._has_raised = False
+        self._was_entered = False
+        self._has_raised = False
         self._reason = ""
 
     @property

@@ -132,8 +132,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
             if is_other_later or is_other_earlier:  # the vehicles never fly these legs at the same time
                 continue
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
-                # If no other legs are closer, the result is `below_m`, the distance that these legs at least have.
-                if best.distance_m == math.inf:
+                if best.distance_m == math.inf:  # These legs are at least `below_m` apart; other legs may be closer.
                     best = Approach(below_m, start.t_s, other_start.t_s)
                 continue
             approach = _closest(leg, other_leg, slack_s)
@@ -153,7 +152,7 @@ def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
     """Return a leg between two points, with altitudes and times of 0."""
     north_m, east_m, _ = start
     end_north_m, end_east_m, _ = end
-    return PathPoint(0.0, north_m, east_m, 0.0), PathPoint(0.0, end_north_m, end_east_m, 0.0)
+    return PathPoint(0.0, north_m, east_m, up_m=0.0), PathPoint(0.0, end_north_m, end_east_m, up_m=0.0)
 
 
 def _lower_bound(leg: Leg, other: Leg) -> float:

@@ -167,7 +167,7 @@ def separate_by_time(
     sequence = list(routes)
     for _ in routes:  # at most one try for each route
         delays, blocked_route, blocker = _delays(
-            sequence, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s
+            sequence, resting_paths, min_distance_m, speed_m_s, slack_s=slack_s, max_delay_s=max_delay_s
         )
         if blocked_route is None:
             delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
@@ -206,6 +206,7 @@ def _delays(
     resting_paths: Sequence[Path],
     min_distance_m: float,
     speed_m_s: float,
+    *,
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:

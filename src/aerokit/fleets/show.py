@@ -184,7 +184,7 @@ def state_at(path: Path, at_s: float) -> tuple[LocalPoint, LocalPoint]:
     fraction = (at_s - start.t_s) / duration_s
     vector = [b - a for a, b in zip(start.place, end.place, strict=True)]
     place = tuple(a + fraction * d for a, d in zip(start.place, vector, strict=True))
-    velocity = vector[0] / duration_s, vector[1] / duration_s, vector[2] / duration_s
+    velocity = tuple(d / duration_s for d in vector)
     return place, velocity  # type: ignore[return-value]
 
 

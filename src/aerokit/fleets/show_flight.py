@@ -163,7 +163,8 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
     """
     errors: list[float] = []
     # A lag causes an error vector of lag × velocity. The lag that fits best is sum(error · velocity) / sum(velocity²).
-    error_times_velocity = velocity_squared = 0.0
+    error_times_velocity = 0.0
+    velocity_squared = 0.0
     for at_s, point in samples:
         planned, velocity = state_at(path, at_s)
         error = [p - q for p, q in zip(planned, point, strict=True)]
@@ -202,7 +203,8 @@ def max_relative_error(
 
 def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
     """Return the vector to a point from another point."""
-    return point[0] - other[0], point[1] - other[1], point[2] - other[2]
+    north, east, up = (a - b for a, b in zip(point, other, strict=True))
+    return north, east, up
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
@@ -210,11 +212,8 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
     for (start_s, start), (end_s, end) in pairwise(samples):
         if start_s <= at_s <= end_s:
             fraction = 0.0 if end_s == start_s else (at_s - start_s) / (end_s - start_s)
-            return (
-                start[0] + fraction * (end[0] - start[0]),
-                start[1] + fraction * (end[1] - start[1]),
-                start[2] + fraction * (end[2] - start[2]),
-            )
+            north, east, up = (a + fraction * (b - a) for a, b in zip(start, end, strict=True))
+            return north, east, up
     return None
 
 
@@ -361,7 +360,7 @@ class Shows(Travel):
 
             async def fly(member: Member) -> None:
                 track, recorder = show.tracks[member.name], recorders[member.name]
-                await _fly_track(member, track, recorder, begin_at, rate_hz, lead_s or 0.0)
+                await _fly_track(member, track, recorder, begin_at, rate_hz=rate_hz, lead_s=lead_s or 0.0)
 
             result = await self._run("show", fly, names=names)
         samples = {name: recorder.samples for name, recorder in recorders.items()}
@@ -416,7 +415,7 @@ class Shows(Travel):
 
 
 async def _fly_track(
-    member: Member, path: Path, recorder: TrackRecorder, begin_at: float, rate_hz: float, lead_s: float
+    member: Member, path: Path, recorder: TrackRecorder, begin_at: float, *, rate_hz: float, lead_s: float
 ) -> None:
     """Fly a member along its path, from the current time until the end of the path."""
     vehicle, period_s = member.vehicle, 1 / rate_hz

@@ -152,7 +152,7 @@ class Travel(SelectionBase):
             separation = self.plan_separation(targets, speed_m_s=speed_m_s)
         if separation is None or separation.decision == "clear":
             return await self._fly_to(
-                action, targets, speed_m_s, timeout, max_distance_m, names=names, stagger_s=stagger_s
+                action, targets, speed_m_s, timeout, max_distance_m=max_distance_m, names=names, stagger_s=stagger_s
             )
         if separation.decision == "refused":
             raise OperationRejected(f"{action}: {separation.reason}; nothing was sent")
@@ -160,10 +160,12 @@ class Travel(SelectionBase):
             if stagger_s:
                 raise InvalidArgument(f"{action}: stagger_s would change the delays of corridors; nothing was sent")
             return await self._fly_to(
-                action, targets, speed_m_s, timeout, max_distance_m, names=names, corridors=separation
+                action, targets, speed_m_s, timeout, max_distance_m=max_distance_m, names=names, corridors=separation
             )
         heights_m = separation.heights_m
-        result = await self._fly_in_layers(action, targets, speed_m_s, timeout, heights_m, max_distance_m)
+        result = await self._fly_in_layers(
+            action, targets, speed_m_s, timeout, heights_m=heights_m, max_distance_m=max_distance_m
+        )
         without_layer = [self.members[name] for name in names or targets if name not in heights_m]
         result.skipped |= {
             member.name: "the separation was planned without it" if member.is_available else member.status
@@ -214,8 +216,8 @@ class Travel(SelectionBase):
         targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
-        max_distance_m: float,
         *,
+        max_distance_m: float,
         names: tuple[str, ...] = (),
         stagger_s: float | None = None,
         corridors: Deconfliction | None = None,
@@ -241,6 +243,7 @@ class Travel(SelectionBase):
         targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
+        *,
         heights_m: Mapping[str, float],
         max_distance_m: float,
     ) -> FleetResult:
@@ -257,7 +260,7 @@ class Travel(SelectionBase):
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"
                 )
-            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m)
+            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m=max_distance_m)
             if not result.is_complete:
                 break
         assert result is not None
@@ -424,5 +427,6 @@ def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path
     for item in mission:
         position = item.position
         if position is not None and not math.isnan(position.latitude_deg):
-            points.append(PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position))))
+            north_m, east_m, up_m = origin.to_local(position, altitude_amsl(member, position))
+            points.append(PathPoint(0.0, north_m, east_m, up_m))
     return Path(member.name, points) if points else None

@@ -72,7 +72,7 @@ class CommandRequest:
             InvalidArgument: latitude or longitude is missing or out of range, or the frame is not global.
         """
         frame = self._command.altitude_frame
-        latitude, longitude, altitude = self.params[4:]
+        *_, latitude, longitude, altitude = self.params
         altitude_m = altitude if math.isfinite(altitude) else None
         if frame in _AMSL_FRAMES:
             return Position(latitude, longitude, altitude_amsl_m=altitude_m)

@@ -286,6 +286,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     # -------------------------------------------------------------------------------- sending
 
     def _announce(self, now: float) -> None:
+        """Start the upload by MISSION_COUNT or MISSION_WRITE_PARTIAL_LIST. The vehicle then requests the first item."""
         target = (self.target_system, self.target_component)
         if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
             self._outbox += self.cancellation()

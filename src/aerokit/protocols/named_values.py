@@ -203,7 +203,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _step(self, now: float) -> None:
         """Finish, or send the requests that are due. Called after each message and at each deadline."""
         if len(self._answers) < len(self._names):
-            self._before_sending(now)
+            self._before_sending(now)  # It may settle the last names.
         if len(self._answers) == len(self._names):
             self._finish({name: self._answers[name] for name in self._names})
             return

@@ -151,6 +151,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _record_count(self, count: int, *, is_streamed: bool) -> None:
+        """Record the number of parameters that a message reports. If it has changed, indices may be missing."""
         # All messages of ArduPilot's stream report the count from the start of the stream, although the number of
         # parameters may change meanwhile. A streamed count is therefore only compared with an earlier streamed count.
         if is_streamed:
@@ -171,7 +172,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._next_index = index + 1
         self._streamed_values += 1
         self._last_at = now
-        if index == 0:
+        if index == 0:  # `start` may have requested this value to measure the round trip.
             self._window.on_answer(0, now)
         else:
             self._window.discard(index)

@@ -109,7 +109,8 @@ class ParquetTable:
     SUFFIX = ".parquet"
 
     def __init__(self, path: Path, columns: Sequence[TableColumn]) -> None:
-        self._arrow = arrow = import_module("pyarrow")
+        arrow = import_module("pyarrow")
+        self._arrow = arrow
         types = {
             "time": arrow.timestamp("us", tz="UTC"),
             "float": arrow.float64(),

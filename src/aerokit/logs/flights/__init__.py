@@ -151,7 +151,8 @@ def _complete_altitudes(flight: FlightLog) -> None:
             # Unless home is near sea level, the two altitudes must differ. If they do not, the log has the same
             # altitude in both columns.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # A value near home's altitude above sea level is above sea level. A value near 0 is above home.
+                # If the value is nearer to home's altitude than to 0, it is an altitude above sea level. Otherwise, it
+                # is a height above home.
                 if abs(amsl_m - home_amsl_m) < abs(amsl_m):
                     relative[row] = amsl_m - home_amsl_m
                 else:

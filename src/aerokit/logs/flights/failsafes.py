@@ -198,7 +198,8 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
         parameters = _missing_parameters(flight, kind)
     facts += parameters
     facts += _texts_before(flight, time_s)
-    return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
+    reaction = reaction or "no mode change followed"
+    return Failsafe(time_s, kind, acted, evidence=tuple(group), reaction=reaction, context=tuple(facts))
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:

@@ -12,7 +12,7 @@ from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, clean_text, error_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane, Waypoint
 from aerokit.logs.flights.flight_controllers import close_bin, opened_bin
-from aerokit.mavlink.enums import MavType
+from aerokit.mavlink.enums import GpsFixType, MavType
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -243,7 +243,7 @@ class _Reader:
         for row in self._tables.rows("CMD", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
             _, number, command, latitude, longitude, altitude, frame = row
             if not latitude and not longitude:
-                latitude = longitude = NAN  # the item has no position
+                latitude, longitude = NAN, NAN  # the item has no position
             items[number] = Waypoint(
                 number, command, latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude, frame=frame
             )
@@ -264,7 +264,7 @@ class _Reader:
             return
         # Without a position of the estimator, use that of the GPS receiver, if it has a 3D fix.
         for time, status, latitude, longitude, amsl in self._tables.rows("GPS", "Status", "Lat", "Lng", "Alt"):
-            if status >= 3:
+            if status >= GpsFixType.TYPE_3D_FIX:
                 track.add(time, latitude, longitude, amsl, NAN)
 
     def _velocity(self) -> None:

@@ -123,8 +123,8 @@ class _Reader:
         # of the header are read.
         flight, source, link = self._flight, self._source, self._link
         handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
-        records = damaged = 0
-        begins_at = ends_at = 0.0
+        records, damaged = 0, 0
+        begins_at, ends_at = 0.0, 0.0
         new_frames = 0  # the vehicle's frames since the last call of link.count()
         next_second, expected_sequence = 0.0, -1
         last_frame_at, last_frame_record = math.nan, 0  # time and number of the record with the vehicle's last frame

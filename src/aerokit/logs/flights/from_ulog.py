@@ -401,7 +401,7 @@ def utc_at_boot(log: Any) -> float:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():
             utc_us, boot_us = data.data["time_utc_usec"], data.data["timestamp"]
-            rows_with_utc = utc_us.nonzero()[0]
+            (rows_with_utc,) = utc_us.nonzero()
             if len(rows_with_utc):
                 row = rows_with_utc[0]
                 return (int(utc_us[row]) - int(boot_us[row])) / 1e6

@@ -27,7 +27,8 @@ class ClockComparison:
 
     def __init__(self) -> None:
         self._previous: tuple[float, int] = (-math.inf, 0)
-        self._recorded_s = self._vehicle_s = 0.0
+        self._recorded_s = 0.0
+        self._vehicle_s = 0.0
 
     def compare(self, time_s: float, boot_ms: int) -> None:
         previous_s, previous_ms = self._previous
@@ -51,7 +52,8 @@ class LinkCounter:
     def __init__(self, flight: FlightLog) -> None:
         self._series, self._silences = flight.link, flight.silences
         self._second = 0  # the second that is being counted
-        self._received = self._lost = 0
+        self._received = 0
+        self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
         """Count received and lost frames. Called after a gap in the sequence and at the start of a second.

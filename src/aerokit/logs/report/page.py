@@ -110,7 +110,9 @@ def page(
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:;"
         " form-action 'none'; base-uri 'none'"
     )
-    charts = [part for section in sections for part in section.parts if isinstance(part, Chart)]
+    charts: list[Chart] = []
+    for section in sections:
+        charts += [part for part in section.parts if isinstance(part, Chart)]
     lines = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">',

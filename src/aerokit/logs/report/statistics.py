@@ -148,13 +148,16 @@ class _ArmedSpans:
 
     def known(self, columns: TimeSeries, name: str) -> list[float]:
         times, values = columns.times, columns[name]
-        parts = (values[bisect_left(times, begin) : bisect_right(times, end)] for begin, end in self._spans)
-        return [value for part in parts for value in part if math.isfinite(value)]
+        known: list[float] = []
+        for begin, end in self._spans:
+            part = values[bisect_left(times, begin) : bisect_right(times, end)]
+            known += [value for value in part if math.isfinite(value)]
+        return known
 
     def mean(self, columns: TimeSeries, name: str) -> float | None:
         """Return the average over time. A value counts until the next row, the last value for a second."""
         times, values = columns.times, columns[name]
-        total = weight = 0.0
+        total, weight = 0.0, 0.0
         for begin, end in self._spans:
             for row in range(bisect_left(times, begin), bisect_right(times, end)):
                 until_s = times[row + 1] if row + 1 < len(times) else times[row] + 1.0

@@ -194,7 +194,7 @@ class Captures:
         return not math.isnan(self._recording_since)
 
     def take(self) -> None:
-        self.take_series(0.0, 1)
+        self.take_series(interval_s=0.0, count=1)
 
     def take_series(self, interval_s: float, count: int) -> None:
         """Take ``count`` images (0: until `stop`), the first at once, then one every ``interval_s`` seconds."""

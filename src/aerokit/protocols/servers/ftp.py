@@ -149,10 +149,11 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the state of a client; None if there are too many clients with open files."""
         key = self._key(request, channel)
         if key not in self._peers and len(self._peers) >= self.max_clients:
-            idle_keys = [idle for idle, peer in self._peers.items() if not peer.sessions and peer.checksum is None]
-            if not idle_keys:
+            idle = (other for other, peer in self._peers.items() if not peer.sessions and peer.checksum is None)
+            idle_key = next(idle, None)
+            if idle_key is None:
                 return None
-            del self._peers[idle_keys[0]]  # A client without open files makes room for the new one.
+            del self._peers[idle_key]  # A client without open files makes room for the new one.
         peer = self._peers.setdefault(key, FtpPeer(channel))
         peer.channel = channel
         return peer

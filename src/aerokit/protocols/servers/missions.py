@@ -226,10 +226,11 @@ class MissionServer:
     def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
-    def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
-        client, kind = sender_of(count), count.mission_type
+    def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
+        """Begin an upload, unless it must be refused."""
+        client, kind = sender_of(message), message.mission_type
         running = self._uploads.get(self._key(kind))
-        refusal = self._refusal(count, channel)
+        refusal = self._refusal(message, channel)
         is_occupied = running is not None and (running.client != client or running.is_being_validated)
         if refusal is None and (is_occupied or self._clearing is not None):
             refusal = _Result.DENIED
@@ -238,17 +239,17 @@ class MissionServer:
             return
         if running is not None:  # The same client starts its upload again.
             self._drop(running)
-        if count.count > self.capacity(kind):
-            self._refuse_size(count, channel)
+        if message.count > self.capacity(kind):
+            self._refuse_size(message, channel)
             return
-        upload = self._begin(count, channel, first=0, end=count.count)
-        if count.count:
+        upload = self._begin(message, channel, first=0, end=message.count)
+        if message.count:
             self._start(upload)
         else:
             self._finish(upload)
 
-    def _refuse_size(self, count: m.MissionCount, channel: Channel) -> None:
-        self._acknowledge(sender_of(count), count.mission_type, _Result.NO_SPACE, channel)
+    def _refuse_size(self, message: m.MissionCount, channel: Channel) -> None:
+        self._acknowledge(sender_of(message), message.mission_type, _Result.NO_SPACE, channel)
 
     def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
         """Register an upload of the items from ``first`` to before ``end``. Nothing is sent."""
