@@ -255,15 +255,9 @@ class FleetAction:
             if member.name in self._policy_orders or not has_finished:
                 self._set_stopped(member, failed, self._policy_orders.get(member.name))
         system_id, name = self._policy_trigger
+        now = self._context.now()
         self._context.publish(
-            PolicyApplied(
-                at=self._context.now(),
-                system_id=system_id,
-                member=name,
-                action=self.name,
-                orders=dict(self._policy_orders),
-                skipped=skipped,
-            )
+            PolicyApplied(now, system_id, name, action=self.name, orders={**self._policy_orders}, skipped=skipped)
         )
         self._pending_policy_orders = len(self._policy_orders)
         for member in available:
@@ -273,7 +267,7 @@ class FleetAction:
                 )
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
-        # Members that are skipped above stop, too.
+        # The actions of skipped members are cancelled, too.
         stopping = [member for member in available if member.name in orders]
         asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
         if not self._policy_orders:
@@ -320,15 +314,9 @@ class FleetAction:
     def _publish_completed(self) -> None:
         assert self._policy_trigger is not None
         system_id, name = self._policy_trigger
+        now, errors = self._context.now(), dict(self._policy_order_errors)
         self._context.publish(
-            PolicyCompleted(
-                at=self._context.now(),
-                system_id=system_id,
-                member=name,
-                action=self.name,
-                orders=dict(self._policy_orders),
-                errors=dict(self._policy_order_errors),
-            )
+            PolicyCompleted(now, system_id, name, action=self.name, orders={**self._policy_orders}, errors=errors)
         )
 
     def _hold_finished_members(self) -> None:

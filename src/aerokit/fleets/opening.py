@@ -129,7 +129,7 @@ async def fleet(
         for name, vehicle in await connections.open(systems):
             members.append(Member(f"{name}/{vehicle.system_id}", name, vehicle))
         _check_names(members)
-        now = next(iter(networks.values())).now
+        now = next(iter(networks.values())).now  # the clock of the event loop, which all connections share
         context = FleetContext(members, networks, rules, now=now, on_error=_raise, min_distance_m=min_distance_m)
         _assign(context, groups or {}, "group")
         _assign(context, roles or {}, "role")

@@ -186,7 +186,7 @@ def _conflicts(
     """Return the conflicts of routes with each other and with stationary vehicles, regardless of time."""
     _check_distance(min_distance_m)
     # Times are ignored here, so the paths can have any speed.
-    paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
+    paths = [Path.straight(route.name, route.start, route.target, speed_m_s=1.0) for route in routes]
     conflicts = list(find_conflicts(paths, min_distance_m))
     resting_paths = _resting_paths(stationary)
     for path in paths:
@@ -219,7 +219,7 @@ def _delays(
     for route in sequence:
         delay_s = 0.0
         while True:
-            path = Path.straight(route.name, route.start, route.target, speed_m_s, delay_s)
+            path = Path.straight(route.name, route.start, route.target, speed_m_s, at_s=delay_s)
             blocker = _find_blocker(path, [*delayed_paths, *resting_paths], min_distance_m, slack_s)
             if blocker is None:
                 break

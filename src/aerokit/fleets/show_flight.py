@@ -100,7 +100,8 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
             return
         round_trip_s = frame.received_at - sent_at
         answered_at = sent_at + round_trip_s / 2  # if both directions take the same time
-        measurements.append((round_trip_s, message.tc1 / 1e9 - answered_at))
+        offset_s = message.tc1 / 1e9 - answered_at
+        measurements.append((round_trip_s, offset_s))
 
     detach = connection.bus.attach(Timesync, on_timesync, system_id=vehicle.system_id)
     try:
@@ -119,7 +120,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
     if not measurements:
         raise OperationTimeout(f"the vehicle did not answer TIMESYNC; {vehicle.describe_link()}")
     round_trip_s, offset_s = min(measurements)  # the measurement with the shortest round trip is the most accurate
-    return ClockOffset(offset_s, round_trip_s, len(measurements))
+    return ClockOffset(offset_s, round_trip_s, answers=len(measurements))
 
 
 # ------------------------------------------------------------------------------------------ report
@@ -176,7 +177,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
         return TrackDeviation(max_m=math.nan, rms_m=math.nan, lag_s=None, samples=0)
     rms = math.sqrt(sum(error * error for error in errors) / len(errors))
     lag_s = error_times_velocity / velocity_squared if velocity_squared else None
-    return TrackDeviation(max(errors), rms, lag_s, len(errors))
+    return TrackDeviation(max_m=max(errors), rms_m=rms, lag_s=lag_s, samples=len(errors))
 
 
 def max_relative_error(

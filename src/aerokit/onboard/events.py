@@ -75,13 +75,7 @@ class EventSender:
         if not stored:
             oldest = self._sent[0].sequence if self._sent else 0
             system, component = channel
-            error = m.ResponseEventError(
-                system,
-                component,
-                sequence=request.first_sequence,
-                sequence_oldest_available=oldest,
-                reason=_UNAVAILABLE,
-            )
+            error = m.ResponseEventError(system, component, request.first_sequence, oldest, reason=_UNAVAILABLE)
             self._host.send(error, channel)
 
 

@@ -304,8 +304,9 @@ class Reassembly:
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:
             length = self.block_size if self.end is None else min(self.block_size, self.end - offset)
-            if ranges and sum(ranges[-1]) == offset:  # The block follows the last range.
-                start, size_so_far = ranges[-1]
+            start, size_so_far = ranges[-1] if ranges else (offset, 0)
+            follows_last_range = bool(ranges) and start + size_so_far == offset
+            if follows_last_range:
                 ranges[-1] = (start, size_so_far + length)
             else:
                 ranges.append((offset, length))

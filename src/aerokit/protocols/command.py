@@ -145,8 +145,8 @@ def command_int(
 ) -> CommandInt:
     """Build a COMMAND_INT.
 
-    ``params`` are param1 to param4, ``x`` and ``y`` latitude and longitude in 1e-7 degrees (in 1e-4 m in local frames),
-    ``z`` is the altitude in metres in ``frame`` (MAV_FRAME).
+    ``params`` are param1 to param4. ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or distances in 1e-4 m
+    in local frames. ``z`` is the altitude in metres in ``frame`` (MAV_FRAME).
 
     Raises:
         InvalidArgument: there are more than four parameters, a value exceeds its type, or the target is 0.

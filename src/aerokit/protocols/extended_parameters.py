@@ -158,6 +158,7 @@ class SettingReads(NamedReads[Setting]):
         self._is_probe_wanted = bool(self._overdue(now))
 
     def _on_message(self, message: Message, now: float) -> None:
+        """Process the answer to a probe, or the value of a requested name. A message may be both."""
         if not isinstance(message, ParamExtValue):
             return
         name = message.param_id

@@ -316,7 +316,8 @@ class FtpDownload(FtpExchange[int]):
         offset = self._reassembly.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. A later request with one of them would look like a
-        # repetition of this request, and the server would only repeat its last reply.
+        # repetition of this request, and the server would only repeat its last reply. The request, the full blocks, a
+        # shorter block and the NAK have one number each.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True

@@ -232,7 +232,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         elif self._error_at is None:
             self._error_at = now
             are_all_sent = self._sent_end == self._end
-            self._send(self._end - 1 if are_all_sent else self._confirmed_end, now, again=True)
+            seq = self._end - 1 if are_all_sent else self._confirmed_end
+            self._send(seq, now, again=True)
             self._wait(now)
         elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
             if self._sent_end == self._end:

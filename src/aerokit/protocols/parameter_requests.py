@@ -142,6 +142,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
+        """Process the answer to a probe, or the value of a requested name. A message may be both."""
         is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
         if is_probe_answer:
             self._count_probe()

@@ -126,14 +126,9 @@ def convert(
         writer = make_writer(incomplete, log_reader)
         entries, begins_at, ends_at, written = _write_records(log_reader, writer, on_bytes)
         size = _move(incomplete, target_path)
+    notes = tuple(log_reader.notes)
     return Conversion(
-        target_path,
-        entries=entries,
-        written=written,
-        bytes=size,
-        begins_at=begins_at,
-        ends_at=ends_at,
-        notes=tuple(log_reader.notes),
+        target_path, entries, written=written, bytes=size, begins_at=begins_at, ends_at=ends_at, notes=notes
     )
 
 

@@ -75,7 +75,7 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
     """Yield the start, end and last sink rate of each fast descent, and whether the descent was stopped."""
-    begin_s = -math.inf  # the last time at which the vehicle did not sink
+    begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
     last_fast_s = -math.inf  # the last time at which it sank fast
     previous_s = -math.inf
     sink_m_s = 0.0  # the highest sink rate shortly before the end of the descent

@@ -319,9 +319,9 @@ class _Reader:
     def _batteries(self) -> None:
         instance = "Inst" if self._tables.has("BAT", "Inst") else "Instance"
         has_percent = self._tables.has("BAT", "RemPct")
-        columns = (
-            (instance, "Volt", "Curr", "CurrTot", "RemPct") if has_percent else (instance, "Volt", "Curr", "CurrTot")
-        )
+        columns = [instance, "Volt", "Curr", "CurrTot"]
+        if has_percent:
+            columns.append("RemPct")
         for time_s, number, voltage, current, used, *rest in self._tables.rows("BAT", *columns):
             is_known = has_percent and rest[0] != _NO_PERCENT
             self._flight.battery(number).add(time_s, voltage, current, used, rest[0] if is_known else NAN)

@@ -108,18 +108,13 @@ class TlogReader(LogReader):
                     on_bytes(file.tell())
                 for frame in framer.receive(raw, unix_s):
                     message = decode(frame)
+                    system_id, component_id = frame.system_id, frame.component_id
                     if frame.message_id in _PARAMETER_IDS:
-                        message = self._decode_parameter(message, frame.system_id)
+                        message = self._decode_parameter(message, system_id)
                     if self.needs_states:
-                        states = self._states(frame.system_id, frame.component_id, unix_s, message)
+                        states = self._states(system_id, component_id, unix_s, message)
                     yield LogRecord(
-                        unix_s,
-                        frame.system_id,
-                        frame.component_id,
-                        table=message.NAME,
-                        fields={},
-                        states=states,
-                        message=message,
+                        unix_s, system_id, component_id, table=message.NAME, fields={}, states=states, message=message
                     )
             on_bytes(file.tell())
         self._check_and_note(count)
