@@ -231,7 +231,7 @@ async def find_systems(
 ) -> dict[str, list[int]]:
     """Wait for vehicles; return the system ids to connect to, by network.
 
-    They are the requested ids or, without a request, all ids found that have no vehicle object yet.
+    These system ids are the requested ones or, without a request, all ids found that have no vehicle object yet.
 
     Args:
         networks: connections by name.

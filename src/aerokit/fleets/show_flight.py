@@ -185,7 +185,7 @@ def max_relative_error(
 ) -> float | None:
     """Return the largest error of the vector from one vehicle to another in metres; None for fewer than two vehicles.
 
-    It is computed at 61 times of the show, with positions that are interpolated between samples.
+    The errors are computed at 61 times of the show, with positions that are interpolated between samples.
     """
     largest_m: float | None = None
     for index in range(RELATIVE_ERROR_SAMPLES + 1):

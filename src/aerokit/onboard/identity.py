@@ -38,7 +38,7 @@ class Identity(Snapshot):
     uid: int = 0
 
     def _check(self) -> None:
-        # The sizes of the fields in COMPONENT_INFORMATION_BASIC.
+        # The texts must fit into the fields of COMPONENT_INFORMATION_BASIC.
         for name, size in (("vendor", 32), ("model", 32), ("version", 24), ("hardware_version", 24)):
             value = getattr(self, name)
             if not isinstance(value, str) or len(value.encode()) > size:

@@ -31,7 +31,7 @@ __all__ = [
 MAX_ATTEMPTS = 4
 """Maximum number of transmissions of a command that may be repeated."""
 
-# Conditions in UNREPEATABLE_COMMANDS: index and value of a parameter.
+# A condition in UNREPEATABLE_COMMANDS has the index of a parameter, and the value that makes it true.
 _PARAM1_IS_0, _PARAM1_IS_1, _PARAM1_IS_2, _PARAM4_IS_1 = (0, 0.0), (0, 1.0), (0, 2.0), (3, 1.0)
 
 # Commands whose repetition has a further effect. Maps MAV_CMD to (effect, condition). If the condition is None, every
@@ -198,7 +198,7 @@ class CommandExchange(Exchange[CommandAck]):
 
     expects: tuple[type[Message], ...] = (CommandAck,)
 
-    # set by start()
+    # start() sets these attributes.
     _started_at: float
     _sent_at: float
 

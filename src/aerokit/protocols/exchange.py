@@ -267,7 +267,7 @@ class Transfer(Exchange[ResultT]):
     take long, but continues while new data arrives.
     """
 
-    # set by start()
+    # start() sets these attributes.
     _started_at: float
     _progress_at: float
 

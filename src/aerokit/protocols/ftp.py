@@ -305,7 +305,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     attempts: int
 
-    # set by start()
+    # start() sets these attributes.
     _sent_at: float
 
     def __init__(

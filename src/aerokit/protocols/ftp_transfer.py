@@ -332,7 +332,7 @@ class FtpDownload(FtpExchange[int]):
         """Deadline for the next block. If it passes, the burst has ended or, before any block, has not started."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
-            # Repeating the burst of a long file is expensive, so such a burst gets more time to start.
+            # Repeating the burst of a long file is expensive, so the burst gets more time to start.
             if self._size is not None and self._size > SHORT_FILE:
                 silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
         else:

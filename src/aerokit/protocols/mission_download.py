@@ -56,7 +56,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     expects: tuple[type[Message], ...] = (MissionCount, MissionItemInt, MissionItem, MissionAck)
 
-    # set by start()
+    # start() sets these attributes.
     _list_requested_at: float
     _received_at: float
 

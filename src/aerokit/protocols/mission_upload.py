@@ -52,7 +52,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several items.
     ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss. A
     request confirms all items before the requested one. ArduPilot answers an item out of sequence with INVALID_SEQUENCE
-    and continues to wait; PX4 ignores such an item and repeats its request every 0.25 s.
+    and continues to wait; PX4 ignores the item and repeats its request every 0.25 s.
 
     An unanswered item is repeated. If the item had arrived, and only the request for the next item was lost, ArduPilot
     answers the repetition with INVALID_SEQUENCE. The next item is then sent.
@@ -60,9 +60,9 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
 
-    # set by start()
+    # start() sets these attributes.
     _received_at: float
-    # set by the first request
+    # The first request sets this attribute.
     _as_float: bool
 
     def __init__(
@@ -253,7 +253,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _restart(self, now: float) -> None:
         """Begin again, because the vehicle's transfer has expired or was cancelled."""
-        if not self._is_accepted:  # It was an older transfer.
+        if not self._is_accepted:  # An older transfer was cancelled.
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
             self._refuse(MavMissionResult.OPERATION_CANCELLED)

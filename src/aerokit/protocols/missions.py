@@ -102,7 +102,7 @@ class MissionExchange(Transfer[ResultT]):
 
     @property
     def kind(self) -> str:
-        """Name of the mission type, for texts: ``"mission"``, ``"fence"`` or ``"rally points"``."""
+        """Name of the mission type, for error texts: ``"mission"``, ``"fence"`` or ``"rally points"``."""
         return NAMES.get(MavMissionType(self.mission_type), "items")
 
     def cancellation(self) -> list[Message]:
@@ -197,7 +197,7 @@ class SetCurrentItem(Transfer[None]):
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
 
-    # set by start()
+    # start() sets these attributes.
     _sent_at: float
 
     def __init__(

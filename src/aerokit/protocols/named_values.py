@@ -203,7 +203,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _step(self, now: float) -> None:
         """Finish, or send the requests that are due. Called after each message and at each deadline."""
         if len(self._answers) < len(self._names):
-            self._before_sending(now)  # It may settle the last names.
+            self._before_sending(now)  # This call may settle the last names.
         if len(self._answers) == len(self._names):
             self._finish({name: self._answers[name] for name in self._names})
             return
@@ -260,7 +260,7 @@ class NamedReads(NamedRequests[ValueT]):
     def _loss_probability(self, attempts: int) -> float:
         """Estimate the probability that the answers to ``attempts`` requests were all lost.
 
-        It is derived from the numbers of sent and answered probes, by Laplace's rule of succession.
+        The estimate is derived from the numbers of sent and answered probes, by Laplace's rule of succession.
         """
         if not self._probes_answered:
             return 1.0

@@ -110,7 +110,7 @@ class RequestWindow(Generic[KeyT]):
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
         """Record an answer. Return the requests that count as lost.
 
-        These are the requests that were sent at least ``overtaken`` transmissions before the answered request.
+        The lost requests were sent at least ``overtaken`` transmissions before the answered request.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)

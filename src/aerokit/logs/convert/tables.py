@@ -264,7 +264,7 @@ def _first(values: Sequence[Any]) -> Any:
 def _value_getter(path: str) -> Callable[[dict[str, Any]], Any]:
     """Return a function that gets the value at a path such as ``batteries.0.voltage_v`` from states.
 
-    It returns None for unknown values.
+    The returned function returns None for unknown values.
     """
     state, *steps = path.split(".")
 

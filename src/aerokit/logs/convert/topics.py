@@ -122,7 +122,7 @@ class MapFrame:
 def height_above(origin_m: float, altitude_amsl_m: float | None, relative_m: float | None) -> float:
     """Return the height above the origin in metres.
 
-    It is derived from the altitude above sea level or, if that is unknown, from the altitude above home.
+    The height is derived from the altitude above sea level or, if that is unknown, from the altitude above home.
     """
     return (relative_m or 0.0) if altitude_amsl_m is None else altitude_amsl_m - origin_m
 

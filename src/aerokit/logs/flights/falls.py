@@ -23,7 +23,8 @@ _FALL_SINK_M_S = 6.0
 _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
-# Disarming and texts up to this long before a descent may explain it, and texts up to this long after its end.
+# Disarming and status texts may explain a descent if they are at most _REASON_BEFORE_S before its start. Status texts
+# may also explain it if they are at most _TEXT_AFTER_S after its end.
 _REASON_BEFORE_S, _TEXT_AFTER_S = 3.0, 5.0
 # Disarming later than this before the end of a descent may be caused by the impact.
 _IMPACT_DISARM_S = 0.3

@@ -277,7 +277,7 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """Yield the logged texts as rows of a table, like `_rows`."""
+    """Yield the logged status texts as rows of a table, like `_rows`."""
     for text in log.logged_messages:
         # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
         severity = max(0, min(7, int(text.log_level) - ord("0")))

@@ -61,8 +61,7 @@ class Chart:
     label: str = ""
     """Description for screen readers and for browsers without scripts."""
     is_timeline: bool = False
-    """True for a chart over time. It has the page's shapes as background, and zooms together with all other timelines.
-    """
+    """True for a chart over time. All these charts have the page's shapes as background, and zoom together."""
 
 
 Summary: TypeAlias = "tuple[str, Sequence[str], Sequence[str]]"

@@ -211,8 +211,8 @@ def findings(flight: FlightLog) -> list[str]:
 def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     """Return texts with the values that were measured in the descent, as far as the log has them.
 
-    They are throttle, tilt, attitude error, motor outputs and battery current. An unusual value is followed by advice
-    on what to look at.
+    The values are throttle, tilt, attitude error, motor outputs and battery current. An unusual value is followed by
+    advice on what to look at.
     """
     begin_s = fall.begins_s
     end_s = fall.time_s - 0.2  # excludes the impact

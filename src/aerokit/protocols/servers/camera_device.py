@@ -167,7 +167,7 @@ class Captures:
         self.images: list[CameraImageCaptured] = []
         """The image log: the latest images since it was cleared, at most ``max_images``."""
         self.dropped_count: int = 0
-        """Number of older images that the log has dropped. It is also the image index of the log's first image."""
+        """Number of older images that the log has dropped. The log's first image has this image index."""
         self.interval_s: float = 0.0
         """Seconds between two images of the current series."""
         self._remaining = 0  # number of images of the series that are still to be taken; -1: no limit

@@ -12,7 +12,7 @@ from typing_extensions import Self
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
 
-# (name, size in bytes). The size is None for a folder.
+# An entry has a name, and a size in bytes, which is None for a folder.
 Entry = tuple[str, int | None]
 
 

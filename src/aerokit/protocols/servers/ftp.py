@@ -135,7 +135,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         """Return the number for a new session.
 
-        It is the number that the client requests, as MAVProxy does, or a free number.
+        The client may request a number, as MAVProxy does. Otherwise, a free number is used.
         """
         if request.session and request.session not in peer.sessions:
             return request.session
