@@ -47,7 +47,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     """Uploads a plan: sends MISSION_COUNT, then the items that the vehicle requests.
 
     If ``first`` is given, the upload begins with MISSION_WRITE_PARTIAL_LIST instead, and replaces the items from
-    ``first`` on. ``takes_int`` is False for a vehicle that does not accept MISSION_ITEM_INT.
+    ``first`` on. ``supports_int`` is False for a vehicle that does not accept MISSION_ITEM_INT.
 
     With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several items.
     ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss. A
@@ -73,7 +73,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         *,
         first: int | None = None,
         window: int,
-        takes_int: bool = True,
+        supports_int: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(target_system, target_component, **options)
@@ -82,7 +82,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._first = first or 0
         self._end = self._first + len(items)
         self._window = window
-        self._accepts_int = takes_int
+        self._supports_int = supports_int
         self.is_refusal_ambiguous: bool = False
         """True if it is unknown which of several items in flight was refused. To find out, send items one at a time."""
         self.was_started: bool = False
@@ -134,7 +134,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             else:
                 self._on_ack(message, now)
         elif isinstance(message, (MissionRequestInt, MissionRequest)) and self._first <= message.seq < self._end:
-            self._as_float = isinstance(message, MissionRequest) and not self._accepts_int
+            self._as_float = isinstance(message, MissionRequest) and not self._supports_int
             self._on_request(message.seq, now)
 
     def expire(self, now: float) -> None:

@@ -75,8 +75,8 @@ class SessionFtpServer(Generic[FilesT]):
     line_end: ClassVar[bytes] = b"\0"
     creates_missing: ClassVar[bool] = True
     """True if OpenFileWO creates a missing file."""
-    reply_kept: ClassVar[int] = 4
-    """Maximum data size of a reply that is stored, in bytes. A stored reply answers a repeated request."""
+    max_stored_reply_size: ClassVar[int] = 4
+    """Maximum size in bytes of the data of a reply that is stored. A stored reply answers a repeated request."""
     crc_block: ClassVar[int] = 65_536
     crc_blocks_at_once: ClassVar[int] = 8
     """Number of blocks of a file that are read for a checksum before the event loop continues."""
@@ -193,7 +193,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
         # NOSESSIONSAVAILABLE is not stored: the client repeats its request until a session is free, and then needs a
         # new answer.
-        if answer.size <= self.reply_kept and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
+        if answer.size <= self.max_stored_reply_size and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
             peer.reply = answer
         self._host.send(answer.message(), peer.channel)
 

@@ -83,7 +83,7 @@ class PlanChannel:
                 *self._target,
                 window=self._context.autopilot.mission_download_window,
                 only=only,
-                gives_int=await self._supports_int(),
+                supports_int=await self._supports_int(),
                 **self._wire_options,
             )
         )
@@ -142,7 +142,7 @@ class PlanChannel:
             items,
             first=first,
             window=window,
-            takes_int=await self._supports_int(),
+            supports_int=await self._supports_int(),
             **self._wire_options,
         )
 
