@@ -87,7 +87,7 @@ async def test_member_late_in_its_corridor_does_not_start() -> None:
         asyncio.get_running_loop().call_later(2.9, block_loop, 3.2)
         result = await stage.fleet.go_to(targets, separation=plan, speed_m_s=5)
         assert set(result.failed) == {"north/2"}
-        assert "s late in its corridor" in str(result.failed["north/2"])
+        assert "s late, so it stays" in str(result.failed["north/2"])
         assert min_distance_m(*tracks)[0] > 8
         assert not [order for _, order in stage.orders_to("north/2") if order.command == MavCmd.DO_REPOSITION]
 

@@ -173,8 +173,8 @@ async def test_streams_have_events_and_states_of_all_members() -> None:
             with pytest.raises(SubscriptionOverflow):
                 async for _ in few:
                     pass
-        for wrong in ((), ("height",)):
-            with pytest.raises(InvalidArgument, match="is not a state"):
+        for wrong, text in (((), "at least one state"), (("height",), "'height' is not a state")):
+            with pytest.raises(InvalidArgument, match=text):
                 stage.fleet.states(*wrong)
         with pytest.raises(InvalidArgument, match="a class of Event"):
             stage.fleet.events(int)  # type: ignore[arg-type]

@@ -193,7 +193,7 @@ def test_show_file_round_trip(tmp_path: FilePath) -> None:
         ("name,t_s,north_m,east_m,up_m\na,1,1,2,3\na,1,5,2,3\n", "two positions"),
         ("name,t_s,north_m,east_m,up_m\n", "a show needs at least one"),
         ("{", "not JSON"),
-        ('{"format": "other"}', "not 'aerokit show'"),
+        ('{"format": "other"}', "not a show"),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": [[0, 1]]}}', "track 'a'"),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": 5}}', "track 'a'"),
     ],

@@ -161,7 +161,7 @@ def test_mission_download_of_unsupported_type() -> None:
 
 
 def test_mission_download_in_float_form() -> None:
-    exchange = download(gives_int=False)
+    exchange = download(supports_int=False)
     exchange.start(0.0)
     exchange.receive(m.MissionCount(*GCS, 1), 0.1)
     assert isinstance(exchange.take_outbox()[-1], m.MissionRequest)

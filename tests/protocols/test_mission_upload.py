@@ -227,12 +227,12 @@ def test_partial_upload_of_missing_items_is_refused() -> None:
 
 
 def test_mission_upload_uses_float_form_if_needed() -> None:
-    for takes_int, request, kind in (
+    for supports_int, request, kind in (
         (True, m.MissionRequest, m.MissionItemInt),
         (False, m.MissionRequest, m.MissionItem),
         (False, m.MissionRequestInt, m.MissionItemInt),
     ):
-        exchange = upload(NEW, window=1, takes_int=takes_int)
+        exchange = upload(NEW, window=1, supports_int=supports_int)
         exchange.start(0.0)
         exchange.take_outbox()
         exchange.receive(request(*GCS, 0), 0.1)

@@ -46,7 +46,7 @@ async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
     Return the seconds by which the whole wait exceeds ``delay_s``.
 
     Raises:
-        OperationRejected: the computer slept meanwhile, so that the order would be late, or the member is unavailable.
+        OperationRejected: the computer slept during the wait, or the member is unavailable.
         HeartbeatTimeout: the member is silent.
     """
     connection = member.vehicle.connection
@@ -88,23 +88,23 @@ class FleetAction:
         holds_if_cancelled: bool = True,
     ) -> None:
         self.name: str = name
-        self._context, self._execute = context, execute
-        self._timeout, self._stagger_s = timeout, stagger_s or 0.0
+        self._context, self._execute, self._timeout = context, execute, timeout
+        self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
         requested = list(members)
         for member in requested:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
-        self._outcomes: dict[str, Any] = {}
+        self._outcomes: dict[str, Any] = {}  # by member name: the returned value, or the error
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
-        self._orders: dict[str, PolicyOrder] = {}
+        self._policy_orders: dict[str, PolicyOrder] = {}
         # System id and name of the failed member for which the policy was applied; None if it was not applied.
         self._policy_trigger: tuple[int, str] | None = None
-        self._order_errors: dict[str, str] = {}
-        self._pending_orders = 0
+        self._policy_order_errors: dict[str, str] = {}
+        self._pending_policy_orders = 0
         self._last_start_at = -math.inf  # when the last member started
         self._is_applying_policy = False
         self._finished = asyncio.Event()
@@ -138,7 +138,7 @@ class FleetAction:
     @property
     def orders(self) -> dict[str, str]:
         """The policy's orders by member name. Empty if no member failed, or if the policy lets the others continue."""
-        return dict(self._orders)
+        return dict(self._policy_orders)
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -212,7 +212,8 @@ class FleetAction:
         """Record that a member failed. The first failure applies the policy."""
         if member.name in self._failed:
             return
-        self._failed[member.name] = self._outcomes[member.name] = error
+        self._failed[member.name] = error
+        self._outcomes[member.name] = error
         member.record_failure(self.name, error)
         is_policy_applied = self._policy_trigger is not None or self._is_applying_policy
         if self._is_safe or is_policy_applied or self._context.is_closed:
@@ -243,28 +244,33 @@ class FleetAction:
             order = orders.get(member.name)
             if order is None:
                 continue
-            if not member.is_flown_by_program:
-                is_disarmed = member.vehicle.is_confirmed_disarmed
-                skipped[member.name] = "it is disarmed" if is_disarmed else "this program does not fly it"
+            if member.is_flown_by_program:
+                self._policy_orders[member.name] = order
+            elif member.vehicle.is_confirmed_disarmed:
+                skipped[member.name] = "it is disarmed"
             else:
-                self._orders[member.name] = order
+                skipped[member.name] = "this program does not fly it"
+            has_finished = member.name in self._outcomes
             # If a member has finished the action and gets no order, its outcome stays.
-            if member.name in self._orders or member.name not in self._outcomes:
-                self._set_stopped(member, failed, self._orders.get(member.name))
+            if member.name in self._policy_orders or not has_finished:
+                self._set_stopped(member, failed, self._policy_orders.get(member.name))
+        system_id, name = self._policy_trigger
+        now = self._context.now()
         self._context.publish(
-            PolicyApplied(self._context.now(), *self._policy_trigger, self.name, dict(self._orders), skipped)
+            PolicyApplied(now, system_id, name, action=self.name, orders={**self._policy_orders}, skipped=skipped)
         )
-        self._pending_orders = len(self._orders)
+        self._pending_policy_orders = len(self._policy_orders)
         for member in available:
-            if member.name in self._orders:
+            if member.name in self._policy_orders:
                 self._context.background.start(
-                    partial(self._send_order, member, self._orders[member.name]), f"aerokit policy {member.name}"
+                    partial(self._send_order, member, self._policy_orders[member.name]), f"aerokit policy {member.name}"
                 )
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
-        ordered = [member for member in available if member.name in orders]
-        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, ordered)
-        if not self._orders:
+        # The actions of skipped members are cancelled, too.
+        stopping = [member for member in available if member.name in orders]
+        asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
+        if not self._policy_orders:
             self._publish_completed()
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
@@ -278,7 +284,8 @@ class FleetAction:
     def _set_stopped(self, member: Member, failed: Member, order: PolicyOrder | None) -> None:
         order_text = f"; the policy ordered {member.name} to {order}" if order else ""
         error = OperationRejected(f"{self.name}: stopped because {failed.name} failed{order_text}")
-        self._stopped[member.name] = self._outcomes[member.name] = error
+        self._stopped[member.name] = error
+        self._outcomes[member.name] = error
 
     def _cancel_tasks_of(self, members: Iterable[Member]) -> None:
         for member in members:
@@ -296,20 +303,20 @@ class FleetAction:
             else:
                 await member.vehicle.hold()
         except AerokitError as error:
-            self._order_errors[member.name] = str(error)
+            self._policy_order_errors[member.name] = str(error)
             member.refresh()  # the order may have failed because of a lost link or a takeover
         finally:
-            self._pending_orders -= 1
-            if not self._pending_orders:
+            self._pending_policy_orders -= 1
+            if not self._pending_policy_orders:
                 self._publish_completed()
                 self._check_finished()
 
     def _publish_completed(self) -> None:
         assert self._policy_trigger is not None
+        system_id, name = self._policy_trigger
+        now, errors = self._context.now(), dict(self._policy_order_errors)
         self._context.publish(
-            PolicyCompleted(
-                self._context.now(), *self._policy_trigger, self.name, dict(self._orders), dict(self._order_errors)
-            )
+            PolicyCompleted(now, system_id, name, action=self.name, orders={**self._policy_orders}, errors=errors)
         )
 
     def _hold_finished_members(self) -> None:
@@ -322,7 +329,7 @@ class FleetAction:
 
     def _check_finished(self) -> None:
         """End `run` once every member has an outcome and all orders of the policy have ended."""
-        if not self._tasks and not self._pending_orders and len(self._outcomes) == len(self._members):
+        if not self._tasks and not self._pending_policy_orders and len(self._outcomes) == len(self._members):
             self._finished.set()
 
     def _on_program_error(self, error: Exception) -> None:

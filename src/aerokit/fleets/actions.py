@@ -44,12 +44,12 @@ class Actions(SelectionBase):
             InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
         """
         if isinstance(action, str):
+            name = action
             for member in self:
-                _method(member, action)  # an unknown name raises here, before any member has started
-            name = method_name = action
+                _method(member, name)  # an unknown name raises here, before any member has started
 
             async def execute(member: Member) -> Any:
-                return await _method(member, method_name)(*arguments, **options)
+                return await _method(member, name)(*arguments, **options)
 
         else:
             if arguments or options:
@@ -155,6 +155,7 @@ class Actions(SelectionBase):
         Raises:
             FleetError: the condition was not true for a member in time. The failure applies the fleet's policy.
         """
+        deadline = self._context.now() + timeout  # one deadline for all members
 
         async def wait_for_condition(member: Member) -> None:
             vehicle = member.vehicle
@@ -164,13 +165,12 @@ class Actions(SelectionBase):
                 while not condition(member):
                     vehicle.connection.raise_if_ended()
                     if vehicle.connection.now() >= deadline:
-                        missing = [member.name for member in self if member.is_available and not condition(member)]
+                        missing = [other.name for other in self if other.is_available and not condition(other)]
                         raise OperationTimeout(
                             f"{description}: not reached within {timeout:g} s by {', '.join(missing)}"
                         )
                     await change_signal.next(POLL_INTERVAL_S)
 
-        deadline = self._context.now() + timeout  # one deadline for all members
         result = await self._run(description, wait_for_condition)
         result.raise_for_errors()
         return result

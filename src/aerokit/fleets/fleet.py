@@ -180,9 +180,10 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: a name is unknown, or none is given.
         """
-        checked_names = names or ("",)  # no state is named "", so a call without names raises, too
+        if not names:
+            raise InvalidArgument("names = () is not allowed: give the name of at least one state (docs/states.md)")
         for member in self:
-            for name in checked_names:
+            for name in names:
                 if name not in member.vehicle.telemetry.cells:
                     raise InvalidArgument(f"names: {short_repr(name)} is not a state; docs/states.md lists them")
 
@@ -201,12 +202,13 @@ class Fleet(Selection):
 
     def _attach_member_events(self, event_type: type[Event], sink: Sink) -> list[Detach]:
         """Pass events of vehicles and links to a sink, as `MemberEvent` with the name of the member or network."""
-        names = {(member.network, member.vehicle.system_id): member.name for member in self._context.members.values()}
+        members = self._context.members.values()
+        member_names = {(member.network, member.vehicle.system_id): member.name for member in members}
 
         def publish(network: str, event: Event) -> None:
             is_about_link = event.system_id == 0
-            name = network if is_about_link else names.get((network, event.system_id))
-            if name is not None:
+            name = network if is_about_link else member_names.get((network, event.system_id))
+            if name is not None:  # an event of a vehicle on this network that is not a member has no name
                 sink(MemberEvent(event.at, event.system_id, name, event))
 
         return [

@@ -86,11 +86,11 @@ class Formation(Snapshot):
     def wedge(cls, names: Sequence[str], spacing_m: float, *, frame: Literal["north", "heading"] = "heading") -> Self:
         """Make a V behind the leader, with members alternately on the left and right.
 
-        Each pair is ``spacing_m`` metres farther back, and as much farther out, than the pair before.
+        Each pair is ``spacing_m`` metres behind the pair before it, and ``spacing_m`` metres farther out on both sides.
         """
         offsets: dict[str, Offset] = {}
         for index, name in enumerate(names):
-            row = index // 2 + 1
+            row = index // 2 + 1  # the leader is row 0
             side = 1 if index % 2 else -1  # 1: right, -1: left
             offsets[name] = Offset(-spacing_m * row, spacing_m * row * side)
         return cls(offsets, frame)
@@ -141,7 +141,8 @@ def follow_velocity(
     velocity = [speed + gain * distance for speed, distance in zip(target_velocity, distance_vector, strict=True)]
     speed = math.hypot(*velocity)
     scale = 1.0 if speed <= max_speed_m_s else max_speed_m_s / speed
-    return velocity[0] * scale, velocity[1] * scale, velocity[2] * scale
+    north, east, up = (component * scale for component in velocity)
+    return north, east, up
 
 
 @checks_arguments
@@ -167,7 +168,8 @@ class Following:
         self._max_speed_m_s = max_speed_m_s
         self._tasks = BackgroundTasks(self._on_error)
         self._stopped = asyncio.Event()
-        self._was_entered = self._has_raised = False
+        self._was_entered = False
+        self._has_raised = False
         self._reason = ""
 
     @property
@@ -183,8 +185,10 @@ class Following:
     def error_m(self, name: str) -> float:
         """Return the distance of a follower from its place in metres; infinite if unknown."""
         member = next((follower for follower in self._followers if follower.name == name), None)
+        if member is None:
+            return math.inf
         try:
-            return math.inf if member is None else math.hypot(*self._vector_to_place(member))
+            return math.hypot(*self._vector_to_place(member))
         except (ValueUnknownError, OperationRejected):
             return math.inf
 
@@ -205,7 +209,7 @@ class Following:
 
     async def __aenter__(self) -> Self:
         if self._was_entered:
-            raise BusyError("a Following can be entered only once; call following() for another one")
+            raise BusyError("a Following can be entered only once; call following() again")
         self._was_entered = True
         self._check_leader()
         self._action = FleetAction(self._context, "following", self._followers, self._fly_follower)
@@ -322,11 +326,14 @@ class Following:
         self._reason = reason
         self._stopped.set()
         now, system_id, name = self._context.now(), self._leader.vehicle.system_id, self._leader.name
-        self._context.publish(FollowingStopped(now, system_id, name, reason, dict(orders), dict(skipped)))
+        self._context.publish(
+            FollowingStopped(now, system_id, name, reason=reason, orders=dict(orders), skipped=dict(skipped))
+        )
 
     def _on_error(self, error: Exception) -> None:
-        holding = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
-        self._stop(str(error) or type(error).__name__, self._action.orders or holding, {})
+        """Stop following because of an error in the program. Without orders of the policy, all followers hold."""
+        hold_orders = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
+        self._stop(str(error) or type(error).__name__, self._action.orders or hold_orders, {})
 
 
 @checks_arguments
@@ -393,7 +400,7 @@ class Formations(Travel):
         return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
-        """Check a formation and its leader; return the leader and the followers."""
+        """Check a formation and its leader. Return the member that leads, and the members that follow."""
         for name in (leader, *formation.offsets):
             if name not in self.members:
                 raise InvalidArgument(
@@ -401,7 +408,8 @@ class Formations(Travel):
                 )
         if leader in formation.offsets:
             raise InvalidArgument(f"formation: {leader!r} is the leader and cannot have an offset")
-        min_m, closest_m = self._context.min_distance_m, formation.min_distance_m()
+        min_m = self._context.min_distance_m
+        closest_m = formation.min_distance_m()
         if min_m is not None and closest_m < min_m:
             raise InvalidArgument(
                 f"formation: two places are {closest_m:.1f} m apart; the minimum of this fleet is {min_m:g} m"

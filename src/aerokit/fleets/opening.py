@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack, contextmanager
 from functools import partial
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal
 
 import anyio
@@ -97,10 +98,10 @@ async def fleet(
         )
     if on_too_close not in ("hold", "report"):
         raise InvalidArgument(f"on_too_close = {on_too_close!r} is not allowed: it must be 'hold' or 'report'")
-    unknown = [group for group in on_error_by_group or {} if group and group not in (groups or {})]
-    if unknown:
-        allowed = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
-        raise InvalidArgument(f"on_error_by_group = {short_repr(unknown[0])} is not allowed: {allowed}")
+    for group in on_error_by_group or {}:
+        if group and group not in (groups or {}):  # members outside of all groups have the group ""
+            allowed = f"the groups are {', '.join(groups)}" if groups else "there are no groups"
+            raise InvalidArgument(f"on_error_by_group = {short_repr(group)} is not allowed: {allowed}")
     if count is not None and count < 1:
         raise InvalidArgument(f"count = {count} is not allowed: it must be 1 or more, or None")
     sources_by_name = _named_sources(sources)
@@ -115,19 +116,20 @@ async def fleet(
         searched = [name for name, source in sources_by_name.items() if not isinstance(source, Vehicle)]
         ids = await find_systems(
             {name: networks[name] for name in searched},
-            _requested_ids(system_ids, searched),
-            count,
-            len(members),
-            timeout,
+            requested=_requested_ids(system_ids, searched),
+            count=count,
+            passed_count=len(members),
+            timeout=timeout,
         )
+        systems: list[tuple[str, Connection, int]] = []
+        for name in searched:
+            systems += [(name, networks[name], system_id) for system_id in ids[name]]
         connections = MemberConnections(timeout, rates)
         stack.push_async_exit(connections.aclose)
-        connected = await connections.open(
-            [(name, networks[name], system_id) for name in searched for system_id in ids[name]]
-        )
-        members += [Member(f"{name}/{vehicle.system_id}", name, vehicle) for name, vehicle in connected]
+        for name, vehicle in await connections.open(systems):
+            members.append(Member(f"{name}/{vehicle.system_id}", name, vehicle))
         _check_names(members)
-        now = next(iter(networks.values())).now
+        now = next(iter(networks.values())).now  # the clock of the event loop, which all connections share
         context = FleetContext(members, networks, rules, now=now, on_error=_raise, min_distance_m=min_distance_m)
         _assign(context, groups or {}, "group")
         _assign(context, roles or {}, "role")
@@ -151,7 +153,7 @@ def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[s
                 raise InvalidArgument(f"sources: two sources are named {name!r}")
             sources_by_name[name] = entry
     if not sources_by_name:
-        raise InvalidArgument("sources is empty: a fleet needs at least one address, connection or vehicle")
+        raise InvalidArgument("a fleet needs at least one address, link, connection or vehicle")
     return sources_by_name
 
 
@@ -176,42 +178,41 @@ def _requested_ids(
 ) -> dict[str, list[int] | None]:
     """Return the requested system ids of each network; None for a network: all that are found."""
     ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - of a wider type
-    by_network: dict[str, Iterable[int]] = {}
     if isinstance(system_ids, Mapping):
-        by_network = {str(name): numbers for name, numbers in system_ids.items()}
+        for name, network_ids in system_ids.items():
+            if str(name) not in ids:
+                raise InvalidArgument(
+                    f"system_ids: {short_repr(name)} is not a network; networks: {', '.join(networks)}"
+                )
+            ids[str(name)] = list(network_ids)
     elif system_ids is not None:
-        ids = {name: list(system_ids) for name in networks}
-    for name, numbers in by_network.items():
-        if name not in ids:
-            raise InvalidArgument(f"system_ids: {short_repr(name)} is not a network; networks: {', '.join(networks)}")
-        ids[name] = list(numbers)
+        all_ids = list(system_ids)
+        ids = {name: list(all_ids) for name in networks}
     for requested in ids.values():
-        for number in requested or ():
-            if not isinstance(number, int) or not 1 <= number <= 255:
-                raise InvalidArgument(f"system_ids: {short_repr(number)} is not allowed: it must be 1 to 255")
+        for system_id in requested or ():
+            if not isinstance(system_id, int) or not 1 <= system_id <= 255:
+                raise InvalidArgument(f"system_ids: {short_repr(system_id)} is not allowed: it must be 1 to 255")
     return ids
 
 
 def _check_names(members: list[Member]) -> None:
-    seen: dict[str, Member] = {}
-    for member in members:
-        first_with_name = seen.setdefault(member.name, member)
-        if first_with_name is not member:
+    for member, other in combinations(members, 2):
+        if member.name == other.name:
             raise InvalidArgument(f"two vehicles are named {member.name!r}: pass a mapping with different names")
-        for other in members:
-            if other is not member and other.vehicle is member.vehicle:
-                raise InvalidArgument(f"{member.name!r} and {other.name!r} are the same vehicle")
+        if member.vehicle is other.vehicle:
+            raise InvalidArgument(f"{member.name!r} and {other.name!r} are the same vehicle")
 
 
 def _assign(context: FleetContext, patterns_by_name: Mapping[str, Iterable[str]], attribute: str) -> None:
     """Set the attribute ``group`` or ``role`` of the members that match each name's patterns."""
     for name, one_or_more in patterns_by_name.items():
         patterns = [one_or_more] if isinstance(one_or_more, str) else one_or_more
-        for member in context.matching(*patterns):
-            previous = getattr(context.members[member], attribute)
+        for member_name in context.matching(*patterns):
+            member = context.members[member_name]
+            previous = getattr(member, attribute)
             if previous:
-                raise InvalidArgument(f"member {member} has two {attribute}s: {previous!r} and {name!r}")
-            setattr(context.members[member], attribute, name)
+                raise InvalidArgument(f"member {member_name} has two {attribute}s: {previous!r} and {name!r}")
+            setattr(member, attribute, name)
 
 
 def _raise(error: Exception) -> None:
@@ -230,7 +231,7 @@ async def find_systems(
 ) -> dict[str, list[int]]:
     """Wait for vehicles; return the system ids to connect to, by network.
 
-    They are the requested ids or, without a request, all ids found that have no vehicle object yet.
+    These system ids are the requested ones or, without a request, all ids found that have no vehicle object yet.
 
     Args:
         networks: connections by name.
@@ -326,16 +327,16 @@ class MemberConnections:
         self._changed = asyncio.Event()
         self._close = asyncio.Event()
         self._has_block_failed = False
-        self._task_count = 0
+        self._running_task_count = 0
         self._all_closed = asyncio.Event()
 
     async def open(self, systems: Sequence[tuple[str, Connection, int]]) -> list[tuple[str, Vehicle]]:
         """Connect to all systems, given as tuples of network, connection and system id.
 
-        Returns the network and the vehicle of each system, in the same order.
+        Return the network and the vehicle of each system, in the same order.
         """
         for index, (network, connection, system_id) in enumerate(systems):
-            self._task_count += 1
+            self._running_task_count += 1
             self._tasks.start(partial(self._run, index, network, connection, system_id))
 
         def describe_missing() -> str:
@@ -360,9 +361,9 @@ class MemberConnections:
         """Close all vehicles, and wait until they are closed. The arguments are the exception of the fleet's block."""
         self._has_block_failed = error is not None
         self._close.set()
-        is_every_vehicle_connected = len(self._connected) == self._task_count
+        is_every_vehicle_connected = len(self._connected) == self._running_task_count
         # If a vehicle is not connected, opening has failed, and cancelling the tasks is enough.
-        if self._task_count and is_every_vehicle_connected:
+        if self._running_task_count and is_every_vehicle_connected:
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 
@@ -381,8 +382,8 @@ class MemberConnections:
         except _BlockFailed:
             pass
         finally:
-            self._task_count -= 1
-            if not self._task_count:
+            self._running_task_count -= 1
+            if not self._running_task_count:
                 self._all_closed.set()
 
     def _on_error(self, error: Exception) -> None:

@@ -132,8 +132,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
             if is_other_later or is_other_earlier:  # the vehicles never fly these legs at the same time
                 continue
             if _lower_bound(leg, other_leg) >= min(best.distance_m, below_m):
-                # These legs are at least `below_m` apart, which is the result unless other legs are closer.
-                if best.distance_m == math.inf:
+                if best.distance_m == math.inf:  # These legs are at least `below_m` apart; other legs may be closer.
                     best = Approach(below_m, start.t_s, other_start.t_s)
                 continue
             approach = _closest(leg, other_leg, slack_s)
@@ -153,7 +152,7 @@ def _flat_leg(start: LocalPoint, end: LocalPoint) -> Leg:
     """Return a leg between two points, with altitudes and times of 0."""
     north_m, east_m, _ = start
     end_north_m, end_east_m, _ = end
-    return PathPoint(0.0, north_m, east_m, 0.0), PathPoint(0.0, end_north_m, end_east_m, 0.0)
+    return PathPoint(0.0, north_m, east_m, up_m=0.0), PathPoint(0.0, end_north_m, end_east_m, up_m=0.0)
 
 
 def _lower_bound(leg: Leg, other: Leg) -> float:
@@ -179,15 +178,16 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
     With s and t from 0 to 1 along the legs, the squared distance is a convex function of both. The time condition
     cuts a strip out of the unit square of (s, t). The minimum is inside the resulting polygon or on its border.
     """
-    (begin, end), (other_begin, other_end) = leg, other
-    start, other_start = begin.place, other_begin.place
-    vector = [end.place[i] - start[i] for i in range(3)]
-    other_vector = [other_end.place[i] - other_start[i] for i in range(3)]
-    start_difference = [start[i] - other_start[i] for i in range(3)]
-    duration_s, other_duration_s = end.t_s - begin.t_s, other_end.t_s - other_begin.t_s
+    start, end = leg
+    other_start, other_end = other
+    vector = _difference(end.place, start.place)
+    other_vector = _difference(other_end.place, other_start.place)
+    start_difference = _difference(start.place, other_start.place)
+    duration_s = end.t_s - start.t_s
+    other_duration_s = other_end.t_s - other_start.t_s
 
     def time_difference(s: float, t: float) -> float:
-        return (begin.t_s + s * duration_s) - (other_begin.t_s + t * other_duration_s)
+        return (start.t_s + s * duration_s) - (other_start.t_s + t * other_duration_s)
 
     def difference(s: float, t: float) -> list[float]:
         return [start_difference[i] + s * vector[i] - t * other_vector[i] for i in range(3)]
@@ -208,7 +208,7 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
         s, t = _closest_on_edge(corner, previous, difference(*corner), difference(*previous))
         distance = math.hypot(*difference(s, t))
         if best is None or distance < best.distance_m:
-            best = Approach(distance, begin.t_s + s * duration_s, other_begin.t_s + t * other_duration_s)
+            best = Approach(distance, start.t_s + s * duration_s, other_start.t_s + t * other_duration_s)
     return best
 
 
@@ -220,12 +220,14 @@ def _closest_inside(
     At the closest points, the derivatives of the squared distance with respect to s and t are 0.
     """
     # Dot products of a (`vector`), b (`other_vector`) and d (`start_difference`).
-    aa, bb, ab = _dot(vector, vector), _dot(other_vector, other_vector), _dot(vector, other_vector)
+    aa, bb = _dot(vector, vector), _dot(other_vector, other_vector)
+    ab = _dot(vector, other_vector)
     determinant = aa * bb - ab * ab
     if determinant <= TOLERANCE * max(aa * bb, TOLERANCE):  # the lines are parallel, or a leg has no length
         return None
     da, db = _dot(start_difference, vector), _dot(start_difference, other_vector)
-    s, t = (ab * db - bb * da) / determinant, (aa * db - ab * da) / determinant
+    s = (ab * db - bb * da) / determinant
+    t = (aa * db - ab * da) / determinant
     return (s, t) if 0 <= s <= 1 and 0 <= t <= 1 else None
 
 
@@ -254,11 +256,18 @@ def _closest_on_edge(
 
     ``difference`` and ``other_difference`` are the difference vectors at the corners of the edge.
     """
-    step = [q - p for p, q in zip(difference, other_difference, strict=True)]
+    step = _difference(other_difference, difference)
     squared_length = _dot(step, step)
-    fraction = 0.0 if squared_length == 0 else min(1.0, max(0.0, -_dot(difference, step) / squared_length))
-    (s, t), (other_s, other_t) = corner, other_corner
+    fraction = 0.0
+    if squared_length > 0:
+        fraction = min(1.0, max(0.0, -_dot(difference, step) / squared_length))
+    s, t = corner
+    other_s, other_t = other_corner
     return s + fraction * (other_s - s), t + fraction * (other_t - t)
+
+
+def _difference(point: Sequence[float], other: Sequence[float]) -> list[float]:
+    return [a - b for a, b in zip(point, other, strict=True)]
 
 
 def _dot(vector: Sequence[float], other: Sequence[float]) -> float:

@@ -80,21 +80,22 @@ class PolicyRules:
         if isinstance(decision, str) and decision in ORDERS:
             return dict.fromkeys(failure.others, ORDERS[decision])
         if not isinstance(decision, Mapping):
-            raise self._invalid_decision(decision)
-        for name in decision:
+            raise InvalidArgument(
+                f"the policy function returned {short_repr(decision)}: allowed are {', '.join(get_args(PolicyName))},"
+                f" None, or a mapping of member names to orders"
+            )
+        for name, order in decision.items():
             if name not in failure.others:
-                raise self._invalid_decision(name)
-        for order in decision.values():
+                raise InvalidArgument(
+                    f"the policy function returned an order for {short_repr(name)}, to which the policy cannot send"
+                    f" orders; allowed are {', '.join(failure.others) or 'none'}"
+                )
             if order not in get_args(PolicyOrder):
-                raise self._invalid_decision(str(order))
+                raise InvalidArgument(
+                    f"the policy function returned the order {short_repr(order)} for {name}: allowed are"
+                    f" {', '.join(get_args(PolicyOrder))}"
+                )
         return dict(decision)
-
-    @staticmethod
-    def _invalid_decision(returned: object) -> InvalidArgument:
-        return InvalidArgument(
-            f"the policy function returned {short_repr(returned)}: allowed are {', '.join(get_args(PolicyName))}, or a"
-            f" mapping of other members to {', '.join(get_args(PolicyOrder))}"
-        )
 
 
 class FleetResult(Mapping[str, Any]):
@@ -142,7 +143,7 @@ class FleetResult(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         parts = [f"{len(self) - len(self.failed) - len(self.stopped)} of {len(self)} done"]
-        parts += [f"failed: {', '.join(self.failed)}"] if self.failed else []
-        parts += [f"stopped: {', '.join(self.stopped)}"] if self.stopped else []
-        parts += [f"skipped: {', '.join(self.skipped)}"] if self.skipped else []
+        for label, names in (("failed", self.failed), ("stopped", self.stopped), ("skipped", self.skipped)):
+            if names:
+                parts.append(f"{label}: {', '.join(names)}")
         return f"<FleetResult of {self.action}: {'; '.join(parts)}>"

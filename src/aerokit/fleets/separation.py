@@ -115,26 +115,29 @@ def separate_by_altitude(
         return Deconfliction("refused", reason, min_distance_m, conflicts)
     # The lowest layer is at the highest start or target, so that every vehicle climbs to its layer.
     lowest_m = max(max(_altitude_m(route.start), _altitude_m(route.target)) for route in routes)
-    layers: dict[str, int] = {}
-    # Each route gets the lowest layer that no crossing route uses and no stationary vehicle blocks.
-    for route in routes:
-        used_layers = {
-            layers[earlier.name]
-            for earlier in routes
-            if earlier.name in layers and _paths_cross(earlier, route, min_distance_m)
-        }
-        layer, height_m = 0, lowest_m
-        while layer in used_layers or _is_layer_blocked(route, stationary, height_m, min_distance_m):
-            layer += 1
-            height_m = lowest_m + layer * min_distance_m
-        layers[route.name] = layer
-    heights = {name: lowest_m + layer * min_distance_m for name, layer in layers.items()}
+    heights = _layer_heights(routes, stationary, lowest_m, min_distance_m)
     highest = max(heights.values())
     if highest > max_altitude_m:
         reason = f"the paths cross, and the layers would reach {highest:.0f} m, above {max_altitude_m:.0f} m"
         return Deconfliction("refused", reason, min_distance_m, conflicts)
-    reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(layers.values()))} layers"
+    reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(heights.values()))} layers"
     return Deconfliction("layers", reason, min_distance_m, conflicts, heights_m=heights)
+
+
+def _layer_heights(
+    routes: Sequence[Route], stationary: Mapping[str, LocalPoint], lowest_m: float, min_distance_m: float
+) -> dict[str, float]:
+    """Return the height of each route: the lowest layer that no crossing route and no stationary vehicle blocks."""
+    heights: dict[str, float] = {}
+    for route in routes:
+        earlier_routes = [earlier for earlier in routes if earlier.name in heights]
+        used = {heights[earlier.name] for earlier in earlier_routes if _paths_cross(earlier, route, min_distance_m)}
+        layer, height_m = 0, lowest_m
+        while height_m in used or _is_layer_blocked(route, stationary, height_m, min_distance_m):
+            layer += 1
+            height_m = lowest_m + layer * min_distance_m
+        heights[route.name] = height_m
+    return heights
 
 
 def separate_by_time(
@@ -160,10 +163,11 @@ def separate_by_time(
     if not conflicts:
         return Deconfliction("clear", "no paths come too close", min_distance_m)
     resting_paths = _resting_paths(stationary)
-    sequence, refusal = list(routes), ""
+    refusal = ""
+    sequence = list(routes)
     for _ in routes:  # at most one try for each route
         delays, blocked_route, blocker = _delays(
-            sequence, resting_paths, min_distance_m, speed_m_s, slack_s, max_delay_s
+            sequence, resting_paths, min_distance_m, speed_m_s, slack_s=slack_s, max_delay_s=max_delay_s
         )
         if blocked_route is None:
             delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
@@ -182,7 +186,7 @@ def _conflicts(
     """Return the conflicts of routes with each other and with stationary vehicles, regardless of time."""
     _check_distance(min_distance_m)
     # Times are ignored here, so the paths can have any speed.
-    paths = [Path.straight(route.name, route.start, route.target, 1.0) for route in routes]
+    paths = [Path.straight(route.name, route.start, route.target, speed_m_s=1.0) for route in routes]
     conflicts = list(find_conflicts(paths, min_distance_m))
     resting_paths = _resting_paths(stationary)
     for path in paths:
@@ -202,6 +206,7 @@ def _delays(
     resting_paths: Sequence[Path],
     min_distance_m: float,
     speed_m_s: float,
+    *,
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
@@ -214,7 +219,7 @@ def _delays(
     for route in sequence:
         delay_s = 0.0
         while True:
-            path = Path.straight(route.name, route.start, route.target, speed_m_s, delay_s)
+            path = Path.straight(route.name, route.start, route.target, speed_m_s, at_s=delay_s)
             blocker = _find_blocker(path, [*delayed_paths, *resting_paths], min_distance_m, slack_s)
             if blocker is None:
                 break
@@ -237,7 +242,7 @@ def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPo
             for other, other_point in {**points, **obstacles}.items():
                 distance = math.dist(point[:2], other_point[:2])
                 if other != name and distance < min_distance_m:
-                    return f"the {end} of {name} is {distance:.1f} m from that of {other} horizontally: too close"
+                    return f"the {end} of {name} is horizontally {distance:.1f} m from that of {other}: too close"
     return ""
 
 
@@ -262,8 +267,10 @@ def _is_layer_blocked(
 
 
 def _find_blocker(path: Path, others: Sequence[Path], min_distance_m: float, slack_s: float) -> str | None:
+    """Return the name of the first of the other paths that the path comes too close to; None if there is none."""
     for other in others:
-        if min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m).distance_m < min_distance_m:
+        approach = min_path_distance(path, other, slack_s=slack_s, below_m=min_distance_m)
+        if approach.distance_m < min_distance_m:
             return other.name
     return None
 

@@ -83,7 +83,7 @@ class Show(Snapshot):
         parsed: dict[str, Path] = {}
         for name, points in tracks.items():
             try:
-                parsed[name] = Path(name, [PathPoint(*map(float, row)) for row in points])
+                parsed[name] = Path(name, [PathPoint(*map(float, point)) for point in points])
             except (TypeError, ValueError) as error:
                 raise InvalidArgument(f"track {name!r}: {error}") from None
         return cls(parsed)
@@ -137,7 +137,9 @@ class Show(Snapshot):
             raise InvalidArgument(f"the text is not JSON: {error}") from None
         tracks = data.get("tracks") if isinstance(data, dict) else None
         if not isinstance(tracks, dict) or (data.get("format"), data.get("version")) != (FORMAT, VERSION):
-            raise InvalidArgument(f"the JSON text is not {FORMAT!r} of version {VERSION}")
+            raise InvalidArgument(
+                f'the JSON text is not a show: its "format" must be "{FORMAT}", its "version" {VERSION}'
+            )
         return cls.from_points(tracks)
 
     def to_csv(self) -> str:
@@ -161,7 +163,7 @@ class Show(Snapshot):
     def _check(self) -> None:
         object.__setattr__(self, "tracks", dict(self.tracks))  # a copy; this object is immutable otherwise
         if not self.tracks:
-            raise InvalidArgument("tracks is empty: a show needs at least one track")
+            raise InvalidArgument("a show needs at least one track")
         for name, track in self.tracks.items():
             if not isinstance(track, Path) or track.begins_at_s < 0:
                 raise InvalidArgument(f"tracks[{name!r}] must be a Path that begins at 0 s or later")
@@ -183,7 +185,7 @@ def state_at(path: Path, at_s: float) -> tuple[LocalPoint, LocalPoint]:
     fraction = (at_s - start.t_s) / duration_s
     vector = [b - a for a, b in zip(start.place, end.place, strict=True)]
     place = tuple(a + fraction * d for a, d in zip(start.place, vector, strict=True))
-    velocity = vector[0] / duration_s, vector[1] / duration_s, vector[2] / duration_s
+    velocity = tuple(d / duration_s for d in vector)
     return place, velocity  # type: ignore[return-value]
 
 

@@ -99,7 +99,9 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
         if frame is None or sent_at is None or not is_answer or frame.component_id != vehicle.component_id:
             return
         round_trip_s = frame.received_at - sent_at
-        measurements.append((round_trip_s, message.tc1 / 1e9 - (sent_at + round_trip_s / 2)))
+        answered_at = sent_at + round_trip_s / 2  # if both directions take the same time
+        offset_s = message.tc1 / 1e9 - answered_at
+        measurements.append((round_trip_s, offset_s))
 
     detach = connection.bus.attach(Timesync, on_timesync, system_id=vehicle.system_id)
     try:
@@ -107,7 +109,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
             now = connection.now()
             timestamp = int(now * 1e9) | 1  # odd, so that it usually differs from the link's own requests
             sent_at_by_timestamp[timestamp] = now
-            connection.send(Timesync(0, timestamp), to=vehicle.system_id)
+            connection.send(Timesync(tc1=0, ts1=timestamp), to=vehicle.system_id)
             await anyio.sleep(TIMESYNC_INTERVAL_S)
         deadline = connection.now() + TIMESYNC_TIMEOUT_S
         while sent_at_by_timestamp and not measurements and connection.now() < deadline:
@@ -118,7 +120,7 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
     if not measurements:
         raise OperationTimeout(f"the vehicle did not answer TIMESYNC; {vehicle.describe_link()}")
     round_trip_s, offset_s = min(measurements)  # the measurement with the shortest round trip is the most accurate
-    return ClockOffset(offset_s, round_trip_s, len(measurements))
+    return ClockOffset(offset_s, round_trip_s, answers=len(measurements))
 
 
 # ------------------------------------------------------------------------------------------ report
@@ -162,7 +164,8 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
     """
     errors: list[float] = []
     # A lag causes an error vector of lag × velocity. The lag that fits best is sum(error · velocity) / sum(velocity²).
-    error_times_velocity = velocity_squared = 0.0
+    error_times_velocity = 0.0
+    velocity_squared = 0.0
     for at_s, point in samples:
         planned, velocity = state_at(path, at_s)
         error = [p - q for p, q in zip(planned, point, strict=True)]
@@ -174,7 +177,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
         return TrackDeviation(max_m=math.nan, rms_m=math.nan, lag_s=None, samples=0)
     rms = math.sqrt(sum(error * error for error in errors) / len(errors))
     lag_s = error_times_velocity / velocity_squared if velocity_squared else None
-    return TrackDeviation(max(errors), rms, lag_s, len(errors))
+    return TrackDeviation(max_m=max(errors), rms_m=rms, lag_s=lag_s, samples=len(errors))
 
 
 def max_relative_error(
@@ -182,11 +185,11 @@ def max_relative_error(
 ) -> float | None:
     """Return the largest error of the vector from one vehicle to another in metres; None for fewer than two vehicles.
 
-    It is computed at 61 times of the show, with positions that are interpolated between samples.
+    The errors are computed at 61 times of the show, with positions that are interpolated between samples.
     """
     largest_m: float | None = None
-    for number in range(RELATIVE_ERROR_SAMPLES + 1):
-        at_s = duration_s * number / RELATIVE_ERROR_SAMPLES
+    for index in range(RELATIVE_ERROR_SAMPLES + 1):
+        at_s = duration_s * index / RELATIVE_ERROR_SAMPLES
         errors: list[LocalPoint] = []
         for name, path in paths.items():
             point = _interpolate(samples.get(name, ()), at_s)
@@ -201,7 +204,8 @@ def max_relative_error(
 
 def _difference(point: LocalPoint, other: LocalPoint) -> LocalPoint:
     """Return the vector to a point from another point."""
-    return point[0] - other[0], point[1] - other[1], point[2] - other[2]
+    north, east, up = (a - b for a, b in zip(point, other, strict=True))
+    return north, east, up
 
 
 def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> LocalPoint | None:
@@ -209,11 +213,8 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
     for (start_s, start), (end_s, end) in pairwise(samples):
         if start_s <= at_s <= end_s:
             fraction = 0.0 if end_s == start_s else (at_s - start_s) / (end_s - start_s)
-            return (
-                start[0] + fraction * (end[0] - start[0]),
-                start[1] + fraction * (end[1] - start[1]),
-                start[2] + fraction * (end[2] - start[2]),
-            )
+            north, east, up = (a + fraction * (b - a) for a, b in zip(start, end, strict=True))
+            return north, east, up
     return None
 
 
@@ -307,7 +308,8 @@ class Shows(Travel):
             InvalidArgument: a track has no member.
             ValueUnknownError: the position of the first member is unknown.
         """
-        return self._start_positions(show, *self._local_origin(show, origin))
+        local_origin, origin_amsl_m = self._local_origin(show, origin)
+        return self._start_positions(show, local_origin, origin_amsl_m)
 
     async def fly_show(
         self,
@@ -346,29 +348,33 @@ class Shows(Travel):
         names = tuple(show.tracks)
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
-        arrived = await self.go_to(self._start_positions(show, local_origin, origin_amsl_m), speed_m_s=speed_m_s)
+        start_positions = self._start_positions(show, local_origin, origin_amsl_m)
+        arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         begin_at = self._context.now() + start_in_s
+        recorders: dict[str, TrackRecorder] = {}
         with ExitStack() as stack:
-            recorders = {
-                name: stack.enter_context(
-                    TrackRecorder(self.members[name].vehicle, clocks[name], local_origin, begin_at, origin_amsl_m)
-                )
-                for name in names
-            }
+            for name in names:
+                vehicle = self.members[name].vehicle
+                recorder = TrackRecorder(vehicle, clocks[name], local_origin, begin_at, origin_amsl_m)
+                recorders[name] = stack.enter_context(recorder)
 
             async def fly(member: Member) -> None:
                 track, recorder = show.tracks[member.name], recorders[member.name]
-                await _fly_track(member, track, recorder, begin_at, rate_hz, lead_s or 0.0)
+                await _fly_track(member, track, recorder, begin_at, rate_hz=rate_hz, lead_s=lead_s or 0.0)
 
             result = await self._run("show", fly, names=names)
         samples = {name: recorder.samples for name, recorder in recorders.items()}
         tracks = {name: track_deviation(path, samples[name]) for name, path in show.tracks.items()}
         lags = [track.lag_s for track in tracks.values() if track.lag_s is not None]
         offsets = {name: offset for name, offset in clocks.items() if isinstance(offset, ClockOffset)}
-        spread_s = max(lags) - min(lags) if lags else None
-        relative_m = max_relative_error(show.tracks, samples, show.duration_s)
-        return ShowReport(result, tracks, offsets, spread_s, relative_m)
+        return ShowReport(
+            result=result,
+            tracks=tracks,
+            clocks=offsets,
+            lag_spread_s=max(lags) - min(lags) if lags else None,
+            max_relative_error_m=max_relative_error(show.tracks, samples, show.duration_s),
+        )
 
     # --------------------------------------------------------------------------------------- private
 
@@ -410,7 +416,7 @@ class Shows(Travel):
 
 
 async def _fly_track(
-    member: Member, path: Path, recorder: TrackRecorder, begin_at: float, rate_hz: float, lead_s: float
+    member: Member, path: Path, recorder: TrackRecorder, begin_at: float, *, rate_hz: float, lead_s: float
 ) -> None:
     """Fly a member along its path, from the current time until the end of the path."""
     vehicle, period_s = member.vehicle, 1 / rate_hz

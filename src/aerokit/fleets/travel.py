@@ -151,15 +151,21 @@ class Travel(SelectionBase):
         if separation is None and self._context.min_distance_m is not None:
             separation = self.plan_separation(targets, speed_m_s=speed_m_s)
         if separation is None or separation.decision == "clear":
-            return await self._fly_to(action, targets, speed_m_s, timeout, max_distance_m, names, stagger_s=stagger_s)
+            return await self._fly_to(
+                action, targets, speed_m_s, timeout, max_distance_m=max_distance_m, names=names, stagger_s=stagger_s
+            )
         if separation.decision == "refused":
             raise OperationRejected(f"{action}: {separation.reason}; nothing was sent")
         if separation.decision == "corridors":
             if stagger_s:
                 raise InvalidArgument(f"{action}: stagger_s would change the delays of corridors; nothing was sent")
-            return await self._fly_to(action, targets, speed_m_s, timeout, max_distance_m, names, corridors=separation)
+            return await self._fly_to(
+                action, targets, speed_m_s, timeout, max_distance_m=max_distance_m, names=names, corridors=separation
+            )
         heights_m = separation.heights_m
-        result = await self._fly_in_layers(action, targets, speed_m_s, timeout, heights_m, max_distance_m)
+        result = await self._fly_in_layers(
+            action, targets, speed_m_s, timeout, heights_m=heights_m, max_distance_m=max_distance_m
+        )
         without_layer = [self.members[name] for name in names or targets if name not in heights_m]
         result.skipped |= {
             member.name: "the separation was planned without it" if member.is_available else member.status
@@ -210,21 +216,20 @@ class Travel(SelectionBase):
         targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
+        *,
         max_distance_m: float,
         names: tuple[str, ...] = (),
-        *,
         stagger_s: float | None = None,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
         """Fly members straight to their targets; in corridors, each member starts after its delay."""
 
         async def fly(member: Member) -> None:
-            delay_s = corridors.delays_s.get(member.name, 0.0) if corridors else 0.0
-            if delay_s:
-                late_s = await wait_to_start(member, delay_s, action)
-                if corridors and late_s > corridors.slack_s:
+            if corridors is not None and corridors.delays_s.get(member.name):
+                late_s = await wait_to_start(member, corridors.delays_s[member.name], action)
+                if late_s > corridors.slack_s:
                     raise OperationRejected(
-                        f"{action}: {member.name} would start {late_s:.1f} s late in its corridor; it stays"
+                        f"{action}: {member.name} would start {late_s:.1f} s late, so it stays where it is"
                     )
             await member.vehicle.go_to(
                 targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
@@ -238,6 +243,7 @@ class Travel(SelectionBase):
         targets: Mapping[str, Position],
         speed_m_s: float | None,
         timeout: float | None,
+        *,
         heights_m: Mapping[str, float],
         max_distance_m: float,
     ) -> FleetResult:
@@ -254,7 +260,7 @@ class Travel(SelectionBase):
                     f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
                     " layers"
                 )
-            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m)
+            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m=max_distance_m)
             if not result.is_complete:
                 break
         assert result is not None
@@ -407,10 +413,11 @@ class Missions(SelectionBase):
                 raise InvalidArgument(
                     f"missions: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
                 )
-            member = members[name] = self.members[name]
+            member = self.members[name]
             member.refresh()
             if not member.is_available:
                 raise OperationRejected(f"missions: {name} is {member.status}; nothing was sent")
+            members[name] = member
         return members
 
 
@@ -420,5 +427,6 @@ def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path
     for item in mission:
         position = item.position
         if position is not None and not math.isnan(position.latitude_deg):
-            points.append(PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position))))
+            north_m, east_m, up_m = origin.to_local(position, altitude_amsl(member, position))
+            points.append(PathPoint(0.0, north_m, east_m, up_m))
     return Path(member.name, points) if points else None

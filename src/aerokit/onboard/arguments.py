@@ -132,4 +132,4 @@ def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandA
         raise InvalidArgument(
             f"{function_name}(): argument {name} would be parameter {number}, but a command has seven parameters"
         )
-    return CommandArgument(name, number, hint, is_optional, allowed)
+    return CommandArgument(name, number, type=hint, is_optional=is_optional, range=allowed)

@@ -67,9 +67,12 @@ class AutopilotDriver:
 
 
 def add_autopilot(
-    services: ComponentServices, driver: AutopilotDriver, report: Callable[[bool | None, int | None], None]
+    services: ComponentServices, driver: AutopilotDriver, set_flight_state: Callable[[bool | None, int | None], None]
 ) -> None:
-    """Serve the commands of a vehicle. ``report(armed, custom_mode)`` changes the heartbeat; None changes nothing."""
+    """Serve the commands of a vehicle.
+
+    ``set_flight_state(is_armed, custom_mode)`` changes the heartbeat. A value of None stays unchanged.
+    """
 
     async def call(name: str, *arguments: object) -> None:
         if not overrides(driver, AutopilotDriver, name):
@@ -81,11 +84,11 @@ def add_autopilot(
     async def arm_disarm(_: CommandRequest, is_armed: bool, force: float | None) -> None:
         is_forced = force == FORCE or (is_armed and force == FORCE_ARM)
         await call("arm" if is_armed else "disarm", is_forced)
-        report(is_armed, None)
+        set_flight_state(is_armed, None)
 
     async def set_mode(_: CommandRequest, base_mode: float | None, custom_mode: int) -> None:
         await call("set_mode", custom_mode)
-        report(None, custom_mode)
+        set_flight_state(None, custom_mode)
 
     async def take_off(request: CommandRequest) -> None:
         *_, altitude_m = request.params

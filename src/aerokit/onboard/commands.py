@@ -58,11 +58,11 @@ class CommandRequest:
     @property
     def params(self) -> tuple[float, ...]:
         """Parameters 1 to 7; positions are in degrees for COMMAND_LONG and COMMAND_INT."""
-        numbers = list(self._command.params)
+        *params, x, y, z = self._command.params
         # COMMAND_INT has latitude and longitude in 1e-7 degrees, but other values in the frames excluded here.
         if self._command.frame is not None and self._command.frame not in (MavFrame.MISSION, MavFrame.LOCAL_NED):
-            numbers[4:6] = (number / 1e7 for number in numbers[4:6])
-        return tuple(numbers)
+            x, y = x / 1e7, y / 1e7
+        return (*params, x, y, z)
 
     @property
     def position(self) -> Position:
@@ -72,7 +72,7 @@ class CommandRequest:
             InvalidArgument: latitude or longitude is missing or out of range, or the frame is not global.
         """
         frame = self._command.altitude_frame
-        latitude, longitude, altitude = self.params[4:]
+        *_, latitude, longitude, altitude = self.params
         altitude_m = altitude if math.isfinite(altitude) else None
         if frame in _AMSL_FRAMES:
             return Position(latitude, longitude, altitude_amsl_m=altitude_m)
@@ -96,7 +96,7 @@ def outcome_of(value: object) -> Outcome:
     if value is None or value is True:
         return Outcome(MavResult.ACCEPTED)
     if isinstance(value, CommandResult):
-        return Outcome(value.result, value.progress, value.detail)
+        return Outcome(value.result, progress=value.progress, detail=value.detail)
     if isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
         return Outcome(int(value))
     return Outcome(MavResult.FAILED)

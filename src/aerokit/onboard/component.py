@@ -149,7 +149,9 @@ class OnboardComponent:
         if state not in MavState.__members__.values():
             raise InvalidArgument(f"state = {state} is not allowed: it must be a MAV_STATE (0 to 8)")
         old = self._heartbeat
-        heartbeat = m.Heartbeat(old.type, old.autopilot, base_mode, custom_mode, state, MAVLINK_VERSION)
+        heartbeat = m.Heartbeat(
+            old.type, old.autopilot, base_mode, custom_mode, system_status=state, mavlink_version=MAVLINK_VERSION
+        )
         heartbeat.encode()  # Raises InvalidArgument before the old heartbeat is replaced.
         self._heartbeat = heartbeat
         self._host.send(heartbeat)

@@ -171,7 +171,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
             return answer
         if not 0 < answer <= MAX_AUTHORIZATION_S:
             raise ValueError(
-                f"the authorizer returned {answer!r}; it must be above 0 and at most {MAX_AUTHORIZATION_S} s"
+                f"the authorizer returned {answer!r}; it must return seconds, above 0 and at most {MAX_AUTHORIZATION_S}"
             )
         # The standard puts the seconds into `progress`; PX4 reads them from `result_param2` (ArmAuthorization.cpp).
         return CommandResult(MavResult.ACCEPTED, progress=math.ceil(answer), detail=math.ceil(answer))

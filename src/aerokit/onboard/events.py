@@ -39,21 +39,20 @@ class EventSender:
             raise InvalidArgument(f"event_id = {event_id} is not allowed: it must be 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:
             raise InvalidArgument(
-                f"arguments has {len(arguments)} bytes; at most {MAX_ARGUMENT_BYTES} fit into the message"
+                f"the arguments of the event have {len(arguments)} bytes; at most {MAX_ARGUMENT_BYTES} fit into EVENT"
             )
         check_severity(severity)
         is_first = self._sequence < 0
         self._sequence = (self._sequence + 1) & 0xFFFF
         levels = severity << 4 | severity  # four bits for logs and four bits for other programs
-        time_ms, data = self._host.time_boot_ms, bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0")
         event = m.Event(
             destination_component=0,  # all components
             destination_system=0,
             id=event_id,
-            event_time_boot_ms=time_ms,
+            event_time_boot_ms=self._host.time_boot_ms,
             sequence=self._sequence,
             log_levels=levels,
-            arguments=data,
+            arguments=bytes(arguments).ljust(MAX_ARGUMENT_BYTES, b"\0"),
         )
         self._sent.append(event)
         self._host.send(event)
@@ -76,7 +75,7 @@ class EventSender:
         if not stored:
             oldest = self._sent[0].sequence if self._sent else 0
             system, component = channel
-            error = m.ResponseEventError(system, component, request.first_sequence, oldest, _UNAVAILABLE)
+            error = m.ResponseEventError(system, component, request.first_sequence, oldest, reason=_UNAVAILABLE)
             self._host.send(error, channel)
 
 
@@ -86,13 +85,17 @@ def answer_pings(host: ComponentHost) -> None:
     def on_ping(ping: m.Ping, channel: Channel) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # A PING with a target is an answer.
             sender_system, sender_component = channel
-            host.send(m.Ping(ping.time_usec, ping.seq, sender_system, sender_component), channel)
+            answer = m.Ping(ping.time_usec, ping.seq, target_system=sender_system, target_component=sender_component)
+            host.send(answer, channel)
 
     def on_timesync(message: m.Timesync, channel: Channel) -> None:
         if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
             own_time_ns = int(host.now * 1e9)
             sender_system, sender_component = channel
-            host.send(m.Timesync(own_time_ns, message.ts1, sender_system, sender_component), channel)
+            answer = m.Timesync(
+                tc1=own_time_ns, ts1=message.ts1, target_system=sender_system, target_component=sender_component
+            )
+            host.send(answer, channel)
 
     host.on(m.Ping, on_ping)
     host.on(m.Timesync, on_timesync)

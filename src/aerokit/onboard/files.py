@@ -171,6 +171,7 @@ class DirectoryFiles:
         self._writable(path).rmdir()
 
     def _writable(self, path: str) -> Path:
+        """Return the path below the root; raise FileFault unless clients may change it."""
         if not self._is_writable or path in self._memory:
             raise FileFault(EROFS)
         target = self._path(path)

@@ -63,12 +63,13 @@ class GimbalDriver:
     ) -> None:
         for name, (low, high) in (("roll_deg", roll_deg), ("pitch_deg", pitch_deg), ("yaw_deg", yaw_deg)):
             if not -360.0 <= low <= high <= 360.0:
-                raise InvalidArgument(f"{name} = ({low}, {high}) is not allowed: both must be −360 to 360, in order")
-        if not max_rate_deg_s > 0 or not 0 <= attitude_hz <= 100:
-            raise InvalidArgument(
-                f"max_rate_deg_s = {max_rate_deg_s}, attitude_hz = {attitude_hz} are not allowed: max_rate_deg_s must"
-                " be above 0, and attitude_hz 0 to 100"
-            )
+                raise InvalidArgument(
+                    f"{name} = ({low}, {high}) is not allowed: both must be −360 to 360, the lower first"
+                )
+        if not max_rate_deg_s > 0:
+            raise InvalidArgument(f"max_rate_deg_s = {max_rate_deg_s} is not allowed: it must be above 0")
+        if not 0 <= attitude_hz <= 100:
+            raise InvalidArgument(f"attitude_hz = {attitude_hz} is not allowed: it must be 0 to 100")
         self.vendor: str = vendor
         self.model: str = model
         self.limits_deg: tuple[tuple[float, float], ...] = (roll_deg, pitch_deg, yaw_deg)
@@ -152,7 +153,8 @@ class GimbalAdapter(GimbalMount):
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
         self._gimbal.point(target)
-        self.flags, self._is_yaw_locked = flags, target.yaw_locked
+        self.flags = flags
+        self._is_yaw_locked = target.yaw_locked
 
     def look_at(self, place: Place | None) -> None:
         if place is None:
@@ -162,9 +164,8 @@ class GimbalAdapter(GimbalMount):
             position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
         self._gimbal.look_at(position)
         self.flags: int = 0
-        self._is_yaw_locked = (
-            position is not None
-        )  # While the gimbal looks at a position, the vehicle does not turn it.
+        # While the gimbal looks at a position, turns of the vehicle do not turn the gimbal.
+        self._is_yaw_locked = position is not None
         self._followed_system_id = 0
 
     def follow(self, system_id: int) -> None:

@@ -121,9 +121,10 @@ class ComponentHost:
             return
         self._text_id = self._text_id % 0xFFFF + 1
         for number, start in enumerate(range(0, len(text), CHUNK_SIZE)):
-            self.send(m.Statustext(severity, text[start : start + CHUNK_SIZE], self._text_id, number))
+            chunk = text[start : start + CHUNK_SIZE]
+            self.send(m.Statustext(severity, chunk, id=self._text_id, chunk_seq=number))
         if len(text) % CHUNK_SIZE == 0:  # A full chunk does not end the text, so an empty chunk must follow.
-            self.send(m.Statustext(severity, "", self._text_id, len(text) // CHUNK_SIZE))
+            self.send(m.Statustext(severity, "", id=self._text_id, chunk_seq=len(text) // CHUNK_SIZE))
 
     def report_error(self, subject: str, error: Exception) -> None:
         """Send an exception of the program's code as a status text, and log it unless it is an AerokitError."""

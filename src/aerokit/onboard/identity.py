@@ -38,7 +38,7 @@ class Identity(Snapshot):
     uid: int = 0
 
     def _check(self) -> None:
-        # The sizes of the fields in COMPONENT_INFORMATION_BASIC.
+        # The texts must fit into the fields of COMPONENT_INFORMATION_BASIC.
         for name, size in (("vendor", 32), ("model", 32), ("version", 24), ("hardware_version", 24)):
             value = getattr(self, name)
             if not isinstance(value, str) or len(value.encode()) > size:
@@ -121,7 +121,8 @@ class IdentityMessages:
         if not self.metadata:
             return []
         checksum = self.update_files()
-        return [m.ComponentMetadata(self._host.time_boot_ms, checksum, f"mftp://{GENERAL_PATH}")]
+        uri = f"mftp://{GENERAL_PATH}"
+        return [m.ComponentMetadata(time_boot_ms=self._host.time_boot_ms, file_crc=checksum, uri=uri)]
 
     def add_metadata(self, kind: CompMetadataType, path: str, content: Callable[[], bytes]) -> None:
         """Serve a metadata file. ``content()`` returns its content; it is called again for each COMPONENT_METADATA."""

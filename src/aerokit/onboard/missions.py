@@ -83,7 +83,7 @@ class ComponentMissions:
             InvalidArgument: there is no such item.
         """
         if not 0 <= index < len(self.items()):
-            raise InvalidArgument(f"index = {index} is not allowed: it must be 0 to {len(self.items()) - 1}")
+            raise InvalidArgument(f"index = {index} is not allowed: the mission has {len(self.items())} items")
         self._server.current = index
         self._host.send(self._server.current_message())
 

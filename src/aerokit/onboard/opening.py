@@ -87,7 +87,9 @@ async def component(
     """
     heartbeat = _heartbeat(type, autopilot)
     if not 1 <= system_id <= 255 or not 1 <= component_id <= 255:
-        raise InvalidArgument(f"system_id, component_id = {system_id}, {component_id} are not allowed: 1 to 255 each")
+        raise InvalidArgument(
+            f"system_id, component_id = {system_id}, {component_id} are not allowed: both must be 1 to 255"
+        )
     if (address is None) == (connection is None):
         raise InvalidArgument("pass either an address or connection=…")
     link_arguments = (baud, mavlink_version, record, reconnect, peers, may_move, signing)

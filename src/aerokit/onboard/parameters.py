@@ -40,7 +40,10 @@ class _Row:
     """One parameter: its metadata, type, default, value, and the function that may refuse a value."""
 
     def __init__(self, metadata: ParameterMetadata, type_: MavParamExtType, default: ParameterValue) -> None:
-        self.metadata, self.type, self.default, self.value = metadata, type_, default, default
+        self.metadata = metadata
+        self.type = type_
+        self.default = default
+        self.value = default
         self.on_set: OnSet | None = None
 
 
@@ -120,7 +123,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             read_only=read_only,
         )
         row = _Row(metadata, _TYPES[type(default)], default)
-        row.value = row.default = self._checked(row, default)
+        row.default = self._checked(row, default)
+        row.value = row.default
         row.on_set = on_set
         if name in self._stored and not read_only:
             try:
@@ -175,7 +179,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         """Return the value in the parameter's type; raise InvalidArgument if it is not allowed."""
         metadata, name = row.metadata, row.metadata.name
         if isinstance(value, bool):
-            raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a number")
+            raise InvalidArgument(f"{name} = {value!r} is not allowed: a parameter cannot be a bool")
         checked = checked_setting(name, value, row.type)
         if isinstance(checked, str):
             return checked
@@ -193,6 +197,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return checked
 
     def _store(self, name: str, value: ParameterValue) -> None:
+        """Store a checked value. If it has changed, start to write the file, unless it is being written already."""
         row = self._rows[name]
         if settings_equal(row.value, value):
             return

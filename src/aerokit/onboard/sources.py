@@ -63,7 +63,7 @@ class ComponentSources:
                 f"min_m, max_m = {min_m}, {max_m} are not allowed: both must be 0 to 655, and min_m below max_m"
             )
         if not 0 < increment_deg <= 360:
-            raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: it must be above 0, at most 360")
+            raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: it must be above 0 and at most 360")
         nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
         values = [_centimetres(distance, nothing_in_range) for distance in distances_m]
         values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))

@@ -54,7 +54,7 @@ class AdaptiveWindow:
         return int(self._size)
 
     def widen(self, size: float) -> None:
-        """Raise the size to ``size``, because this many answers are known to fit into one round trip."""
+        """Raise the size to ``size`` or half of the maximum, because so many answers fit into one round trip."""
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
@@ -80,14 +80,16 @@ class AdaptiveWindow:
             self._loss = 0.5  # Below the limit, so that only further losses halve the size again.
 
 
-class _Block:
-    """Transmissions of the request for one block; ``last_number`` is the number of the latest one."""
+class _BlockRequest:
+    """The request for one block. All transmissions are numbered; ``transmission_number`` is that of its latest one."""
 
-    __slots__ = ("attempts", "last_number", "previous_sent_at", "sent_at")
+    __slots__ = ("attempts", "previous_sent_at", "sent_at", "transmission_number")
 
     def __init__(self) -> None:
-        self.attempts = self.last_number = 0
-        self.previous_sent_at = self.sent_at = 0.0
+        self.attempts = 0
+        self.transmission_number = 0
+        self.previous_sent_at = 0.0
+        self.sent_at = 0.0
 
 
 class BlockRequests:
@@ -103,8 +105,8 @@ class BlockRequests:
         self._burst_size = burst_size
         self._spacing_s = spacing_s
         self._waiting: dict[int, None] = {}
-        self._in_flight: dict[int, _Block] = {}  # in the order in which they were sent
-        self._blocks: dict[int, _Block] = {}
+        self._in_flight: dict[int, _BlockRequest] = {}  # in the order in which they were sent
+        self._blocks: dict[int, _BlockRequest] = {}
         self._sent_count = 0
         self._timeouts = 0
         self._busy_until = float("-inf")
@@ -159,9 +161,9 @@ class BlockRequests:
         self._round_trip.add_sample(now - sent_at)
         self.window.on_answer(now - sent_at)
         if block.attempts == 1:
-            self._requeue_overtaken(block.last_number)
+            self._requeue_overtaken(block.transmission_number)
 
-    def _sent_at_of_answer(self, block: _Block, now: float) -> float | None:
+    def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
         """Return the time of the transmission that was answered; None if it may be one of several."""
         if block.attempts == 1:
             return block.sent_at
@@ -189,19 +191,20 @@ class BlockRequests:
                 self._next_send_at = now + self._spacing_s
             offset = next(iter(self._waiting))
             del self._waiting[offset]
-            self._send(offset, now)
+            self._record_transmission(offset, now)
             due.append(offset)
         return due
 
-    def _due_at(self, block: _Block) -> float:
+    def _due_at(self, block: _BlockRequest) -> float:
+        """Return the time at which the answer to a request is overdue."""
         backoff_attempt = max(1, self._timeouts - TIMEOUTS_BEFORE_BACKOFF)
         return max(block.sent_at, self._busy_until) + self._round_trip.timeout_s(backoff_attempt)
 
-    def _send(self, offset: int, now: float) -> None:
+    def _record_transmission(self, offset: int, now: float) -> None:
         self._sent_count += 1
-        block = self._blocks.setdefault(offset, _Block())
+        block = self._blocks.setdefault(offset, _BlockRequest())
         block.attempts += 1
-        block.last_number = self._sent_count
+        block.transmission_number = self._sent_count
         block.previous_sent_at = block.sent_at
         block.sent_at = now
         self._in_flight[offset] = block
@@ -210,16 +213,17 @@ class BlockRequests:
         """Repeat the requests that were sent long before transmission ``number``, which was answered first."""
         overtaken = []
         for offset, block in self._in_flight.items():
-            if block.last_number > number - OVERTAKEN:
+            if block.transmission_number > number - OVERTAKEN:
                 break
             overtaken.append(offset)
         self._requeue(overtaken)
 
     def _requeue(self, offsets: list[int]) -> None:
+        """Record that these requests were lost, and queue them again, before all that wait."""
+        for offset in offsets:
+            del self._in_flight[offset]
+            self.window.on_loss()
         if offsets:
-            for offset in offsets:
-                del self._in_flight[offset]
-                self.window.on_loss()
             self._waiting = {**dict.fromkeys(offsets), **self._waiting}
 
 
@@ -300,8 +304,9 @@ class Reassembly:
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:
             length = self.block_size if self.end is None else min(self.block_size, self.end - offset)
-            if ranges and sum(ranges[-1]) == offset:  # The block follows the last range.
-                start, size_so_far = ranges[-1]
+            start, size_so_far = ranges[-1] if ranges else (offset, 0)
+            follows_last_range = bool(ranges) and start + size_so_far == offset
+            if follows_last_range:
                 ranges[-1] = (start, size_so_far + length)
             else:
                 ranges.append((offset, length))

@@ -31,7 +31,7 @@ __all__ = [
 MAX_ATTEMPTS = 4
 """Maximum number of transmissions of a command that may be repeated."""
 
-# Conditions in UNREPEATABLE_COMMANDS: index and value of a parameter.
+# A condition in UNREPEATABLE_COMMANDS has the index of a parameter, and the value that makes it true.
 _PARAM1_IS_0, _PARAM1_IS_1, _PARAM1_IS_2, _PARAM4_IS_1 = (0, 0.0), (0, 1.0), (0, 2.0), (3, 1.0)
 
 # Commands whose repetition has a further effect. Maps MAV_CMD to (effect, condition). If the condition is None, every
@@ -128,7 +128,8 @@ def command_long(
     _check_target(target_system, command)
     if len(params) > 7:
         raise InvalidArgument(f"{command_name(command)} takes at most 7 parameters, {len(params)} were given")
-    return CommandLong(target_system, target_component, command, 0, *_checked_params(command, params, 7))
+    confirmation = 0  # the first transmission
+    return CommandLong(target_system, target_component, command, confirmation, *_checked_params(command, params, 7))
 
 
 def command_int(
@@ -144,8 +145,8 @@ def command_int(
 ) -> CommandInt:
     """Build a COMMAND_INT.
 
-    ``params`` are param1 to param4, ``x`` and ``y`` latitude and longitude in 1e-7 degrees (in 1e-4 m in local frames),
-    ``z`` is the altitude in metres in ``frame`` (MAV_FRAME).
+    ``params`` are param1 to param4. ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or distances in 1e-4 m
+    in local frames. ``z`` is the altitude in metres in ``frame`` (MAV_FRAME).
 
     Raises:
         InvalidArgument: there are more than four parameters, a value exceeds its type, or the target is 0.
@@ -158,7 +159,10 @@ def command_int(
             raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not an integer of 32 bits")
     param1, param2, param3, param4 = _checked_params(command, params, 4)
     z = _checked_number(command, "z", z)
-    return CommandInt(target_system, target_component, frame, command, 0, 0, param1, param2, param3, param4, x, y, z)
+    return CommandInt(
+        target_system, target_component, frame, command, current=0, autocontinue=0, param1=param1, param2=param2,
+        param3=param3, param4=param4, x=x, y=y, z=z,
+    )  # fmt: skip
 
 
 class CommandExchange(Exchange[CommandAck]):
@@ -194,7 +198,7 @@ class CommandExchange(Exchange[CommandAck]):
 
     expects: tuple[type[Message], ...] = (CommandAck,)
 
-    # set by start()
+    # start() sets these attributes.
     _started_at: float
     _sent_at: float
 
@@ -243,7 +247,7 @@ class CommandExchange(Exchange[CommandAck]):
     def start(self, now: float) -> None:
         self._started_at = now
         self._send(now)
-        if self._is_sent:
+        if self._is_sent:  # The caller itself sends the first message.
             self._outbox.clear()
 
     def receive(self, message: Message, now: float) -> None:
@@ -308,6 +312,7 @@ class CommandExchange(Exchange[CommandAck]):
             self.deadline = min(now + POLL_INTERVAL_S, give_up_at)
 
     def _why_not_repeated(self) -> str:
+        """Return the end of the error text: why the order was not sent more often; empty after the last attempt."""
         if self._sent_count < self._attempts:
             return "; not sent again: no HEARTBEAT received since then"
         if self._attempts == 1 and max_attempts(self._message.command, _params_of(self._message)) == 1:

@@ -102,6 +102,9 @@ GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
 # A time-out is the smoothed round trip plus this many deviations, as in TCP.
 DEVIATIONS = 4.0
 
+# Seconds to wait for an answer before the first measurement, as in TCP.
+INITIAL_TIMEOUT_S = 1.0
+
 # Minimum jitter of answers, caused by the vehicle's main loop and the resolution of the clock.
 JITTER_S = 0.03
 
@@ -143,7 +146,7 @@ class RoundTrip:
         because the link may be congested or down.
         """
         if self.smoothed_s is None:
-            first_timeout_s = min(1.0, self._max_s)
+            first_timeout_s = min(INITIAL_TIMEOUT_S, self._max_s)
         else:
             first_timeout_s = self.smoothed_s + max(DEVIATIONS * self._deviation_s, JITTER_S)
         backoffs = min(max(0, attempt - 2), MAX_BACKOFFS)
@@ -165,7 +168,7 @@ class MessageStream:
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
-        self._interval = RoundTrip(min_s=0.001)
+        self._interval = RoundTrip(min_s=0.001)  # the time between two messages, smoothed like a round trip
         self._has_started = False  # True once a message has followed the request
         self._last_at = 0.0  # time of the request, or of the last message after it
         self.failures: int = 0
@@ -264,7 +267,7 @@ class Transfer(Exchange[ResultT]):
     take long, but continues while new data arrives.
     """
 
-    # set by start()
+    # start() sets these attributes.
     _started_at: float
     _progress_at: float
 
@@ -287,7 +290,8 @@ class Transfer(Exchange[ResultT]):
         self._on_progress = on_progress
 
     def _start_clock(self, now: float) -> None:
-        self._started_at = self._progress_at = now
+        self._started_at = now
+        self._progress_at = now
 
     def _report_progress(self, now: float, done: int, total: int | None) -> None:
         self._progress_at = now
@@ -319,7 +323,7 @@ class StaleAnswerFilter:
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
-        self._early: dict[str, set[float]] = {}  # name → send times of the requests that were answered too early
+        self._early_requests: dict[str, set[float]] = {}  # by name: when the requests answered too early were sent
 
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
         """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``."""
@@ -330,7 +334,7 @@ class StaleAnswerFilter:
             # The sample shortens the round trip, so that the next answer is accepted if the vehicle really is this
             # fast.
             self._round_trip.add_sample(elapsed_s)
-        early_requests = self._early.setdefault(name, set())
+        early_requests = self._early_requests.setdefault(name, set())
         early_requests.add(sent_at)
         has_become_faster = len(early_requests) > MAX_EARLY_ANSWERS
         return not has_become_faster

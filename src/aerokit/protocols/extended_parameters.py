@@ -75,7 +75,8 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
         """Process a value. Other messages, and messages of other components, are ignored."""
         if self.done or not isinstance(message, ParamExtValue) or not self._is_from_target(message):
             return
-        count, index = min(message.param_count, MAX_PARAMETERS), message.param_index
+        count = min(message.param_count, MAX_PARAMETERS)
+        index = message.param_index
         if index < count:
             self._count = count
             self._on_value(setting_of(message), index, count, now)
@@ -85,7 +86,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
         return ParamExtRequestList(self.target_system, self.target_component)
 
     def _read_request(self, index: int) -> Message:
-        return ParamExtRequestRead(self.target_system, self.target_component, "", index)
+        return ParamExtRequestRead(self.target_system, self.target_component, param_id="", param_index=index)
 
     def _on_quiet(self, now: float) -> None:
         if self._count is None:
@@ -95,7 +96,8 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
 
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
         """Store a value of the stream, or an answer to a request. Request indices that the stream has left out."""
-        if self._is_streaming and index >= self._next_index:
+        is_streamed = self._is_streaming and index >= self._next_index
+        if is_streamed:
             for missing in range(self._next_index, index):
                 self._window.request(missing)
             if self._next_index:  # The time before the first value is not a pause of the stream.
@@ -126,7 +128,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             for index in stale:
                 self._window.request(index)
             if not stale:
-                settings = (self._received[index][0] for index in range(self._count))
+                settings = (self._received[index] for index in range(self._count))
                 self._finish({setting.name: setting for setting in settings})
         elif len(self._window) == 0:  # Nothing is requested, but values are missing: the count has increased.
             self._end_stream()
@@ -156,6 +158,7 @@ class SettingReads(NamedReads[Setting]):
         self._is_probe_wanted = bool(self._overdue(now))
 
     def _on_message(self, message: Message, now: float) -> None:
+        """Process the answer to a probe, or the value of a requested name. A message may be both."""
         if not isinstance(message, ParamExtValue):
             return
         name = message.param_id
@@ -272,8 +275,9 @@ class SettingWrite(Transfer[Setting]):
     def _write(self, now: float) -> None:
         self._writes += 1
         value = setting_bytes(self._value, self._type)
-        target = self.target_system, self.target_component
-        self._outbox.append(ParamExtSet(*target, self._name, value, self._type))
+        self._outbox.append(
+            ParamExtSet(self.target_system, self.target_component, self._name, value, param_type=self._type)
+        )
         self._attempts = 1
         self._wait(now, is_writing=True)
 

@@ -129,7 +129,10 @@ class FtpMessage(Snapshot):
         sequence, session, opcode, size, request_opcode, burst_complete, offset = HEADER.unpack_from(payload)
         data_end = HEADER.size + size if cut else PAYLOAD_SIZE
         data = payload[HEADER.size : data_end]
-        return cls(sequence, opcode, session, size, request_opcode, burst_complete != 0, offset, data)
+        return cls(
+            sequence, opcode, session=session, size=size, request_opcode=request_opcode,
+            burst_complete=burst_complete != 0, offset=offset, data=data,
+        )  # fmt: skip
 
     def encode(self) -> bytes:
         """Return the payload of the FILE_TRANSFER_PROTOCOL message: 251 bytes."""
@@ -233,7 +236,7 @@ class FtpClient:
         self.source_system: int = source_system
         self.source_component: int = source_component
         self._sequence = first_sequence
-        self._session = first_sequence
+        self._session = first_sequence  # session numbers should differ between programs, too
 
     def next_sequence(self, replies: int = 1) -> int:
         """Return the sequence number of a new request. The next ``replies`` numbers are reserved for its replies."""
@@ -248,7 +251,12 @@ class FtpClient:
 
     def message(self, request: FtpMessage) -> FileTransferProtocol:
         """Wrap a request into a MAVLink message to the server."""
-        return FileTransferProtocol(0, self.target_system, self.target_component, request.encode())
+        return FileTransferProtocol(
+            target_network=0,
+            target_system=self.target_system,
+            target_component=self.target_component,
+            payload=request.encode(),
+        )
 
     def is_for_us(self, message: FileTransferProtocol) -> bool:
         """Return True if the message is addressed to this client or to all."""
@@ -297,7 +305,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
 
     attempts: int
 
-    # set by start()
+    # start() sets these attributes.
     _sent_at: float
 
     def __init__(
@@ -342,7 +350,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
         """Send the request, unless ``is_sent``."""
         self._start_clock(now)
         self._transmit(now)
-        if self._is_sent:
+        if self._is_sent:  # The caller itself sends the first message.
             self._outbox.clear()
 
     def expire(self, now: float) -> None:
@@ -384,6 +392,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._wait(now)
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
+        """Process a reply to another request, which only shows that the vehicle is still busy with a burst."""
         # ArduPilot answers TERMINATESESSION only after the current burst, so the blocks of the burst count as progress.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._progress_at = now

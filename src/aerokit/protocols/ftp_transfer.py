@@ -118,14 +118,14 @@ class FtpDownload(FtpExchange[int]):
         self._reassembly = into
         self._session = session
         self._size = None if is_virtual(path) or size == 0 else size
-        self._scanned = into.position  # Missing blocks before this offset were already requested.
+        self._scanned_until = into.position  # Missing blocks before this offset were already requested.
         self._requests = BlockRequests(self.round_trip)
         self._reads: dict[int, _SentRequest] = {}  # requests by sequence number
         self._bursts: deque[_Burst] = deque(maxlen=MAX_BURSTS)
         self._is_bursting = False
         self._failed_bursts = 0
         self._repeated_bursts = 0  # number of bursts requested since the last block that was new
-        self._highest_blocks: dict[int, int] = {}  # sequence number of a burst → highest number of its received blocks
+        self._highest_blocks: dict[int, int] = {}  # by sequence number of a burst: the highest received block number
         self._supports_bursts = True
         self._burst_at = 0.0  # time of the latest request for a burst, or of the last block after it
         # Burst and time of the last block that was received, and the highest number of a block of this burst.
@@ -164,11 +164,11 @@ class FtpDownload(FtpExchange[int]):
     def _receive_burst(self, reply: FtpMessage, now: float) -> None:
         """Process a block of a burst, or the NAK that ends a burst. Replies to earlier bursts may still arrive."""
         for burst in reversed(self._bursts):
-            if reply.is_ack and burst.contains(reply):
-                self._on_block(burst, reply, now)
-                return
-            end = None if reply.is_ack else burst.end(reply)
-            if end is not None:
+            if reply.is_ack:
+                if burst.contains(reply):
+                    self._on_block(burst, reply, now)
+                    return
+            elif (end := burst.end(reply)) is not None:
                 self._end_burst(burst, end, reply)
                 return
 
@@ -288,10 +288,11 @@ class FtpDownload(FtpExchange[int]):
         self._set_deadline()
 
     def _request_gaps(self) -> None:
-        while self._scanned < self._reassembly.tail:
-            if self._scanned in self._reassembly.gaps:
-                self._requests.request(self._scanned)
-            self._scanned += DATA_SIZE
+        """Queue requests for the missing blocks that were noticed after the last call."""
+        while self._scanned_until < self._reassembly.tail:
+            if self._scanned_until in self._reassembly.gaps:
+                self._requests.request(self._scanned_until)
+            self._scanned_until += DATA_SIZE
 
     @property
     def _needs_burst(self) -> bool:
@@ -309,27 +310,30 @@ class FtpDownload(FtpExchange[int]):
     def _read(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()
         self._reads[sequence] = _SentRequest(offset, now)
-        self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, self._session, DATA_SIZE, offset=offset))
+        self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, session=self._session, size=DATA_SIZE, offset=offset))
 
     def _burst(self, now: float) -> None:
         """Request a burst of everything after the last block received."""
         offset = self._reassembly.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. A later request with one of them would look like a
-        # repetition of this request, and the server would only repeat its last reply.
+        # repetition of this request, and the server would only repeat its last reply. The request, the full blocks, a
+        # shorter block and the NAK have one number each.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True
         self._burst_at = now
         self._repeated_bursts += 1
-        self._send(FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, self._session, DATA_SIZE, offset=offset))
+        self._send(
+            FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, session=self._session, size=DATA_SIZE, offset=offset)
+        )
 
     @property
     def _burst_due_at(self) -> float:
         """Deadline for the next block. If it passes, the burst has ended or, before any block, has not started."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:
-            # Repeating the burst of a long file is expensive, so such a burst gets more time to start.
+            # Repeating the burst of a long file is expensive, so the burst gets more time to start.
             if self._size is not None and self._size > SHORT_FILE:
                 silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
         else:
@@ -437,7 +441,11 @@ class FtpUpload(FtpExchange[None]):
         sequence = self._client.next_sequence()
         self._writes[sequence] = _SentRequest(offset, now)
         data = self._block(offset)
-        self._send(FtpMessage(sequence, MavFtpOpcode.WRITEFILE, self._session, len(data), offset=offset, data=data))
+        self._send(
+            FtpMessage(
+                sequence, MavFtpOpcode.WRITEFILE, session=self._session, size=len(data), offset=offset, data=data
+            )
+        )
 
     def _block(self, offset: int) -> bytes:
         return self._data[offset : offset + DATA_SIZE]

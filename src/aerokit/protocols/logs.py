@@ -78,7 +78,8 @@ class LogDownload(Transfer[int]):
         self._range_end = into.position
         self._latest_offset = self._range_end  # largest offset received in the current range
         self._max_range_blocks = FIRST_RANGE
-        self._requested_blocks = self._received_blocks = 0  # of the current range
+        self._requested_blocks = 0  # of the current range
+        self._received_blocks = 0
         self._early_ends = 0
         self._has_checked_gaps = True
 
@@ -162,7 +163,8 @@ class LogDownload(Transfer[int]):
         if not self._has_checked_gaps:
             gap = self._first_long_gap()
             if gap is not None:
-                self._stream_range(*gap, now)
+                start, end = gap
+                self._stream_range(start, end, now)
                 return
             self._has_checked_gaps = True
             for offset in self._reassembly.gaps:
@@ -171,16 +173,17 @@ class LogDownload(Transfer[int]):
             self._request(offset, LOG_BLOCK)
 
     def _first_long_gap(self) -> tuple[int, int] | None:
-        """Return start and end of the first gap of at least `LONG_GAP` blocks."""
-        start = end = -1
+        """Return start and end of the first gap of at least `LONG_GAP` blocks; None if all gaps are shorter."""
+        min_length = LONG_GAP * LOG_BLOCK
+        start, end = 0, 0  # the gap that is being measured
         for offset in self._reassembly.gaps:
             is_new_gap = offset != end
             if is_new_gap:
-                if end - start >= LONG_GAP * LOG_BLOCK:
+                if end - start >= min_length:
                     break
                 start = offset
             end = offset + LOG_BLOCK
-        return (start, end) if end - start >= LONG_GAP * LOG_BLOCK else None
+        return (start, end) if end - start >= min_length else None
 
     def _stream_range(self, start: int, end: int, now: float) -> None:
         """Request a range, or its beginning if the range is longer than a request may be."""
@@ -333,6 +336,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
             self._request_missing(now)
 
     def _expect(self, entry: LogEntry) -> None:
+        """Determine the ids of the requested logs from the first entry, which contains the number of all logs."""
         last = self._first_id + entry.num_logs - 1
         if self._end is not None:
             last = min(last, self._end)

@@ -50,13 +50,13 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     ``window`` is the number of requests in flight. It must be 1 for PX4, which aborts with ERROR unless a request is
     for the next item or the previous one. ArduPilot answers requests in any order, so only missing items are requested
-    again. ``only`` restricts the download to these items. ``gives_int`` is False for a vehicle that has no
+    again. ``only`` restricts the download to these items. ``supports_int`` is False for a vehicle that has no
     MISSION_ITEM_INT.
     """
 
     expects: tuple[type[Message], ...] = (MissionCount, MissionItemInt, MissionItem, MissionAck)
 
-    # set by start()
+    # start() sets these attributes.
     _list_requested_at: float
     _received_at: float
 
@@ -67,12 +67,12 @@ class MissionDownload(MissionExchange[DownloadResult]):
         *,
         window: int,
         only: Sequence[int] | None = None,
-        gives_int: bool = True,
+        supports_int: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._window = window
-        self._uses_int = gives_int
+        self._supports_int = supports_int
         self._only = only
         self._indices: Sequence[int] = ()
         self._items: dict[int, Item] = {}
@@ -219,7 +219,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._wait_for_items(now)
 
     def _request(self, seq: int, now: float) -> None:
-        request_type = MissionRequestInt if self._uses_int else MissionRequest
+        request_type = MissionRequestInt if self._supports_int else MissionRequest
         self._outbox.append(request_type(self.target_system, self.target_component, seq, self.mission_type))
         self._requested_at[seq] = now
         self._request_counts[seq] = self._request_counts.get(seq, 0) + 1
@@ -243,7 +243,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         transmissions = 2 if self._window == 1 else 1
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions
         items = tuple(self._items[seq] for seq in self._indices)
-        self._finish(DownloadResult(items, self._count or 0, self._opaque_id))
+        self._finish(DownloadResult(items, count=self._count or 0, opaque_id=self._opaque_id))
 
     def _time_out(self, now: float) -> None:
         """Cancel the download and fail, because the vehicle has stopped answering."""
@@ -253,7 +253,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the download:"
-                f" {details} ({now - self._progress_at:.1f} s)",
+                f" {details}; nothing new for {now - self._progress_at:.1f} s",
                 missing=tuple(seq - self.offset for seq in missing if seq >= self.offset),
             )
         )

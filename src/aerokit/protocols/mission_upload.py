@@ -47,12 +47,12 @@ class MissionUpload(MissionExchange[UploadResult]):
     """Uploads a plan: sends MISSION_COUNT, then the items that the vehicle requests.
 
     If ``first`` is given, the upload begins with MISSION_WRITE_PARTIAL_LIST instead, and replaces the items from
-    ``first`` on. ``takes_int`` is False for a vehicle that does not accept MISSION_ITEM_INT.
+    ``first`` on. ``supports_int`` is False for a vehicle that does not accept MISSION_ITEM_INT.
 
     With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several items.
     ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss. A
     request confirms all items before the requested one. ArduPilot answers an item out of sequence with INVALID_SEQUENCE
-    and continues to wait; PX4 ignores such an item and repeats its request every 0.25 s.
+    and continues to wait; PX4 ignores the item and repeats its request every 0.25 s.
 
     An unanswered item is repeated. If the item had arrived, and only the request for the next item was lost, ArduPilot
     answers the repetition with INVALID_SEQUENCE. The next item is then sent.
@@ -60,9 +60,9 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     expects: tuple[type[Message], ...] = (MissionRequestInt, MissionRequest, MissionAck)
 
-    # set by start()
+    # start() sets these attributes.
     _received_at: float
-    # set by the first request
+    # The first request sets this attribute.
     _as_float: bool
 
     def __init__(
@@ -73,7 +73,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         *,
         first: int | None = None,
         window: int,
-        takes_int: bool = True,
+        supports_int: bool = True,
         **options: Any,
     ) -> None:
         super().__init__(target_system, target_component, **options)
@@ -82,7 +82,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._first = first or 0
         self._end = self._first + len(items)
         self._window = window
-        self._accepts_int = takes_int
+        self._supports_int = supports_int
         self.is_refusal_ambiguous: bool = False
         """True if it is unknown which of several items in flight was refused. To find out, send items one at a time."""
         self.was_started: bool = False
@@ -93,8 +93,8 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _reset(self) -> None:
         self._is_accepted = False
-        # The vehicle has all items before `_confirmed_end`. All items before `_sent_end` were sent at least once.
-        self._confirmed_end = self._sent_end = self._first
+        self._confirmed_end = self._first  # The vehicle has all items before this one.
+        self._sent_end = self._first  # All items before this one were sent at least once.
         self._sent_at: dict[int, float] = {}
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
@@ -134,7 +134,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             else:
                 self._on_ack(message, now)
         elif isinstance(message, (MissionRequestInt, MissionRequest)) and self._first <= message.seq < self._end:
-            self._as_float = isinstance(message, MissionRequest) and not self._accepts_int
+            self._as_float = isinstance(message, MissionRequest) and not self._supports_int
             self._on_request(message.seq, now)
 
     def expire(self, now: float) -> None:
@@ -204,7 +204,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
             if self._is_accepted and self._sent_end == self._end:
-                self._succeed(not self._was_tail_repeated, ack.opaque_id, now)
+                self._succeed(now, is_confirmed=not self._was_tail_repeated, opaque_id=ack.opaque_id)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_accepted:
                 # The vehicle already has the item that was sent, or an item before it was lost.
@@ -232,12 +232,13 @@ class MissionUpload(MissionExchange[UploadResult]):
         elif self._error_at is None:
             self._error_at = now
             are_all_sent = self._sent_end == self._end
-            self._send(self._end - 1 if are_all_sent else self._confirmed_end, now, again=True)
+            seq = self._end - 1 if are_all_sent else self._confirmed_end
+            self._send(seq, now, again=True)
             self._wait(now)
         elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
             if self._sent_end == self._end:
                 # All items were sent, so the upload may be complete. The caller must read the plan back.
-                self._succeed(False, 0, now)
+                self._succeed(now, is_confirmed=False, opaque_id=0)
             else:
                 self._refuse(MavMissionResult.ERROR)
 
@@ -252,7 +253,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _restart(self, now: float) -> None:
         """Begin again, because the vehicle's transfer has expired or was cancelled."""
-        if not self._is_accepted:  # It was an older transfer.
+        if not self._is_accepted:  # An older transfer was cancelled.
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
             self._refuse(MavMissionResult.OPERATION_CANCELLED)
@@ -265,9 +266,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         self.is_refusal_ambiguous = self._sent_end - self._confirmed_end > 1
         self._reject(result, seq=self._confirmed_end if self._is_accepted else None)
 
-    def _succeed(self, is_confirmed: bool, opaque_id: int, now: float) -> None:
+    def _succeed(self, now: float, *, is_confirmed: bool, opaque_id: int) -> None:
         self._report_progress(now, len(self._items), len(self._items))
-        self._finish(UploadResult(is_confirmed, opaque_id, max(0, self._confirmed_end - self.offset)))
+        first_unconfirmed = max(0, self._confirmed_end - self.offset)
+        self._finish(UploadResult(is_confirmed, opaque_id, item=first_unconfirmed))
 
     def _time_out(self, now: float) -> None:
         """Cancel the upload and fail, because the vehicle has stopped answering."""
@@ -277,7 +279,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the upload: {details}"
-                f" ({self._attempt} attempts, {now - self._progress_at:.1f} s)",
+                f"; nothing new for {now - self._progress_at:.1f} s after {self._attempt} attempts",
                 missing=tuple(seq - self.offset for seq in missing),
             )
         )
@@ -285,6 +287,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     # -------------------------------------------------------------------------------- sending
 
     def _announce(self, now: float) -> None:
+        """Start the upload by MISSION_COUNT or MISSION_WRITE_PARTIAL_LIST. The vehicle then requests the first item."""
         target = (self.target_system, self.target_component)
         if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
             self._outbox += self.cancellation()

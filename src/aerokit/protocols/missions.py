@@ -102,7 +102,7 @@ class MissionExchange(Transfer[ResultT]):
 
     @property
     def kind(self) -> str:
-        """Name of the mission type, for texts: ``"mission"``, ``"fence"`` or ``"rally points"``."""
+        """Name of the mission type, for error texts: ``"mission"``, ``"fence"`` or ``"rally points"``."""
         return NAMES.get(MavMissionType(self.mission_type), "items")
 
     def cancellation(self) -> list[Message]:
@@ -130,7 +130,8 @@ class MissionExchange(Transfer[ResultT]):
         return self.round_trip.timeout_s(backoff_attempt)
 
     def _reject(self, result: int, *, seq: int | None = None) -> None:
-        item = None if seq is None or seq < self.offset else seq - self.offset
+        is_item = seq is not None and seq >= self.offset  # an item before the offset is home
+        item = seq - self.offset if seq is not None and is_item else None
         subject = "" if item is None else f" item {item}"
         reason = RESULTS.get(result, f"result {result}")
         self._fail(MissionRejected(f"{self.kind}: the vehicle refused{subject}: {reason}", result=result, item=item))
@@ -161,7 +162,7 @@ class MissionClear(MissionExchange[None]):
 
     def expire(self, now: float) -> None:
         if self._is_idle(now):
-            self._fail(self._timeout(now))
+            self._fail(self._timed_out(now))
             return
         self._attempt += 1
         self._send(now)
@@ -171,7 +172,7 @@ class MissionClear(MissionExchange[None]):
         self._outbox.append(MissionClearAll(self.target_system, self.target_component, self.mission_type))
         self._wait(now)
 
-    def _timeout(self, now: float) -> MissionTimeout:
+    def _timed_out(self, now: float) -> MissionTimeout:
         return MissionTimeout(
             f"{self.kind}: no answer to MISSION_CLEAR_ALL, sent {self._attempt} times"
             f" in {now - self._started_at:.1f} s; the vehicle may have cleared it"
@@ -196,7 +197,7 @@ class SetCurrentItem(Transfer[None]):
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
 
-    # set by start()
+    # start() sets these attributes.
     _sent_at: float
 
     def __init__(
@@ -236,7 +237,7 @@ class SetCurrentItem(Transfer[None]):
             self._fail(
                 OperationTimeout(
                     f"MISSION_SET_CURRENT {self._seq} was not confirmed in {now - self._started_at:.1f} s"
-                    f" ({self._attempts} attempts); MISSION_CURRENT reported {reported} (numbers on the wire)"
+                    f" ({self._attempts} attempts); MISSION_CURRENT reported {reported} (numbers as in the messages)"
                     + (f"; not sent again: {end}" if end else "")
                 )
             )

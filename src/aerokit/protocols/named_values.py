@@ -50,8 +50,8 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
     def __init__(self, target_system: int, target_component: int, **options: Unpack[TransferOptions]) -> None:
         super().__init__(target_system, target_component, **options)
         self._window: RequestWindow[int] = RequestWindow(self.round_trip, size=self.window_size)
-        # Maps an index to the value, and to the number of parameters that the same message reports.
-        self._received: dict[int, tuple[ValueT, int]] = {}
+        self._received: dict[int, ValueT] = {}  # the values by index
+        self._reported_counts: dict[int, int] = {}  # by index: number of parameters, from the message with the value
         self._count: int | None = None
         self._next_index = 0  # next index that is expected in the stream
         self._is_streaming = False
@@ -95,7 +95,8 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
 
     def _store(self, index: int, value: ValueT, reported_count: int, now: float) -> None:
         is_new = index not in self._received
-        self._received[index] = value, reported_count
+        self._received[index] = value
+        self._reported_counts[index] = reported_count
         if is_new:
             count = self._count or 0
             self._report_progress(now, min(len(self._received), count), count)
@@ -112,7 +113,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
         """Drop values received with another count, and return their indices. Does so at most `MAX_REFRESHES` times."""
-        stale = tuple(index for index in range(count) if self._received[index][1] != count)
+        stale = tuple(index for index in range(count) if self._reported_counts[index] != count)
         if not stale or self._refreshes >= MAX_REFRESHES:
             return ()
         self._refreshes += 1
@@ -194,6 +195,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         """Called after due requests were sent."""
 
     def _settle(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
+        """Record the final answer for a name."""
         self._window.discard(name)
         self._answers[name] = answer
         self._report_progress(now, len(self._answers), len(self._names))
@@ -201,7 +203,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _step(self, now: float) -> None:
         """Finish, or send the requests that are due. Called after each message and at each deadline."""
         if len(self._answers) < len(self._names):
-            self._before_sending(now)
+            self._before_sending(now)  # This call may settle the last names.
         if len(self._answers) == len(self._names):
             self._finish({name: self._answers[name] for name in self._names})
             return
@@ -222,7 +224,8 @@ class NamedReads(NamedRequests[ValueT]):
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
     _is_probe_wanted = False
-    _probes_sent = _probes_answered = 0
+    _probes_sent = 0
+    _probes_answered = 0
 
     @abstractmethod
     def _read_request(self, name: str, index: int) -> Message:
@@ -239,7 +242,7 @@ class NamedReads(NamedRequests[ValueT]):
 
     def _after_sending(self, now: float) -> None:
         if self._is_probe_wanted and PROBE not in self._window:
-            self._window.send(PROBE, now)
+            self._window.record_sent(PROBE, now)
             self._outbox += self._request(PROBE)
         self._is_probe_wanted = False
 
@@ -248,6 +251,7 @@ class NamedReads(NamedRequests[ValueT]):
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 
     def _reject_unknown(self, names: Iterable[str], now: float) -> None:
+        """Reject those of the unanswered names that were requested so often that a loss of all answers is unlikely."""
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
                 text = f"{self.unknown_text} {name}: it answers requests for other names, but not for this one"
@@ -256,7 +260,7 @@ class NamedReads(NamedRequests[ValueT]):
     def _loss_probability(self, attempts: int) -> float:
         """Estimate the probability that the answers to ``attempts`` requests were all lost.
 
-        It is derived from the numbers of sent and answered probes, by Laplace's rule of succession.
+        The estimate is derived from the numbers of sent and answered probes, by Laplace's rule of succession.
         """
         if not self._probes_answered:
             return 1.0

@@ -35,7 +35,7 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
         if same_value(float(known.value), float(value)):
             value = known.value  # The reported value is equal, except for bits that a float cannot hold.
     index = known.index if reported.index is None else reported.index
-    return Parameter(known.name, value, type_, known.default, index)
+    return Parameter(known.name, value, type_, default=known.default, index=index)
 
 
 # Maximum seconds between two parts of a list. ArduPilot sends parts ten times a second, or once a second (MAV1_PARAMS).
@@ -76,8 +76,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._bytewise = bytewise
-        self._names: dict[str, Parameter] = {}  # name → parameter with the latest value
-        self._refusals: dict[int, int] = {}  # index → number of PARAM_ERROR messages
+        self._names: dict[str, Parameter] = {}  # by name: the parameter with its latest value
+        self._refusals: dict[int, int] = {}  # by index: number of PARAM_ERROR messages
         self._count_in_stream: int | None = None  # number of parameters that the stream's last message reported
         self._must_request_missing = False
         self._streamed_values = 0  # number of values received from the stream
@@ -151,6 +151,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _record_count(self, count: int, *, is_streamed: bool) -> None:
+        """Record the number of parameters that a message reports. If it has changed, indices may be missing."""
         # All messages of ArduPilot's stream report the count from the start of the stream, although the number of
         # parameters may change meanwhile. A streamed count is therefore only compared with an earlier streamed count.
         if is_streamed:
@@ -171,7 +172,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._next_index = index + 1
         self._streamed_values += 1
         self._last_at = now
-        if index == 0:
+        if index == 0:  # `start` may have requested this value to measure the round trip.
             self._window.on_answer(0, now)
         else:
             self._window.discard(index)
@@ -184,14 +185,15 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         return ParamRequestList(self.target_system, self.target_component)
 
     def _read_request(self, index: int) -> Message:
-        return ParamRequestRead(self.target_system, self.target_component, "", index)
+        return ParamRequestRead(self.target_system, self.target_component, param_id="", param_index=index)
 
     def _on_quiet(self, now: float) -> None:
-        is_longer = self._count is None or self._count > MIN_STREAMED
-        if self._streamed_values < MIN_STREAMED and is_longer:  # The stream has never begun.
+        is_short_list = self._count is not None and self._count <= MIN_STREAMED
+        has_started = self._streamed_values >= MIN_STREAMED or is_short_list
+        if has_started:
+            self._end_stream()
+        else:
             self._send_list_request(now)
-            return
-        self._end_stream()
 
     def _end_stream(self) -> None:
         self._is_streaming = False
@@ -228,8 +230,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         count = self._count
         if count is None or len(self._received) < count:
             return
-        parameters = [self._received[index][0] for index in range(count) if index in self._received]
-        if len(parameters) != count:
+        parameters = [self._received[index] for index in range(count) if index in self._received]
+        if len(parameters) != count:  # Some received indices are not below the count, which has decreased.
             return
         names = {parameter.name for parameter in parameters}
         is_consistent = len(names) == count == len(self._names)  # Each name has exactly one index, and vice versa.
@@ -246,5 +248,5 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         table = []
         for index, name in enumerate(ordered):
             latest = self._names[name]
-            table.append(Parameter(name, latest.value, latest.type, None, index))
+            table.append(Parameter(name, latest.value, latest.type, index=index))
         return table

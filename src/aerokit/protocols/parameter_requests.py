@@ -127,7 +127,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             own_system=own_system,
             **options,
         )
-        self._probe = self._is_probe_wanted = probe
+        self._probe = probe
+        self._is_probe_wanted = probe
         self._possibly_stale = dict(possibly_stale)
         self._refused: set[str] = set()
         self._alternatives = {name: tuple(other_names) for name, other_names in alternatives.items()}
@@ -141,12 +142,14 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE)
+        """Process the answer to a probe, or the value of a requested name. A message may be both."""
+        is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
         if is_probe_answer:
             self._count_probe()
             overtaken = self._window.on_answer(PROBE, now, overtaken=1)
-            self._reject_unknown(overtaken, now)
-            self._is_probe_wanted |= bool(overtaken)
+            if overtaken:
+                self._reject_unknown(overtaken, now)
+                self._is_probe_wanted = True
         name = message.param_id
         if name and name in self._window:
             self._window.on_answer(name, now)
@@ -261,7 +264,8 @@ class ParameterWrites(ParameterRequests):
             return
         unexpected.add(reported)
         self._window.on_answer(name, now)
-        is_unchanged = same_value(reported.value, self._before.get(name, reported.value))
+        before = self._before.get(name)  # None: unknown, so the value may be unchanged
+        is_unchanged = before is None or same_value(reported.value, before)
         if is_unchanged and not is_as_requested:
             self._to_set.add(name)  # The value is still the old one, so PARAM_SET is sent again.
         if unexpected.are_conclusive(is_unchanged=is_unchanged):
@@ -274,7 +278,7 @@ class ParameterWrites(ParameterRequests):
         is_whole_float = reported.type is ParameterType.REAL32 and float(reported.value).is_integer()
         if self._bytewise or not type_.is_integer or not is_whole_float:
             return reported
-        return Parameter(reported.name, int(reported.value), type_, None, reported.index)
+        return Parameter(reported.name, int(reported.value), type_, index=reported.index)
 
     def _timeout_text(self, name: str) -> str:
         return f"PARAM_SET of {name} was not confirmed, sent {self._window.attempts(name)} times"

@@ -36,8 +36,11 @@ class _Request:
     __slots__ = ("attempts", "due_at", "first_at", "first_number", "last_number", "sent_at", "was_duplicated")
 
     def __init__(self, now: float, number: int) -> None:
-        self.first_at = self.sent_at = self.due_at = now
-        self.first_number = self.last_number = number
+        self.first_at = now
+        self.sent_at = now
+        self.due_at = now
+        self.first_number = number
+        self.last_number = number
         self.was_duplicated = False
         self.attempts = 0
 
@@ -93,10 +96,10 @@ class RequestWindow(Generic[KeyT]):
         if key not in self:
             self._waiting[key] = None
 
-    def send(self, key: KeyT, now: float) -> None:
+    def record_sent(self, key: KeyT, now: float) -> None:
         """Record a request that is sent now, regardless of the window."""
         self._waiting.pop(key, None)
-        self._send(key, now)
+        self._record_transmission(key, now)
 
     def discard(self, key: KeyT) -> None:
         """Drop a request, for example because another message answered it."""
@@ -107,7 +110,7 @@ class RequestWindow(Generic[KeyT]):
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
         """Record an answer. Return the requests that count as lost.
 
-        These are the requests that were sent at least ``overtaken`` transmissions before the answered request.
+        The lost requests were sent at least ``overtaken`` transmissions before the answered request.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
@@ -141,7 +144,7 @@ class RequestWindow(Generic[KeyT]):
         while self._waiting and len(self._in_flight) < self._max_in_flight:
             key = next(iter(self._waiting))
             del self._waiting[key]
-            self._send(key, now)
+            self._record_transmission(key, now)
             due.append(key)
         if self._duplicate_last and len(self._in_flight) <= FEW_LEFT and not self._waiting:
             duplicates = [key for key in due if self._requests[key].attempts >= DUPLICATE_FROM_ATTEMPT]
@@ -158,6 +161,7 @@ class RequestWindow(Generic[KeyT]):
             self._next_silence_at = now + self._timeout_s(1)
 
     def _timeout_s(self, attempts: int) -> float:
+        """Return the seconds to wait for an answer. Only silences of the whole link make the wait much longer."""
         round_trip = self._round_trip
         seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
         if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:
@@ -173,12 +177,13 @@ class RequestWindow(Generic[KeyT]):
         else:
             self._max_in_flight = max(self._max_in_flight - 1, self._initial_size)
 
-    def _send(self, key: KeyT, now: float) -> None:
+    def _record_transmission(self, key: KeyT, now: float) -> None:
         """Record a transmission of the request, and the time at which its answer is overdue."""
         self._sent_count += 1
         request = self._requests.get(key)
         if request is None:
-            request = self._requests[key] = _Request(now, self._sent_count)
+            request = _Request(now, self._sent_count)
+            self._requests[key] = request
         request.attempts += 1
         request.last_number = self._sent_count
         request.sent_at = now

@@ -65,7 +65,7 @@ def rtcm_messages(data: bytes) -> list[bytes]:
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
         subject = f"rtcm (byte {begin} of {len(data)})"
         if size is None:
-            raise InvalidArgument(f"{subject} is not allowed: no RTCM 3 message begins there (its first byte is 0xD3)")
+            raise InvalidArgument(f"{subject} is not allowed: no RTCM 3 message begins there (all begin with 0xD3)")
         frame = data[begin : begin + size]
         if len(frame) < size:
             raise InvalidArgument(
@@ -134,6 +134,6 @@ def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
         pieces.append(b"")
     flags = (sequence & 0x1F) << 3 | is_split
     return [
-        GpsRtcmData(flags | number << 1, len(piece), piece.ljust(FRAGMENT_SIZE, b"\0"))
+        GpsRtcmData(flags=flags | number << 1, len=len(piece), data=piece.ljust(FRAGMENT_SIZE, b"\0"))
         for number, piece in enumerate(pieces)
     ]

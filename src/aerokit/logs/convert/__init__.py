@@ -126,7 +126,10 @@ def convert(
         writer = make_writer(incomplete, log_reader)
         entries, begins_at, ends_at, written = _write_records(log_reader, writer, on_bytes)
         size = _move(incomplete, target_path)
-    return Conversion(target_path, entries, written, size, begins_at, ends_at, tuple(log_reader.notes))
+    notes = tuple(log_reader.notes)
+    return Conversion(
+        target_path, entries, written=written, bytes=size, begins_at=begins_at, ends_at=ends_at, notes=notes
+    )
 
 
 def _writer_for(target: Path, tables: str) -> Callable[[Path, LogReader], _Writer]:
@@ -146,7 +149,7 @@ def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], ob
     try:
         for entry in log.entries(on_bytes):
             if not entries:
-                begins_at = ends_at = entry.unix_s
+                begins_at = entry.unix_s
             entries += 1
             ends_at = max(ends_at, entry.unix_s)
             writer.write(entry)

@@ -59,7 +59,7 @@ class McapWriter:
         self._file.close()
 
     def _write_states(self, record: LogRecord) -> None:
-        """Write the changed states, and Foxglove's topics that depend on them: texts, location and pose."""
+        """Write the changed states, and Foxglove's topics that depend on them: log, location, transform and pose."""
         system_id, unix_s = record.system_id, record.unix_s
         latest = self._latest.setdefault(system_id, {})
         for state, value in record.states:
@@ -100,7 +100,8 @@ class McapWriter:
         """Add a message to a topic. The topic is registered with its first message."""
         channel = self._channels.get(name)
         if channel is None:
-            channel = self._channels[name] = self._register(make_topic())
+            channel = self._register(make_topic())
+            self._channels[name] = channel
         time_ns = topics.nanoseconds(unix_s)
         self._writer.add_message(channel, time_ns, topics.encoded(fields), time_ns)
         self.written += 1

@@ -109,7 +109,8 @@ class ParquetTable:
     SUFFIX = ".parquet"
 
     def __init__(self, path: Path, columns: Sequence[TableColumn]) -> None:
-        self._arrow = arrow = import_module("pyarrow")
+        arrow = import_module("pyarrow")
+        self._arrow = arrow
         types = {
             "time": arrow.timestamp("us", tz="UTC"),
             "float": arrow.float64(),
@@ -164,9 +165,8 @@ class FlightTableWriter:
         latest = self._latest.setdefault(record.system_id, {})
         latest.update(record.states)
         if any(state == "position" for state, _ in record.states):
-            self._table.add(
-                record.unix_s, (record.system_id, *(get_value(latest) for get_value in self._value_getters))
-            )
+            values = [get_value(latest) for get_value in self._value_getters]
+            self._table.add(record.unix_s, (record.system_id, *values))
             self.written += 1
 
     def close(self) -> None:
@@ -195,14 +195,15 @@ class MessageTablesWriter:
         self.written += 1
 
     def _open_table(self, record: LogRecord) -> tuple[Table, Callable[[LogRecord], list[Any]]]:
+        """Create the table for records of this type. Return it with the function that converts a record to a row."""
         columns = self._log.columns(record)
         # The name becomes a file name, but the log is untrusted input, so other characters are replaced.
         name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
         if (self._path / name).exists():
             name = f"{len(self._tables)}_{name}"
         table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
-        table_and_row_maker = self._tables[record.table] = table, _row_maker(columns, record)
-        return table_and_row_maker
+        self._tables[record.table] = table, _row_maker(columns, record)
+        return self._tables[record.table]
 
     def close(self) -> None:
         for table, _ in self._tables.values():
@@ -235,13 +236,13 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[L
     # NAME is a second name even if there is only one column. For a single name, attrgetter would not return a tuple.
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
-    texts = [position for position, column in enumerate(columns) if column.kind == "str"]
+    text_positions = [position for position, column in enumerate(columns) if column.kind == "str"]
 
     def make_row(record: LogRecord) -> list[Any]:
         _, *values = get_fields(record.message)
         for position, index in array_elements:
             values[position] = values[position][index]
-        for position in texts:
+        for position in text_positions:
             values[position] = _cell(values[position])
         return values
 
@@ -263,7 +264,7 @@ def _first(values: Sequence[Any]) -> Any:
 def _value_getter(path: str) -> Callable[[dict[str, Any]], Any]:
     """Return a function that gets the value at a path such as ``batteries.0.voltage_v`` from states.
 
-    It returns None for unknown values.
+    The returned function returns None for unknown values.
     """
     state, *steps = path.split(".")
 

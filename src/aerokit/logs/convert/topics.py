@@ -122,7 +122,7 @@ class MapFrame:
 def height_above(origin_m: float, altitude_amsl_m: float | None, relative_m: float | None) -> float:
     """Return the height above the origin in metres.
 
-    It is derived from the altitude above sea level or, if that is unknown, from the altitude above home.
+    The height is derived from the altitude above sea level or, if that is unknown, from the altitude above home.
     """
     return (relative_m or 0.0) if altitude_amsl_m is None else altitude_amsl_m - origin_m
 
@@ -302,7 +302,7 @@ def _schema_of(value: object) -> dict[str, Any]:
     if isinstance(converted, dict):
         return {"type": "object", "properties": {name: _schema_of(item) for name, item in converted.items()}}
     if isinstance(converted, list):
-        items = value if isinstance(value, (list, tuple)) else converted
+        items = value if isinstance(value, (list, tuple)) else converted  # the items of `value` have annotations
         return {"type": "array", "items": _schema_of(items[0]) if items else {}}
     return {} if converted is None else {"type": _JSON_TYPES[type(converted).__name__]}
 

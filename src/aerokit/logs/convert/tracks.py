@@ -56,7 +56,6 @@ class _TrackWriter:
     def __init__(self, path: Path, log: LogReader) -> None:
         self._path, self._log = path, log
         self._tracks: dict[int, _Track] = {}
-        self._mission: dict[int, Waypoint] = {}
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:

@@ -102,11 +102,14 @@ def _complete(flight: FlightLog) -> None:
     _, last_disarmed_s = flight.armed[-1] if flight.armed else (0.0, 0.0)
     is_armed_at_end = math.isinf(last_disarmed_s)
     flight.set_armed(flight.duration_s, armed=False)  # ends an open span
-    if flight.home is None and len(flight.track):  # use the position at the first arming, or else the first position
-        first_armed_s, _ = flight.armed[0] if flight.armed else (-math.inf, -math.inf)
-        row = max(flight.track.index_at(first_armed_s), 0)
-        columns = ("latitude_deg", "longitude_deg", "altitude_amsl_m")
-        flight.set_home(flight.track.times[row], *(flight.track[name][row] for name in columns))
+    track = flight.track
+    if flight.home is None and len(track):  # use the position at the first arming, or else the first position
+        row = 0
+        if flight.armed:
+            first_armed_s, _ = flight.armed[0]
+            row = max(track.index_at(first_armed_s), 0)
+        latitude, longitude = track["latitude_deg"][row], track["longitude_deg"][row]
+        flight.set_home(track.times[row], latitude, longitude, track["altitude_amsl_m"][row])
     _complete_altitudes(flight)
     if is_armed_at_end:
         flight.notes.append(_armed_at_end_note(flight))
@@ -148,7 +151,8 @@ def _complete_altitudes(flight: FlightLog) -> None:
             # Unless home is near sea level, the two altitudes must differ. If they do not, the log has the same
             # altitude in both columns.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:
-                # A value near home's altitude above sea level is above sea level. A value near 0 is above home.
+                # If the value is nearer to home's altitude than to 0, it is an altitude above sea level. Otherwise, it
+                # is a height above home.
                 if abs(amsl_m - home_amsl_m) < abs(amsl_m):
                     relative[row] = amsl_m - home_amsl_m
                 else:

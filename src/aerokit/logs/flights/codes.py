@@ -112,7 +112,7 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# Subsystems whose error code is a number with its own meaning.
+# The error codes of these subsystems have their own meaning.
 _MODE_CHANGE = 10  # the number of the refused mode
 _ESTIMATOR_SWITCH = 24  # the number of the new estimator
 _FENCE = 9  # bits of AC_FENCE_TYPE
@@ -142,7 +142,7 @@ def error_text(subsystem: int, code: int, text: str) -> str:
 
 
 def clean_text(text: str) -> str:
-    """Remove terminal control sequences and surrounding white space; PX4 ends texts with a tab."""
+    """Remove terminal control sequences and surrounding white space; PX4 ends status texts with a tab."""
     return _CONTROL_CHARACTERS.sub("", text).strip()
 
 
@@ -218,4 +218,5 @@ def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
     if gcs_meanings is not None:
         return gcs_meanings.get(value, "")
     meanings = _ACTIONS.get(firmware, {}).get(parameter, ())
-    return meanings[int(value)] if value in range(len(meanings)) else ""
+    is_known = value in range(len(meanings))  # False for a fraction, too
+    return meanings[int(value)] if is_known else ""

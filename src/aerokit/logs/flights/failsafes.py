@@ -128,18 +128,19 @@ def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
     """Return evidence for each time at which a satellite receiver lost its 3D fix."""
     evidence = []
     for number, gps in flight.gps.items():
-        had_fix, had_satellites = False, math.nan
+        had_fix, satellites_before = False, math.nan
         for time_s, fix_type, satellites in zip(gps.times, gps["fix_type"], gps["satellites"], strict=True):
+            if math.isnan(fix_type):
+                continue
             has_fix = fix_type >= GpsFixType.TYPE_3D_FIX
-            if had_fix and fix_type < GpsFixType.TYPE_3D_FIX:
+            if had_fix and not has_fix:
                 text = f"receiver {number + 1} has no 3D fix any more"
                 if not math.isnan(satellites):
                     text += f", {satellites:.0f} satellites"
-                    if not math.isnan(had_satellites):
-                        text += f" instead of {had_satellites:.0f}"
+                    if not math.isnan(satellites_before):
+                        text += f" instead of {satellites_before:.0f}"
                 evidence.append(FailsafeEvidence(time_s, "gps", text))
-            if not math.isnan(fix_type):
-                had_fix, had_satellites = has_fix, satellites
+            had_fix, satellites_before = has_fix, satellites
     return evidence
 
 
@@ -164,8 +165,8 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
             group.append(evidence)
     kinds = [_kind_of(group) for group in groups]
     return [
-        _explain(flight, group, is_first_of_kind=kind not in kinds[:number])
-        for number, (kind, group) in enumerate(zip(kinds, groups, strict=True))
+        _explain(flight, group, is_first_of_kind=kind not in kinds[:index])
+        for index, (kind, group) in enumerate(zip(kinds, groups, strict=True))
     ]
 
 
@@ -197,7 +198,8 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
         parameters = _missing_parameters(flight, kind)
     facts += parameters
     facts += _texts_before(flight, time_s)
-    return Failsafe(time_s, kind, acted, tuple(group), reaction or "no mode change followed", tuple(facts))
+    reaction = reaction or "no mode change followed"
+    return Failsafe(time_s, kind, acted, evidence=tuple(group), reaction=reaction, context=tuple(facts))
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
@@ -211,14 +213,15 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
         is_near = time_s - _EARLY_MODE_CHANGE_S <= change.time_s <= last_s + _REACTION_TIMEOUT_S
         # Some autopilots change the mode after disarming, which is no reaction to a failsafe.
         was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
-        if is_near and was_armed and change.by_autopilot is not False:
-            previous_mode = flight.mode_at(change.time_s - 1e-6)
-            if previous_mode:
-                is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
-                cause = "" if is_sure else "; cause not logged"
-                return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
+        was_commanded = change.by_autopilot is False  # None: the log does not contain the cause
+        previous_mode = flight.mode_at(change.time_s - 1e-6)
+        if is_near and was_armed and not was_commanded and previous_mode:
+            is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
+            cause = "" if is_sure else "; cause not logged"
+            return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
     until_s = last_s + _DISARMING_TIMEOUT_S
     disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
+    # If the log ends while the vehicle is armed, the last time in `flight.armed` is the end of the log.
     if disarmed_s is not None and disarmed_s < flight.duration_s:
         is_sure = _kind_of(group) in CRASH_KINDS
         cause = "" if is_sure else "; cause not logged"
@@ -417,6 +420,6 @@ def configured_by(flight: FlightLog, kind: str) -> list[str]:
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:
-    """Return the last texts of the 15 s before a failsafe, without the text that reports the failsafe itself."""
+    """Return the last four status texts of the 15 s before a failsafe, without the text that reports it."""
     texts = [text for text in flight.texts if time_s - 15 <= text.time_s < time_s - 0.05]
     return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-4:]]

@@ -23,7 +23,8 @@ _FALL_SINK_M_S = 6.0
 _IMPACT_S = 0.6
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
-# Disarming and texts up to this long before a descent may explain it, and texts up to this long after its end.
+# Disarming and status texts may explain a descent if they are at most _REASON_BEFORE_S before its start. Status texts
+# may also explain it if they are at most _TEXT_AFTER_S after its end.
 _REASON_BEFORE_S, _TEXT_AFTER_S = 3.0, 5.0
 # Disarming later than this before the end of a descent may be caused by the impact.
 _IMPACT_DISARM_S = 0.3
@@ -66,12 +67,18 @@ def falls(flight: FlightLog) -> list[Fall]:
     """
     if not flight.armed:
         return []
-    return [fall for descent in _descents(flight) if (fall := _fall(flight, *descent)) is not None]
+    candidates = [
+        _fall(flight, begin_s, end_s, sink_m_s, was_stopped)
+        for begin_s, end_s, sink_m_s, was_stopped in _descents(flight)
+    ]
+    return [fall for fall in candidates if fall is not None]
 
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
     """Yield the start, end and last sink rate of each fast descent, and whether the descent was stopped."""
-    begin_s = previous_s = last_fast_s = -math.inf
+    begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
+    last_fast_s = -math.inf  # the last time at which it sank fast
+    previous_s = -math.inf
     sink_m_s = 0.0  # the highest sink rate shortly before the end of the descent
     for time_s, down_m_s in zip(flight.velocity.times, flight.velocity["down_m_s"], strict=True):
         if math.isnan(down_m_s):
@@ -82,11 +89,13 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
             last_fast_s = time_s
         elif down_m_s < _STOPPED_M_S:
             max_stop_s = max(_IMPACT_S, 1.5 * (time_s - previous_s))  # longer if the log has few values
-            if last_fast_s > begin_s and time_s - last_fast_s <= max_stop_s:
+            was_fast = last_fast_s > begin_s
+            if was_fast and time_s - last_fast_s <= max_stop_s:
                 yield begin_s, time_s, sink_m_s, True
             begin_s, sink_m_s = time_s, 0.0
         previous_s = time_s
-    if last_fast_s > begin_s and last_fast_s == previous_s:
+    is_fast_at_end = last_fast_s == previous_s > begin_s
+    if is_fast_at_end:
         yield begin_s, last_fast_s, sink_m_s, False
 
 
@@ -98,21 +107,29 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
     if not lost_height_m >= _MIN_HEIGHT_M:  # `not >=` is also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    # Without an impact, the log ends during the descent. If the vehicle would have hit the ground within two seconds,
-    # the descent is treated as a fall.
-    is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < 2 * sink_m_s
+    # Without an impact, the log ends during the descent. Then the height must be so small that the vehicle would reach
+    # the ground within two seconds.
+    near_ground_m = 2 * sink_m_s
+    is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < near_ground_m
     if not (is_on_ground or reasons):
         return None
-    is_hard_landing = sink_m_s < _FALL_SINK_M_S and not reasons
-    return Fall(end_s, begin_s, lost_height_m, sink_m_s, is_hard_landing, has_impact, tuple(reasons))
+    return Fall(
+        time_s=end_s,
+        begins_s=begin_s,
+        height_m=lost_height_m,
+        sink_m_s=sink_m_s,
+        is_hard_landing=sink_m_s < _FALL_SINK_M_S and not reasons,
+        has_impact=has_impact,
+        reasons=tuple(reasons),
+    )
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
     """Return True if the vehicle keeps this height until it is disarmed, or stays armed near the height of home."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
-    is_armed = until_s < disarmed_s or disarmed_s >= flight.duration_s
-    if is_armed and height_m > _NEAR_HOME_HEIGHT_M:
+    was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # armed spans end with the log, too
+    if not was_disarmed and height_m > _NEAR_HOME_HEIGHT_M:
         return False  # the vehicle may be hovering
     heights = flight.track.between("altitude_relative_m", time_s + _IMPACT_S, until_s)
     return all(abs(height - height_m) <= _SAME_HEIGHT_M for height in heights)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+_NAN = math.nan
 _HOME_AFTER_ARMING_S = 2.0
 
 
@@ -318,7 +319,10 @@ class FlightLog:
             self.armed[-1] = (begin_s, time_s)
 
     def set_home(self, time_s: float, latitude_deg: float, longitude_deg: float, amsl_m: float) -> None:
-        """Record home until shortly after the first arming. ArduPilot moves home with a disarmed vehicle."""
+        """Record home, if it is valid. Later than two seconds after the first arming, a known home is not replaced.
+
+        Until arming, ArduPilot moves home with the vehicle.
+        """
         is_valid = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and (latitude_deg or longitude_deg)
         if not is_valid:  # NaN is not valid, because it fails the comparisons
             return
@@ -329,14 +333,8 @@ class FlightLog:
 
     def set_parameter(self, time_s: float, name: str, value: float) -> None:
         """Record a parameter's value: its first value, or a change."""
-        before = self._latest_parameters.get(name)
+        first = self.parameters.setdefault(name, value)
+        before = self._latest_parameters.get(name, first)
         self._latest_parameters[name] = value
-        if name not in self.parameters:
-            self.parameters[name] = value
-            return
-        before = self.parameters[name] if before is None else before
         if value != before and not (math.isnan(value) and math.isnan(before)):
             self.parameter_changes.append(ParameterChange(time_s, name, before, value))
-
-
-_NAN = math.nan

@@ -108,7 +108,7 @@ def _column_kind(value: object) -> str:
 
 
 def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
-    """Create a position. Return None for impossible values, which a diverged or not yet started estimator reports."""
+    """Create a position; None for impossible values, which estimators report before they work or if they fail."""
     try:
         check_place(latitude, longitude)
         position = Position(latitude, longitude, float(amsl_m), relative_m)
@@ -128,11 +128,11 @@ class BinReader(_RowReader):
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all records except those that describe formats. Values are multiplied by the factors of the formats."""
-        reader = self._reader = opened_bin(self.path)
+        self._reader = opened_bin(self.path)
         try:
-            yield from self._rows(reader, on_bytes)
+            yield from self._rows(self._reader, on_bytes)
         finally:
-            close_bin(reader)
+            close_bin(self._reader)
 
     def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         count = 0
@@ -277,7 +277,7 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """Yield the logged texts as rows of a table, like `_rows`."""
+    """Yield the logged status texts as rows of a table, like `_rows`."""
     for text in log.logged_messages:
         # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
         severity = max(0, min(7, int(text.log_level) - ord("0")))

@@ -12,7 +12,7 @@ from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, clean_text, error_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane, Waypoint
 from aerokit.logs.flights.flight_controllers import close_bin, opened_bin
-from aerokit.mavlink.enums import MavType
+from aerokit.mavlink.enums import GpsFixType, MavType
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -37,7 +37,7 @@ _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
 # A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-_INDEXING_SHARE = 0.3  # Indexing the rows is this fraction of the total progress.
+_INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the rows
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
@@ -47,11 +47,16 @@ def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable
         FileFormatError: the file is not an ArduPilot log, or was written before 2015.
     """
     size = flight.path.stat().st_size
-    reader = opened_bin(flight.path, lambda percent: on_bytes(round(size * _INDEXING_SHARE * percent / 100)))
+
+    def on_indexing(percent: float) -> None:
+        on_bytes(round(size * _INDEXING_SHARE * percent / 100))
+
+    def on_reading(share: float) -> None:
+        on_bytes(round(size * (_INDEXING_SHARE + (1 - _INDEXING_SHARE) * share)))
+
+    reader = opened_bin(flight.path, on_indexing)
     try:
-        _Reader(flight, _Tables(reader)).read(
-            lambda share: on_bytes(round(size * (_INDEXING_SHARE + (1 - _INDEXING_SHARE) * share)))
-        )
+        _Reader(flight, _Tables(reader)).read(on_reading)
     finally:
         close_bin(reader)
 
@@ -99,11 +104,12 @@ class _Tables:
         row_format = reader.formats[reader.name_to_id[table]]
         indices = [row_format.columns.index(name) for name in ("TimeUS", *columns)]
         unpack = struct.Struct(_struct_pattern(row_format, indices)).unpack_from
-        # Unpacked rows have the order of the file. `positions` are the places of TimeUS and of `columns` in such a row.
+        # The values of an unpacked row have the order of the file. `positions` has their indices in the order of
+        # TimeUS and `columns`.
         positions = [sorted(indices).index(index) for index in indices]
         scales = [row_format.msg_mults[index] for index in indices]
         data, offsets = reader.data_map, reader.offsets[row_format.type]
-        last_offset, began_us = len(data) - row_format.len, self.began_us
+        last_offset = len(data) - row_format.len  # a row after this offset is cut off by the end of the file
         for begin in range(0, len(offsets), _CHUNK_ROWS):
             rows = [
                 unpack(data, offset + _HEADER_SIZE)
@@ -114,8 +120,8 @@ class _Tables:
                 continue
             unpacked = list(zip(*rows, strict=True))
             chunk = [_scaled(unpacked[position], scale) for position, scale in zip(positions, scales, strict=True)]
-            chunk[0] = [(time_us - began_us) / 1e6 for time_us in chunk[0]]
-            yield chunk
+            times_us, *values = chunk
+            yield [[(time_us - self.began_us) / 1e6 for time_us in times_us], *values]
 
     def _first_time(self) -> int:
         """Return the time of the first row in the file, which may be in any table."""
@@ -211,9 +217,9 @@ class _Reader:
         modes = ardupilot_for(vehicle_type).modes
         has_reason = self._tables.has("MODE", "ModeNum", "Rsn")
         columns = ("ModeNum", "Rsn") if has_reason else ("ModeNum",)
-        for time_s, mode_number, *reason_number in self._tables.rows("MODE", *columns):
-            (key,) = reason_number or (None,)
-            reason, failsafe, by_autopilot = MODE_REASONS.get(key, ("", None, None))
+        for time_s, mode_number, *rest in self._tables.rows("MODE", *columns):
+            reason_number = rest[0] if has_reason else None
+            reason, failsafe, by_autopilot = MODE_REASONS.get(reason_number, ("", None, None))
             name = modes.name_of(mode_number)
             if self._flight.add_mode(time_s, name, reason, by_autopilot) and failsafe:
                 text = f"mode {name}, reason: {reason} (MODE)"
@@ -237,7 +243,7 @@ class _Reader:
         for row in self._tables.rows("CMD", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
             _, number, command, latitude, longitude, altitude, frame = row
             if not latitude and not longitude:
-                latitude = longitude = NAN  # the item has no position
+                latitude, longitude = NAN, NAN  # the item has no position
             items[number] = Waypoint(
                 number, command, latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude, frame=frame
             )
@@ -258,11 +264,11 @@ class _Reader:
             return
         # Without a position of the estimator, use that of the GPS receiver, if it has a 3D fix.
         for time, status, latitude, longitude, amsl in self._tables.rows("GPS", "Status", "Lat", "Lng", "Alt"):
-            if status >= 3:
+            if status >= GpsFixType.TYPE_3D_FIX:
                 track.add(time, latitude, longitude, amsl, NAN)
 
     def _velocity(self) -> None:
-        table = next((table for table in ("XKF1", "NKF1") if self._tables.has(table, "VN", "VE", "VD")), "XKF1")
+        table = "XKF1" if self._tables.has("XKF1", "VN", "VE", "VD") else "NKF1"  # NKF1: the estimator of old logs
         core_columns = ("C",) if self._tables.has(table, "C") else ()
         for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
             if not core or core == [0]:  # one estimator, or the first of several
@@ -294,7 +300,8 @@ class _Reader:
         relative = target["altitude_relative_m"]
         for time, height in heights:
             if has_positions:
-                relative[max(target.index_at(time), 0)] = height
+                row = max(target.index_at(time), 0)
+                relative[row] = height
             else:
                 target.add(time, NAN, NAN, NAN, height)
 
@@ -311,13 +318,13 @@ class _Reader:
 
     def _batteries(self) -> None:
         instance = "Inst" if self._tables.has("BAT", "Inst") else "Instance"
-        percent_columns = ("RemPct",) if self._tables.has("BAT", "RemPct") else ()
-        rows = self._tables.rows("BAT", instance, "Volt", "Curr", "CurrTot", *percent_columns)
-        for time_s, number, voltage, current, used, *percent in rows:
-            (remaining,) = percent or (_NO_PERCENT,)
-            self._flight.battery(number).add(
-                time_s, voltage, current, used, NAN if remaining == _NO_PERCENT else remaining
-            )
+        has_percent = self._tables.has("BAT", "RemPct")
+        columns = [instance, "Volt", "Curr", "CurrTot"]
+        if has_percent:
+            columns.append("RemPct")
+        for time_s, number, voltage, current, used, *rest in self._tables.rows("BAT", *columns):
+            is_known = has_percent and rest[0] != _NO_PERCENT
+            self._flight.battery(number).add(time_s, voltage, current, used, rest[0] if is_known else NAN)
 
     def _gps(self) -> None:
         # GPA has the accuracy for each row of GPS. Rows belong together if time and receiver are the same.
@@ -351,8 +358,8 @@ class _Reader:
             self._flight.radio.add(*row)
 
     def _errors(self) -> None:
-        for time, system, code in self._tables.rows("ERR", "Subsys", "ECode"):
-            kind, text = ERRORS.get(system, ("general", f"subsystem {system}"))
-            if code:
-                description = f"{error_text(system, code, text)} (ERR {system}/{code})"
+        for time, subsystem, code in self._tables.rows("ERR", "Subsys", "ECode"):
+            kind, text = ERRORS.get(subsystem, ("general", f"subsystem {subsystem}"))
+            if code:  # 0: the error is over
+                description = f"{error_text(subsystem, code, text)} (ERR {subsystem}/{code})"
                 self._flight.failsafe_evidence.append(FailsafeEvidence(time, kind, description))

@@ -123,16 +123,17 @@ class _Reader:
         # of the header are read.
         flight, source, link = self._flight, self._source, self._link
         handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
-        damaged = count = received = 0  # `received`: frames since the last call of link.count()
-        expected_sequence, next_second = -1, 0.0
-        received_at, received_count = math.nan, 0  # time of the vehicle's last frame, and `count` at that time
-        begins_at = ends_at = 0.0
+        records, damaged = 0, 0
+        begins_at, ends_at = 0.0, 0.0
+        new_frames = 0  # the vehicle's frames since the last call of link.count()
+        next_second, expected_sequence = 0.0, -1
+        last_frame_at, last_frame_record = math.nan, 0  # time and number of the record with the vehicle's last frame
         with flight.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
-                if not count:
+                if not records:
                     begins_at = unix_s
-                count += 1
-                if count % 16_384 == 0:
+                records += 1
+                if records % 16_384 == 0:
                     on_bytes(file.tell())
                 if unix_s > ends_at:
                     ends_at = unix_s
@@ -141,13 +142,15 @@ class _Reader:
                 else:
                     message_id, sender, sequence = raw[5:6] + b"\0\0", raw[3:5], raw[2]
                 if sender == source:
-                    received += 1
+                    new_frames += 1
                     if sequence != expected_sequence or unix_s >= next_second:
-                        if unix_s - received_at >= MIN_SILENCE_S:
-                            link.add_silence(received_at - begins_at, unix_s - begins_at, count - received_count - 1)
-                        next_s = link.count(unix_s - begins_at, sequence, expected_sequence, received)
-                        next_second, received = begins_at + next_s, 0
-                    received_at, received_count = unix_s, count
+                        if unix_s - last_frame_at >= MIN_SILENCE_S:
+                            link.add_silence(
+                                last_frame_at - begins_at, unix_s - begins_at, records - last_frame_record - 1
+                            )
+                        next_s = link.count(unix_s - begins_at, sequence, expected_sequence, new_frames)
+                        next_second, new_frames = begins_at + next_s, 0
+                    last_frame_at, last_frame_record = unix_s, records
                     expected_sequence = (sequence + 1) & 0xFF
                     if message_id not in handlers_of_vehicle:
                         continue
@@ -165,7 +168,7 @@ class _Reader:
                     handle(unix_s - begins_at, message)
             on_bytes(file.tell())
         flight.begins_at, flight.ends_at = begins_at, ends_at
-        link.end(received, received_at - begins_at, flight.duration_s, count - received_count)
+        link.end(new_frames, last_frame_at - begins_at, flight.duration_s, records - last_frame_record)
         self._finish(damaged)
 
     def _finish(self, damaged: int) -> None:
@@ -199,9 +202,10 @@ class _Reader:
         for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
-        self._flight.position_target = merged = TimeSeries(*setpoints.names)
+        merged = TimeSeries(*setpoints.names)
         for row in sorted(rows, key=itemgetter(0)):  # by time
             merged.add(*row)
+        self._flight.position_target = merged
 
     def _vehicle_handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
         """Return the handlers of messages that count only if the vehicle itself has sent them."""
@@ -433,10 +437,14 @@ def _message_id_bytes(kind: type[Message]) -> bytes:
 def _decoded(raw: bytes, unix_s: float) -> Message | None:
     """Decode the frame of a record; None if its checksum is wrong."""
     if raw[0] == MAGIC_V2:
-        frame, end = Frame(), 10 + raw[1]  # faster than `Frame.parse`; ignores a signature after `end`
-        frame.body, frame.checksum = raw[1:end], raw[end] | raw[end + 1] << 8
+        # This is faster than `Frame.parse`. A signature after the checksum is ignored.
+        frame = Frame()
+        end = 10 + raw[1]  # the end of the payload
+        frame.body = raw[1:end]
+        frame.checksum = raw[end] | raw[end + 1] << 8
         frame.system_id, frame.component_id = raw[5], raw[6]
-        frame.message_id, frame.received_at = raw[7] | raw[8] << 8 | raw[9] << 16, unix_s
+        frame.message_id = raw[7] | raw[8] << 8 | raw[9] << 16
+        frame.received_at = unix_s
     else:
         frame = Frame.parse(raw, unix_s)
     if x25(frame.body + STANDARD.extras[frame.message_id]) != frame.checksum:

@@ -72,7 +72,7 @@ _FAILSAFE_FLAGS = {
     "vtol_fixed_wing_system_failure": ("transition", "fixed-wing system failure"),
 }
 _BATTERY_WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
-_LOADING_SHARE = 0.9  # part of the progress that loading the file counts for
+_LOADING_SHARE = 0.9  # the progress is 90 % when pyulog has loaded the file
 _BUFFER = 1 << 20
 
 
@@ -150,7 +150,7 @@ class _Reader:
         self._flight, self._log = flight, log
         self._data = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
         first_times = [int(data.data["timestamp"][0]) for data in self._data]
-        self._began_us = min(int(log.start_timestamp), *first_times) if first_times else int(log.start_timestamp)
+        self._began_us = min([int(log.start_timestamp), *first_times])
 
     def read(self) -> None:
         flight, log = self._flight, self._log
@@ -166,7 +166,7 @@ class _Reader:
             # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
             severity = max(0, min(7, int(text.log_level) - ord("0")))
             flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
-        initial = [(log.start_timestamp, *item) for item in log.initial_parameters.items()]
+        initial = [(log.start_timestamp, name, value) for name, value in log.initial_parameters.items()]
         for time_us, name, value in (*initial, *log.changed_parameters):
             if isinstance(value, (int, float)):
                 flight.set_parameter(self._time(time_us), str(name), float(value))
@@ -176,6 +176,7 @@ class _Reader:
         self._equipment()
 
     def _time(self, time_us: int) -> float:
+        """Return the seconds since the start of the log; 0 for earlier times."""
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
@@ -206,6 +207,7 @@ class _Reader:
         fields = ("nav_state", "nav_state_user_intention", "failsafe")
         for time_s, state, intended_state, failsafe in status.rows(*fields):
             name = _NAV_STATES.get(int(state), f"MODE {int(state)}")
+            # The autopilot itself changed the mode if it is not the mode that the pilot or a program requested.
             by_autopilot = None if math.isnan(intended_state) else bool(state != intended_state)
             reason = ""
             if failsafe == 1:
@@ -240,14 +242,15 @@ class _Reader:
         flight = self._flight
         home = self._topic("home_position")
         if home is not None:
-            for row in home.rows("lat", "lon", "alt"):
-                flight.set_home(*row)
+            for time_s, home_latitude, home_longitude, home_amsl in home.rows("lat", "lon", "alt"):
+                flight.set_home(time_s, home_latitude, home_longitude, home_amsl)
         position = self._topic("vehicle_global_position")
         if position is not None:
             latitude, longitude, amsl = position.array("lat"), position.array("lon"), position.array("alt")
             if "lat_lon_valid" in position:
-                latitude[position.array("lat_lon_valid") == 0] = NAN
-                longitude[position.array("lat_lon_valid") == 0] = NAN
+                is_invalid = position.array("lat_lon_valid") == 0
+                latitude[is_invalid] = NAN
+                longitude[is_invalid] = NAN
             _extend(flight.track, position.times, latitude_deg=latitude, longitude_deg=longitude, altitude_amsl_m=amsl)
         else:
             self._track_of_receiver()
@@ -398,7 +401,7 @@ def utc_at_boot(log: Any) -> float:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():
             utc_us, boot_us = data.data["time_utc_usec"], data.data["timestamp"]
-            rows_with_utc = utc_us.nonzero()[0]
+            (rows_with_utc,) = utc_us.nonzero()
             if len(rows_with_utc):
                 row = rows_with_utc[0]
                 return (int(utc_us[row]) - int(boot_us[row])) / 1e6

@@ -27,7 +27,8 @@ class ClockComparison:
 
     def __init__(self) -> None:
         self._previous: tuple[float, int] = (-math.inf, 0)
-        self._recorded_s = self._vehicle_s = 0.0
+        self._recorded_s = 0.0
+        self._vehicle_s = 0.0
 
     def compare(self, time_s: float, boot_ms: int) -> None:
         previous_s, previous_ms = self._previous
@@ -51,13 +52,14 @@ class LinkCounter:
     def __init__(self, flight: FlightLog) -> None:
         self._series, self._silences = flight.link, flight.silences
         self._second = 0  # the second that is being counted
-        self._received = self._lost = 0
+        self._received = 0
+        self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
         """Count received and lost frames. Called after a gap in the sequence and at the start of a second.
 
-        ``received`` frames arrived since the last call; the last of them has this time and sequence number. Returns the
-        start of the next second. ``expected`` is negative for the first frame.
+        ``received`` frames arrived after the last call; the last of them has this time and sequence number. Return the
+        start of the next second. ``expected`` is the sequence number that would follow; negative for the first frame.
         """
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
@@ -65,7 +67,7 @@ class LinkCounter:
         if time_s >= self._second + 1:  # the last frame is the first frame of a new second
             self._received += received - 1
             received = 1
-            if int(time_s) - self._second > 1:  # _add_row() records such a silence as 100 % loss
+            if int(time_s) - self._second > 1:  # _add_row() records the seconds without frames as 100 % loss
                 missing = 0
             self._add_row(int(time_s))
         self._received += received
@@ -109,7 +111,8 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
     """
     if is_real_time(speed):
         return
-    recorded_s, flight.speed = flight.duration_s, speed
+    recorded_s = flight.duration_s
+    flight.speed = speed
     flight.notes.append(
         f"this is a simulation at {speed:.3g} times real speed, because the vehicle's clock differs from the"
         f" recording's: all times and durations in this report are simulated; the recording took {recorded_s:.0f} s"

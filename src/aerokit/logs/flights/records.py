@@ -77,7 +77,8 @@ def unit_suffix(name: str, unit: str) -> str:
     """Append the unit to a name, unless the name ends with it: ``alt`` in mm becomes ``alt_mm``."""
     suffix = _UNITS.get(unit, unit).replace("/", "_").replace("*", "").replace("^", "")
     suffix = "".join(character for character in suffix if character.isalnum() or character == "_")
-    return name if not suffix or name.lower().endswith(f"_{suffix.lower()}") else f"{name}_{suffix}"
+    has_suffix = name.lower().endswith(f"_{suffix.lower()}")
+    return f"{name}_{suffix}" if suffix and not has_suffix else name
 
 
 class TlogReader(LogReader):
@@ -97,7 +98,8 @@ class TlogReader(LogReader):
         ``param_value`` of PARAM_VALUE and PARAM_SET is always the value of the parameter. PX4 sends an integer's bits
         in this field, which are decoded.
         """
-        framer, decode, count = self._framer, STANDARD.decode, 0
+        framer, decode = self._framer, STANDARD.decode
+        count = 0
         states: tuple[tuple[str, Any], ...] = ()
         with self.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
@@ -106,11 +108,14 @@ class TlogReader(LogReader):
                     on_bytes(file.tell())
                 for frame in framer.receive(raw, unix_s):
                     message = decode(frame)
+                    system_id, component_id = frame.system_id, frame.component_id
                     if frame.message_id in _PARAMETER_IDS:
-                        message = self._decode_parameter(message, frame.system_id)
+                        message = self._decode_parameter(message, system_id)
                     if self.needs_states:
-                        states = self._states(frame.system_id, frame.component_id, unix_s, message)
-                    yield LogRecord(unix_s, frame.system_id, frame.component_id, message.NAME, {}, states, message)
+                        states = self._states(system_id, component_id, unix_s, message)
+                    yield LogRecord(
+                        unix_s, system_id, component_id, table=message.NAME, fields={}, states=states, message=message
+                    )
             on_bytes(file.tell())
         self._check_and_note(count)
 
@@ -151,14 +156,17 @@ class TlogReader(LogReader):
     def _states(
         self, system_id: int, component_id: int, unix_s: float, message: Message
     ) -> tuple[tuple[str, Any], ...]:
+        """Return the states that a message changes. A system has states from its autopilot's first HEARTBEAT on."""
         vehicle = self._vehicles.get(system_id)
         if vehicle is None:
             if not isinstance(message, Heartbeat) or not is_autopilot(message):
                 return ()
-            vehicle = self._vehicles[system_id] = _VehicleStates(system_id, component_id)
+            vehicle = _VehicleStates(system_id, component_id)
+            self._vehicles[system_id] = vehicle
         return vehicle.update(unix_s, message) if vehicle.component_id == component_id else ()
 
     def _check_and_note(self, records: int) -> None:
+        """Raise FileFormatError if nothing could be read, and add notes about skipped messages."""
         if not records:
             raise FileFormatError(f"{self.path} contains no MAVLink messages: it is not a .tlog, or it is empty")
         statistics = self._framer.statistics
@@ -185,7 +193,8 @@ class _VehicleStates:
 
     def update(self, unix_s: float, message: Message) -> tuple[tuple[str, Any], ...]:
         """Decode a message; return the names and values of the states that it changes."""
-        self._now = now = max(unix_s, self._now + 1e-6)  # always increases, although the clock may have been set back
+        now = max(unix_s, self._now + 1e-6)  # always increases, although the clock may have been set back
+        self._now = now
         telemetry = self._telemetry
         names = self._states_by_message.get(type(message).__name__, ())
         if names:

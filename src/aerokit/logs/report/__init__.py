@@ -104,13 +104,8 @@ def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summar
         (flight,) = flights
         optional_sections = [make_section(flight) for make_section in SECTIONS]
         sections = [section for section in optional_sections if section is not None]
-        return page(
-            flight.path.name,
-            [(_heading(flight), summaries[0], findings(flight))],
-            sections,
-            COLOURS,
-            timeline_shapes(flight),
-        )
+        headed_summary = (_heading(flight), summaries[0], findings(flight))
+        return page(flight.path.name, [headed_summary], sections, COLOURS, shapes=timeline_shapes(flight))
     first, second = flights
     headed_summaries = [
         (f"{name}: {flight.path.name}, {_heading(flight)}", sentences, findings(flight))

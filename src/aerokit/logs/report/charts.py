@@ -95,7 +95,8 @@ def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[in
     pieces = max(max_rows // 2, 1)
     selected = {0, count - 1}
     for piece in range(pieces):
-        begin, end = count * piece // pieces, count * (piece + 1) // pieces
+        begin = count * piece // pieces
+        end = count * (piece + 1) // pieces
         part = values[begin:end]
         known = part
         if math.isnan(sum(part)):  # at least one value is unknown
@@ -143,10 +144,11 @@ def over_time(
         "range": time_range(0.0, flight.duration_s),
     }
     full_layout = {"xaxis": times, "yaxis": {"title": {"text": unit}, **layout.pop("yaxis", {})}, **layout}
-    for number, trace in enumerate(trace for trace in drawn if "line" not in trace):
+    without_colour = [trace for trace in drawn if "line" not in trace]
+    for number, trace in enumerate(without_colour):
         trace["line"] = {"color": series_colour(number), "width": 1.6}
     label = f"{unit} over time: {', '.join(trace['name'] for trace in drawn)}"
-    return Chart(name, drawn, full_layout, height, label, is_timeline=True)
+    return Chart(name, drawn, full_layout, height=height, label=label, is_timeline=True)
 
 
 def time_range(begin_s: float, end_s: float) -> list[float]:
@@ -195,11 +197,11 @@ def track_parts(flight: FlightLog) -> list[Part]:
         *_mission(flight, plane),
         *_circular_fence(flight),
         *lines,
-        _marker("home", [(0.0, 0.0)], "circle", "colour:home", 11),
+        _marker("home", [(0.0, 0.0)], symbol="circle", colour="colour:home", size=11),
         *_failsafe_markers(flight, places),
     ]
-    layout = map_layout(traces)
-    chart = Chart("map", traces, layout, 520, "the track from above, north is up")
+    label = "the track from above, north is up"
+    chart = Chart("map", traces, map_layout(traces), height=520, label=label)
     return [chart, *simplification_note(deviation_m)]
 
 
@@ -228,7 +230,9 @@ def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return Plotly's layout for a map that contains these traces."""
     axes: dict[str, dict[str, Any]] = {}
     for name, direction in (("x", "east"), ("y", "north")):
-        values = [value for trace in traces for value in trace[name] if value is not None]
+        values: list[float] = []
+        for trace in traces:
+            values += [value for value in trace[name] if value is not None]
         margin = max(0.05 * (max(values) - min(values)), 1.0)
         axes[f"{name}axis"] = {
             "title": {"text": f"metres {direction} of home"},
@@ -252,7 +256,9 @@ def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tu
         part = rows[bisect_left(rows, start) : bisect_left(rows, end) + 1] if start < end else []
         if part:
             mode_rows = rows_by_mode.setdefault(change.name, [])
-            mode_rows += [None, *part] if mode_rows else part
+            if mode_rows:  # the mode was used before
+                mode_rows.append(None)
+            mode_rows += part
     colours = mode_colours(flight)
     lines = [
         {
@@ -313,10 +319,10 @@ def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
     markers = _marker(
         "mission",
         [plane.metres(item.latitude_deg, item.longitude_deg) for item in items],
-        "diamond-open",
-        "colour:mission",
-        9,
-        [f"{flight.item_label(item)} {command_name(item.command)}" for item in items],
+        symbol="diamond-open",
+        colour="colour:mission",
+        size=9,
+        texts=[f"{flight.item_label(item)} {command_name(item.command)}" for item in items],
     )
     return [{**markers, "mode": "markers+lines", "line": {"color": "colour:mission", "width": 1, "dash": "dash"}}]
 
@@ -358,13 +364,14 @@ def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) 
                 event_places.append(places[row])
                 names.append(f"{event.title}, {clock(event.time_s)}")
         if event_places:
-            markers.append(_marker(legend, event_places, symbol, _FAILSAFE, 12, names))
+            markers.append(_marker(legend, event_places, symbol=symbol, colour=_FAILSAFE, size=12, texts=names))
     return markers
 
 
 def _marker(
     name: str,
     places: Sequence[tuple[float, float]],
+    *,
     symbol: str,
     colour: str,
     size: int,

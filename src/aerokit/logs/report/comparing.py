@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.report.charts import (
@@ -79,7 +80,7 @@ def comparison(
         _modes(flights),
         _parameters(flights),
         *(
-            Section(f"{section.title} of {name}", section.parts, section.explanation, section.missing)
+            replace(section, title=f"{section.title} of {name}")
             for name, section in zip(NAMES, failsafe_sections, strict=True)
         ),
     ]
@@ -98,7 +99,7 @@ def _armed_at(flight: FlightLog) -> float:
 def _differences(statistics: tuple[FlightStatistics, FlightStatistics]) -> Section:
     rows = []
     for field, (name, digits) in _STATISTICS.items():
-        value_a, value_b = (getattr(of_flight, field) for of_flight in statistics)
+        value_a, value_b = (getattr(flight_statistics, field) for flight_statistics in statistics)
         if value_a is None and value_b is None:
             continue
         difference = ""
@@ -117,17 +118,17 @@ def _maps(flights: Sequence[FlightLog]) -> Section:
         rows, deviation_m = drawn_track(places)
         deviations.append(deviation_m)
         if rows:
-            north = [rounded(north_m) for north_m, _ in (places[row] for row in rows)]
-            east = [rounded(east_m) for _, east_m in (places[row] for row in rows)]
+            drawn_places = [places[row] for row in rows]
+            north = [rounded(north_m) for north_m, _ in drawn_places]
+            east = [rounded(east_m) for _, east_m in drawn_places]
             traces.append({"x": east, "y": north, **_line_style(number)})
-    title, missing = "Tracks", "Neither log has positions."
     if not traces:
-        return Section(title, missing=missing)
-    chart = Chart("maps", traces, map_layout(traces), 520, "both tracks from above, north is up")
+        return Section("Tracks", missing="Neither log has positions.")
+    chart = Chart("maps", traces, map_layout(traces), height=520, label="both tracks from above, north is up")
     return Section(
-        title,
+        "Tracks",
         [chart, *simplification_note(max(deviations))],
-        "From above, relative to each flight's home; north is up.",
+        explanation="From above, relative to each flight's home; north is up.",
     )
 
 
@@ -159,7 +160,7 @@ def _overlay_section(
     axis = {"title": {"text": "seconds since arming"}, "range": time_range(begin, end)}
     layout = {"xaxis": axis, "yaxis": {"title": {"text": unit}}}
     name = "both-" + title.lower().replace(" ", "-")
-    chart = Chart(name, traces, layout, 240, f"{unit}, both flights", is_timeline=True)
+    chart = Chart(name, traces, layout, height=240, label=f"{unit}, both flights", is_timeline=True)
     parts: list[Part] = [chart]
     if names_without_data:
         parts.append(Paragraphs([f"The log of {names_without_data[0]} does not contain this."]))
@@ -189,8 +190,8 @@ def _parameters(flights: Sequence[FlightLog]) -> Section:
     ]
     part: Part = Paragraphs([f"None: all {len(parameters_a)} are the same."])
     if rows:
-        part = Table(("parameter", *NAMES), rows, f"{len(rows)} differ")
-    return Section(title, [part], "Values at the start of each log.")
+        part = Table(("parameter", *NAMES), rows, title=f"{len(rows)} differ")
+    return Section(title, [part], explanation="Values at the start of each log.")
 
 
 def _value(value: float | None) -> str:

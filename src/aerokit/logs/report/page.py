@@ -61,8 +61,7 @@ class Chart:
     label: str = ""
     """Description for screen readers and for browsers without scripts."""
     is_timeline: bool = False
-    """True for a chart over time. It has the page's shapes as background, and zooms together with all other timelines.
-    """
+    """True for a chart over time. All these charts have the page's shapes as background, and zoom together."""
 
 
 Summary: TypeAlias = "tuple[str, Sequence[str], Sequence[str]]"
@@ -110,7 +109,9 @@ def page(
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:;"
         " form-action 'none'; base-uri 'none'"
     )
-    charts = [part for section in sections for part in section.parts if isinstance(part, Chart)]
+    charts: list[Chart] = []
+    for section in sections:
+        charts += [part for part in section.parts if isinstance(part, Chart)]
     lines = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">',

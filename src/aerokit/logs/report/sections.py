@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.failsafes import failsafes
@@ -39,10 +40,10 @@ _WRITTEN_BY_AUTOPILOT = (
 )
 
 
-def _with_parts(section: Section, *charts: Part | None) -> Section:
+def _with_parts(section: Section, *optional_parts: Part | None) -> Section:
     """Add the parts that are not None to the section. Without any, the section shows its text for missing data."""
-    parts = [part for part in charts if part is not None]
-    return Section(section.title, parts, section.explanation, "" if parts else section.missing)
+    parts = [part for part in optional_parts if part is not None]
+    return replace(section, parts=parts, missing="" if parts else section.missing)
 
 
 def _map(flight: FlightLog) -> Section:
@@ -102,13 +103,13 @@ def failsafe_section(flight: FlightLog) -> Section:
     collapsed = tables[_MAX_OPEN_FAILSAFES:]
     if collapsed:
         parts.append(Collapsed(f"{len(collapsed)} more", collapsed))
-    explanation = "Each failsafe has its evidence, the values measured before it, and "
-    explanation += (
-        "the parameters that configure it."
-        if flight.parameters
-        else "the names of the parameters that configure it: the log contains no parameters, `aerokit params get NAME`"
-        " reads them from the vehicle."
-    )
+    parameters = "the parameters that configure it."
+    if not flight.parameters:
+        parameters = (
+            "the names of the parameters that configure it: the log contains no parameters, `aerokit params get NAME`"
+            " reads them from the vehicle."
+        )
+    explanation = f"Each failsafe has its evidence, the values measured before it, and {parameters}"
     return Section("Failsafes", parts, explanation)
 
 
@@ -117,7 +118,7 @@ def _failsafe(failsafe: Failsafe) -> Table:
     head = f"{clock(failsafe.time_s)} {failsafe.title} ({kind}): {failsafe.reaction}"
     rows = [("evidence", f"{clock(item.time_s)} {item.text}") for item in failsafe.evidence]
     rows += [("context", text) for text in failsafe.context]
-    return Table((kind, head), rows, head, [mark] * len(failsafe.evidence))
+    return Table((kind, head), rows, title=head, marks=[mark] * len(failsafe.evidence))
 
 
 def _attitude(flight: FlightLog) -> Section:
@@ -280,7 +281,7 @@ def _texts(flight: FlightLog) -> Section:
         else:
             marks.append("warning" if severity == MavSeverity.WARNING else "bad")
     more = len(flight.texts) - len(rows)
-    parts: list[Part] = [Table(("time", "severity", "text"), rows, f"{len(rows)} texts", marks)]
+    parts: list[Part] = [Table(("time", "severity", "text"), rows, title=f"{len(rows)} texts", marks=marks)]
     if more:
         parts.append(Paragraphs([f"{more} more texts are not shown."]))
     if flight.path.suffix.lower() == ".bin":
@@ -301,9 +302,9 @@ def _parameters(flight: FlightLog) -> Section:
     parts: list[Part] = [Paragraphs(["No parameter changed during the log."])]
     if rows:
         parts = [Table(("time", "parameter", "before", "after"), rows, f"{len(changes)} changes")]
-    by_autopilot = len(flight.parameter_changes) - len(changes)
-    if by_autopilot:
-        text = f"{by_autopilot} changes by the autopilot itself, of counters and the like, are not shown."
+    hidden_count = len(flight.parameter_changes) - len(changes)
+    if hidden_count:
+        text = f"{hidden_count} changes by the autopilot itself, of counters and the like, are not shown."
         parts.append(Paragraphs([text]))
     parameters = [(name, f"{value:.9g}") for name, value in sorted(flight.parameters.items())]
     parts.append(

@@ -58,7 +58,8 @@ def _sentence(flight: FlightLog, silence: Silence) -> str:
     before = _state(flight, silence.begins_s)
     text = f"Nothing was received from the vehicle for {span(silence.ends_s - silence.begins_s)}"
     text += f" from {clock(silence.begins_s)} on"
-    text += ", until the log ends" if is_at_end else ""
+    if is_at_end:
+        text += ", until the log ends"
     text += f"; it was last {before}." if before else "."
     after = "" if is_at_end else _state(flight, silence.ends_s + _MODE_DELAY_S)
     return f"{text} Afterwards it was {after}." if after else text
@@ -66,9 +67,14 @@ def _sentence(flight: FlightLog, silence: Silence) -> str:
 
 def _state(flight: FlightLog, time_s: float) -> str:
     """Return the height and the mode as text, such as "12.5 m above home in LOITER"; empty if both are unknown."""
-    height_m, mode = flight.track.at("altitude_relative_m", time_s), flight.mode_at(time_s)
-    parts = [] if math.isnan(height_m) else [f"{height_m:.1f} m above home"]
-    return " ".join([*parts, *([f"in {mode}"] if mode else [])])
+    height_m = flight.track.at("altitude_relative_m", time_s)
+    mode = flight.mode_at(time_s)
+    parts = []
+    if not math.isnan(height_m):
+        parts.append(f"{height_m:.1f} m above home")
+    if mode:
+        parts.append(f"in {mode}")
+    return " ".join(parts)
 
 
 def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:

@@ -37,7 +37,8 @@ def simplify(
     if not any(known):
         return [], 0.0
     selected = {index for index in keep if known[index]}
-    gaps, last_index = [], len(known) - 1
+    gaps = []  # the first index of each gap
+    last_index = len(known) - 1
     for index, is_known in enumerate(known):
         is_end_of_line = index in (0, last_index) or not (known[index - 1] and known[index + 1])
         if is_known and (is_end_of_line or index % _MAX_SEGMENT == 0):
@@ -80,7 +81,8 @@ def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> 
     squared_length = segment_x * segment_x + segment_y * segment_y
     largest, largest_index = -1.0, first + 1
     for index in range(first + 1, last):
-        dx, dy = places[index][0] - x, places[index][1] - y
+        point_x, point_y = places[index]
+        dx, dy = point_x - x, point_y - y
         if squared_length:  # replaces (dx, dy) by the distance vector from the segment's nearest point
             fraction = (dx * segment_x + dy * segment_y) / squared_length
             fraction = 0.0 if fraction < 0.0 else min(fraction, 1.0)

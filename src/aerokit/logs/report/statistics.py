@@ -148,13 +148,16 @@ class _ArmedSpans:
 
     def known(self, columns: TimeSeries, name: str) -> list[float]:
         times, values = columns.times, columns[name]
-        parts = (values[bisect_left(times, begin) : bisect_right(times, end)] for begin, end in self._spans)
-        return [value for part in parts for value in part if math.isfinite(value)]
+        known: list[float] = []
+        for begin, end in self._spans:
+            part = values[bisect_left(times, begin) : bisect_right(times, end)]
+            known += [value for value in part if math.isfinite(value)]
+        return known
 
     def mean(self, columns: TimeSeries, name: str) -> float | None:
         """Return the average over time. A value counts until the next row, the last value for a second."""
         times, values = columns.times, columns[name]
-        total = weight = 0.0
+        total, weight = 0.0, 0.0
         for begin, end in self._spans:
             for row in range(bisect_left(times, begin), bisect_right(times, end)):
                 until_s = times[row + 1] if row + 1 < len(times) else times[row] + 1.0
@@ -208,10 +211,11 @@ def findings(flight: FlightLog) -> list[str]:
 def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     """Return texts with the values that were measured in the descent, as far as the log has them.
 
-    They are throttle, tilt, attitude error, motor outputs and battery current. An unusual value is followed by advice
-    on what to look at.
+    The values are throttle, tilt, attitude error, motor outputs and battery current. An unusual value is followed by
+    advice on what to look at.
     """
-    begin_s, end_s = fall.begins_s, fall.time_s - 0.2  # 0.2 s before the end, to exclude the impact
+    begin_s = fall.begins_s
+    end_s = fall.time_s - 0.2  # excludes the impact
     angles = ("roll_deg", "pitch_deg")
     texts = []
     currents = _currents(flight, begin_s, end_s)
@@ -232,7 +236,8 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     if motors:
         texts.append(motors)
     for name, current in currents.items():
-        texts.append(f"{name} {current.text('A')}{_STOPPED if current.is_low else ''}")
+        advice = _STOPPED if current.is_low else ""
+        texts.append(f"{name} {current.text('A')}{advice}")
     return texts
 
 
@@ -367,16 +372,17 @@ def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
 def _until_impact(flight: FlightLog, armed_s: float) -> str:
     """Return a note on the armed time until the first fall, if the vehicle was armed for a while after it."""
     impact_s = next((fall.time_s for fall in falls(flight) if fall.has_impact and not fall.is_hard_landing), math.inf)
-    until_s = sum(max(min(end, impact_s) - begin, 0.0) for begin, end in flight.armed)
-    return f" ({span(until_s)} until the impact)" if armed_s - until_s >= 1.0 else ""
+    armed_before_s = sum(max(min(end, impact_s) - begin, 0.0) for begin, end in flight.armed)
+    return f" ({span(armed_before_s)} until the impact)" if armed_s - armed_before_s >= 1.0 else ""
 
 
 def _modes_sentence(flight: FlightLog) -> str:
     seconds_by_mode = time_in_modes(flight)
-    modes = [f"{name} ({span(seconds)})" for name, seconds in seconds_by_mode.items() if seconds >= 0.5]
-    modes = modes or [f"{name} ({span(seconds)})" for name, seconds in seconds_by_mode.items()]
-    if not modes:
+    if not seconds_by_mode:
         return ""
+    # Modes that lasted less than half a second are omitted, unless all did.
+    longer = {name: seconds for name, seconds in seconds_by_mode.items() if seconds >= 0.5}
+    modes = [f"{name} ({span(seconds)})" for name, seconds in (longer or seconds_by_mode).items()]
     return f"{'Flown in' if flight.armed else 'In'} {', '.join(modes)}."
 
 
@@ -393,21 +399,21 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 
 def _failsafes_sentence(flight: FlightLog) -> str:
     """Return sentences about the failsafes, the warnings, and missing parameters that would explain the warnings."""
-    acted, warnings, kinds = [], [], []
+    acted, warnings, warning_kinds = [], [], []
     for failsafe in failsafes(flight):
         at = f"{failsafe.title} at {clock(failsafe.time_s)}"
         if failsafe.acted:
             acted.append(f"{at} ({failsafe.reaction})")
         else:
             warnings.append(f"{at} ({failsafe.evidence[0].text})")
-            kinds.append(failsafe.kind)
+            warning_kinds.append(failsafe.kind)
     sentences = []
     if acted:
         sentences.append(f"{len(acted)} failsafe{'' if len(acted) == 1 else 's'}: {_first_few(acted)}.")
     if warnings:
         plural = "" if len(warnings) == 1 else "s"
         sentences.append(f"{len(warnings)} warning{plural} without a recorded reaction: {_first_few(warnings)}.")
-    unknown = _unknown_actions(flight, kinds)
+    unknown = _unknown_actions(flight, warning_kinds)
     if unknown:
         sentences.append(f"The log does not contain the parameters that decide on the reaction: {', '.join(unknown)}.")
     return " ".join(sentences) or "No failsafe was reported."

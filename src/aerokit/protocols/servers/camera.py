@@ -114,7 +114,8 @@ def _stream_fields(camera: CameraDevice, stream: int) -> dict[str, Any]:
 
 def _flags(camera: CameraDevice, stream: int) -> int:
     flags: int = VideoStreamStatusFlags.RUNNING if stream in camera.running_streams else 0
-    if camera.thermal_celsius and stream == len(camera.streams):
+    is_thermal = camera.thermal_celsius is not None and stream == len(camera.streams)  # the last stream
+    if is_thermal:
         flags |= VideoStreamStatusFlags.THERMAL | VideoStreamStatusFlags.THERMAL_RANGE_ENABLED
     return flags
 

@@ -67,7 +67,7 @@ class _Pictures:
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
-        self._last_number = 0
+        self._last_sequence = 0
 
     async def start(self, command: ReceivedCommand) -> int:
         """Take images, if param 1 selects this camera.
@@ -77,20 +77,21 @@ class _Pictures:
         """
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
-        count, number = to_int(command.param3), to_int(command.param4)
+        count = to_int(command.param3)
+        sequence = to_int(command.param4)
         in_wrong_mode = _has_wrong_mode(camera, CameraMode.VIDEO, _CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
         if not _is_own(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
             return MavResult.DENIED
-        is_repeated = count == 1 and number > 0 and number == self._last_number
+        is_repeated = count == 1 and sequence > 0 and sequence == self._last_sequence
         if is_repeated:
             return MavResult.ACCEPTED
         if captures.is_busy:
             return MavResult.TEMPORARILY_REJECTED
         if not camera.has_space():
             return MavResult.FAILED
-        self._last_number = number if count == 1 else 0
+        self._last_sequence = sequence if count == 1 else 0
         captures.take_series(interval_s, count)
         return MavResult.ACCEPTED
 

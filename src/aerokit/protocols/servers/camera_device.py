@@ -167,7 +167,7 @@ class Captures:
         self.images: list[CameraImageCaptured] = []
         """The image log: the latest images since it was cleared, at most ``max_images``."""
         self.dropped_count: int = 0
-        """Number of older images that the log has dropped. It is also the image index of the log's first image."""
+        """Number of older images that the log has dropped. The log's first image has this image index."""
         self.interval_s: float = 0.0
         """Seconds between two images of the current series."""
         self._remaining = 0  # number of images of the series that are still to be taken; -1: no limit
@@ -179,7 +179,8 @@ class Captures:
     def switch_off(self) -> None:
         """End the series and the video at once, as a power failure does. The image log is kept."""
         self._remaining = 0
-        self._is_exposing = self._is_late = False
+        self._is_exposing = False
+        self._is_late = False
         self._recording_since = math.nan
         self._series += 1
 
@@ -193,7 +194,7 @@ class Captures:
         return not math.isnan(self._recording_since)
 
     def take(self) -> None:
-        self.take_series(0.0, 1)
+        self.take_series(interval_s=0.0, count=1)
 
     def take_series(self, interval_s: float, count: int) -> None:
         """Take ``count`` images (0: until `stop`), the first at once, then one every ``interval_s`` seconds."""
@@ -358,5 +359,7 @@ class Tracking:
         x, y, radius = self.place if is_point else (_UNKNOWN,) * 3
         is_rectangle = self.mode == CameraTrackingMode.RECTANGLE
         left, top, right, bottom = self.place if is_rectangle else (_UNKNOWN,) * 4
-        mode = int(self.mode)
-        return m.CameraTrackingImageStatus(self.flags, mode, Target.IN_STATUS, x, y, radius, left, top, right, bottom)
+        return m.CameraTrackingImageStatus(
+            tracking_status=self.flags, tracking_mode=int(self.mode), target_data=Target.IN_STATUS, point_x=x,
+            point_y=y, radius=radius, rec_top_x=left, rec_top_y=top, rec_bottom_x=right, rec_bottom_y=bottom,
+        )  # fmt: skip

@@ -130,9 +130,9 @@ class CommandDispatcher:
 
     def report(self, command: ReceivedCommand, progress: CommandProgress, answer: Callable[[], None]) -> None:
         """Send IN_PROGRESS with each percentage, then call ``finish`` and ``answer``."""
-        for number, percent in enumerate(progress.percents):
+        for index, percent in enumerate(progress.percents):
             self._host.call_later(
-                number * progress.interval_s,
+                index * progress.interval_s,
                 lambda percent=percent: self.answer(command, MavResult.IN_PROGRESS, percent),  # type: ignore[misc]
             )
 
@@ -146,7 +146,10 @@ class CommandDispatcher:
     def answer(self, command: ReceivedCommand, result: int, progress: int = 0, detail: int = 0) -> None:
         """Send an acknowledgement; ``detail`` is its ``result_param2``."""
         system, component = command.sender
-        ack = CommandAck(command.command, result, progress, detail, system, component)
+        ack = CommandAck(
+            command.command, result, progress=progress, result_param2=detail, target_system=system,
+            target_component=component,
+        )  # fmt: skip
         self._host.send(ack, command.channel)
 
 
@@ -219,9 +222,10 @@ class RunningCommands:
         if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
             self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
             return None
-        running = self._running[command.command] = RunningCommand(command, cancel)
-        self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(running))
-        return running
+        started = RunningCommand(command, cancel)
+        self._running[command.command] = started
+        self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(started))
+        return started
 
     def report(self, running: RunningCommand, percent: int) -> None:
         """Send IN_PROGRESS with this percentage now."""
@@ -230,6 +234,7 @@ class RunningCommands:
             self._server.answer(running.command, MavResult.IN_PROGRESS, percent)
 
     def _report_repeatedly(self, running: RunningCommand) -> None:
+        """Send IN_PROGRESS now and at intervals, until the command has ended."""
         if self._running.get(running.command.command) is running:
             self._server.answer(running.command, MavResult.IN_PROGRESS, running.progress)
             self._host.call_later(PROGRESS_INTERVAL_S, lambda: self._report_repeatedly(running))

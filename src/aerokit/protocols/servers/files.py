@@ -12,7 +12,7 @@ from typing_extensions import Self
 ENOENT, EEXIST, ENOTDIR, EISDIR = 2, 17, 20, 21
 EINVAL, ENFILE, EFBIG, ENOSPC, EROFS, ENOTEMPTY = 22, 23, 27, 28, 30, 39
 
-# (name, size in bytes). The size is None for a folder.
+# An entry has a name, and a size in bytes, which is None for a folder.
 Entry = tuple[str, int | None]
 
 
@@ -162,6 +162,8 @@ _Folder = dict[str, "_File | _Folder"]
 
 
 class _Opened(FileHandle):
+    """An open file in memory; it is read-only if ``tree`` is None."""
+
     def __init__(self, tree: FileTree | None, file: _File) -> None:
         self._tree = tree
         self._file = file

@@ -75,8 +75,8 @@ class SessionFtpServer(Generic[FilesT]):
     line_end: ClassVar[bytes] = b"\0"
     creates_missing: ClassVar[bool] = True
     """True if OpenFileWO creates a missing file."""
-    reply_kept: ClassVar[int] = 4
-    """Maximum data size of a reply that is stored, in bytes. A stored reply answers a repeated request."""
+    max_stored_reply_size: ClassVar[int] = 4
+    """Maximum size in bytes of the data of a reply that is stored. A stored reply answers a repeated request."""
     crc_block: ClassVar[int] = 65_536
     crc_blocks_at_once: ClassVar[int] = 8
     """Number of blocks of a file that are read for a checksum before the event loop continues."""
@@ -135,7 +135,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         """Return the number for a new session.
 
-        It is the number that the client requests, as MAVProxy does, or a free number.
+        The client may request a number, as MAVProxy does. Otherwise, a free number is used.
         """
         if request.session and request.session not in peer.sessions:
             return request.session
@@ -149,10 +149,11 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the state of a client; None if there are too many clients with open files."""
         key = self._key(request, channel)
         if key not in self._peers and len(self._peers) >= self.max_clients:
-            idle_keys = [idle for idle, peer in self._peers.items() if not peer.sessions and peer.checksum is None]
-            if not idle_keys:
+            idle = (other for other, peer in self._peers.items() if not peer.sessions and peer.checksum is None)
+            idle_key = next(idle, None)
+            if idle_key is None:
                 return None
-            del self._peers[idle_keys[0]]  # A client without open files makes room for the new one.
+            del self._peers[idle_key]  # A client without open files makes room for the new one.
         peer = self._peers.setdefault(key, FtpPeer(channel))
         peer.channel = channel
         return peer
@@ -192,7 +193,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
         # NOSESSIONSAVAILABLE is not stored: the client repeats its request until a session is free, and then needs a
         # new answer.
-        if answer.size <= self.reply_kept and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
+        if answer.size <= self.max_stored_reply_size and answer.data[:1] != bytes([MavFtpErr.NOSESSIONSAVAILABLE]):
             peer.reply = answer
         self._host.send(answer.message(), peer.channel)
 
@@ -250,7 +251,8 @@ class SessionFtpServer(Generic[FilesT]):
         create = request.opcode == Op.CREATEFILE or (may_create and path not in self.files)
         file = self.files.open(path, writing=not is_reading, create=create)
         number = self._new_number(peer, request)
-        session = peer.sessions[number] = FtpSession(number, file, size, not is_reading)
+        session = FtpSession(number, file, size, is_writing=not is_reading)
+        peer.sessions[number] = session
         self._watch(peer, session)
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 

@@ -31,7 +31,10 @@ class FtpPacket(FtpMessage):
         return are_equal and self.data[: self.size] == other.data[: other.size]
 
     def message(self) -> FileTransferProtocol:
-        return FileTransferProtocol(0, *self.client, self.encode())
+        system, component = self.client
+        return FileTransferProtocol(
+            target_network=0, target_system=system, target_component=component, payload=self.encode()
+        )
 
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
         """Return the ACK of this request."""

@@ -121,8 +121,13 @@ class GimbalMount:
 
 
 def gimbal_manager_status(gimbal: GimbalMount) -> m.GimbalManagerStatus:
-    device = gimbal.device_id
-    return m.GimbalManagerStatus(gimbal.host.time_boot_ms, _flags(gimbal), device, *gimbal.primary, *gimbal.secondary)
+    primary_system, primary_component = gimbal.primary
+    secondary_system, secondary_component = gimbal.secondary
+    return m.GimbalManagerStatus(
+        time_boot_ms=gimbal.host.time_boot_ms, flags=_flags(gimbal), gimbal_device_id=gimbal.device_id,
+        primary_control_sysid=primary_system, primary_control_compid=primary_component,
+        secondary_control_sysid=secondary_system, secondary_control_compid=secondary_component,
+    )  # fmt: skip
 
 
 def _flags(gimbal: GimbalMount) -> int:
@@ -159,8 +164,12 @@ def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:
     capabilities = int(gimbal.capabilities)
     if gimbal.can_point_at_positions:
         capabilities |= GimbalManagerCapFlags.CAN_POINT_LOCATION_GLOBAL
-    limits = (limit for min_and_max in gimbal.limits for limit in min_and_max)
-    return m.GimbalManagerInformation(gimbal.host.time_boot_ms, capabilities, gimbal.device_id, *limits)
+    (roll_min, roll_max), (pitch_min, pitch_max), (yaw_min, yaw_max) = gimbal.limits
+    return m.GimbalManagerInformation(
+        time_boot_ms=gimbal.host.time_boot_ms, cap_flags=capabilities, gimbal_device_id=gimbal.device_id,
+        roll_min=roll_min, roll_max=roll_max, pitch_min=pitch_min, pitch_max=pitch_max, yaw_min=yaw_min,
+        yaw_max=yaw_max,
+    )  # fmt: skip
 
 
 _UNCHANGED, _SENDER, _RELEASE = -1, -2, -3
@@ -187,10 +196,11 @@ class GimbalRequests:
         ids = (command.param1, command.param2, command.param3, command.param4)
         if not self._selects_gimbal(command.z) or not all(_RELEASE <= number <= 255 for number in ids):
             return MavResult.DENIED
-        system1, component1, system2, component2 = map(int, ids)
-        primary = _owner(gimbal.primary, (system1, component1), sender)
-        secondary = _owner(gimbal.secondary, (system2, component2), sender)
-        gimbal.set_control(primary, secondary)
+        primary_system, primary_component, secondary_system, secondary_component = map(int, ids)
+        gimbal.set_control(
+            primary=_owner(gimbal.primary, (primary_system, primary_component), sender),
+            secondary=_owner(gimbal.secondary, (secondary_system, secondary_component), sender),
+        )
         return MavResult.ACCEPTED
 
     def pitch_and_yaw(self, command: ReceivedCommand) -> int:
@@ -200,7 +210,8 @@ class GimbalRequests:
         pitch, yaw, pitch_rate, yaw_rate = map(
             math.radians, (command.param1, command.param2, command.param3, command.param4)
         )
-        is_applied = self.apply(to_int(command.x), (0.0, pitch, yaw), (0.0, pitch_rate, yaw_rate))
+        flags = to_int(command.x)
+        is_applied = self.apply(flags, angles=(0.0, pitch, yaw), rates=(0.0, pitch_rate, yaw_rate))
         return MavResult.ACCEPTED if is_applied else MavResult.DENIED
 
     def _refusal(self, device_id: float, command: ReceivedCommand) -> int | None:

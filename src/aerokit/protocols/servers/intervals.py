@@ -49,7 +49,7 @@ class MessageStreams:
     def stream(self, message_id: int, interval_s: float, channel: Channel = None) -> bool:
         """Stream messages with this id on one channel (None: on all channels). An interval of 0 stops the stream.
 
-        Returns False if there are too many streams already.
+        Return False if there are too many streams already.
         """
         key = (channel, message_id)
         if interval_s <= 0.0:

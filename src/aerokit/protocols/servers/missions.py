@@ -38,14 +38,18 @@ def item_message_float(
     item: MissionItem, place: tuple[float, float], seq: int, to: tuple[int, int], mission_type: int, current: int = 0
 ) -> m.MissionItem:
     """Create a MISSION_ITEM; ``place`` becomes ``x`` and ``y``."""
-    head = (*to, seq, item.frame, item.command, current, int(item.autocontinue))
-    numbers = (item.param1, item.param2, item.param3, item.param4)
-    return m.MissionItem(*head, *numbers, *place, item.z, mission_type)
+    system, component = to
+    x, y = place
+    return m.MissionItem(
+        target_system=system, target_component=component, seq=seq, frame=item.frame, command=item.command,
+        current=current, autocontinue=int(item.autocontinue), param1=item.param1, param2=item.param2,
+        param3=item.param3, param4=item.param4, x=x, y=y, z=item.z, mission_type=mission_type,
+    )  # fmt: skip
 
 
 MAX_ITEMS = 2000
 _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
-_R = MavMissionResult
+_Result = MavMissionResult
 
 # Function that accepts or refuses an uploaded list, now or later. Its arguments are the MAV_MISSION_TYPE, the items,
 # and a function to call with the MAV_MISSION_RESULT.
@@ -89,7 +93,7 @@ class MissionServer:
     def __init__(
         self,
         host: ServerHost,
-        validate: Validator = lambda _, __, answer: answer(_R.ACCEPTED),
+        validate: Validator = lambda _, __, answer: answer(_Result.ACCEPTED),
         *,
         on_set_current: Callable[[int], bool] = lambda _: False,
         capacity: int = MAX_ITEMS,
@@ -140,10 +144,10 @@ class MissionServer:
         return self._opaque_ids[mission_type] if items else 0
 
     def current_message(self) -> m.MissionCurrent:
-        fence, rally = self.id(MavMissionType.FENCE), self.id(MavMissionType.RALLY)
         return m.MissionCurrent(
-            self.current, self.count(0), mission_id=self.id(0), fence_id=fence, rally_points_id=rally
-        )
+            seq=self.current, total=self.count(MavMissionType.MISSION), mission_id=self.id(MavMissionType.MISSION),
+            fence_id=self.id(MavMissionType.FENCE), rally_points_id=self.id(MavMissionType.RALLY),
+        )  # fmt: skip
 
     def store(self, mission_type: int, items: Sequence[MissionItem]) -> None:
         """Replace a list."""
@@ -170,12 +174,12 @@ class MissionServer:
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
         """Return the MAV_MISSION_RESULT that refuses a transfer, else None."""
-        return None if message.mission_type in self.lists else _R.UNSUPPORTED
+        return None if message.mission_type in self.lists else _Result.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
         """Return the requested item; if it does not exist, the MAV_MISSION_RESULT for the answer."""
         items = self.lists.get(mission_type, ())
-        return items[seq] if 0 <= seq < len(items) else _R.INVALID_SEQUENCE
+        return items[seq] if 0 <= seq < len(items) else _Result.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         """Return the item as MISSION_ITEM_INT or MISSION_ITEM, whichever was requested."""
@@ -192,21 +196,24 @@ class MissionServer:
         """Store the expected item of an upload; return the MAV_MISSION_RESULT."""
         upload.uses_int = isinstance(message, m.MissionItemInt)
         upload.items.append(from_wire(message))
-        return _R.ACCEPTED
+        return _Result.ACCEPTED
 
     def _key(self, mission_type: int) -> int:
         """Return the key of an upload; uploads with different keys can run at the same time."""
         return 0
 
     def _acknowledge(self, to: tuple[int, int], kind: int, result: int, channel: Channel, opaque_id: int = 0) -> None:
-        self._host.send(m.MissionAck(*to, result, kind, opaque_id), channel)
+        system, component = to
+        self._host.send(m.MissionAck(system, component, result, kind, opaque_id=opaque_id), channel)
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         kind, to = request.mission_type, sender_of(request)
         if (refusal := self._refusal(request, channel)) is not None:
             self._acknowledge(to, kind, refusal, channel)
         else:
-            self._host.send(m.MissionCount(*to, self.count(kind), kind, self.id(kind)), channel)
+            system, component = to
+            count = m.MissionCount(system, component, self.count(kind), kind, opaque_id=self.id(kind))
+            self._host.send(count, channel)
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         refusal = self._refusal(request, channel)
@@ -219,34 +226,38 @@ class MissionServer:
     def _refuse_item(self, request: AnyRequest, result: int, channel: Channel) -> None:
         self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
-    def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
-        client, kind = sender_of(count), count.mission_type
+    def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
+        """Begin an upload, unless it must be refused."""
+        client, kind = sender_of(message), message.mission_type
         running = self._uploads.get(self._key(kind))
-        refusal = self._refusal(count, channel)
+        refusal = self._refusal(message, channel)
         is_occupied = running is not None and (running.client != client or running.is_being_validated)
         if refusal is None and (is_occupied or self._clearing is not None):
-            refusal = _R.DENIED
+            refusal = _Result.DENIED
         if refusal is not None:
             self._acknowledge(client, kind, refusal, channel)
             return
         if running is not None:  # The same client starts its upload again.
             self._drop(running)
-        if count.count > self.capacity(kind):
-            self._refuse_size(count, channel)
+        if message.count > self.capacity(kind):
+            self._refuse_size(message, channel)
             return
-        upload = self._begin(count, channel, 0, count.count)
-        if count.count:
+        upload = self._begin(message, channel, first=0, end=message.count)
+        if message.count:
             self._start(upload)
         else:
             self._finish(upload)
 
-    def _refuse_size(self, count: m.MissionCount, channel: Channel) -> None:
-        self._acknowledge(sender_of(count), count.mission_type, _R.NO_SPACE, channel)
+    def _refuse_size(self, message: m.MissionCount, channel: Channel) -> None:
+        self._acknowledge(sender_of(message), message.mission_type, _Result.NO_SPACE, channel)
 
     def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
-        now, kind = self._host.now, message.mission_type
-        upload = ListUpload(sender_of(message), channel, kind, first, end, now, now, self.requests_int)
-        self._uploads[self._key(kind)] = upload
+        """Register an upload of the items from ``first`` to before ``end``. Nothing is sent."""
+        upload = ListUpload(
+            client=sender_of(message), channel=channel, mission_type=message.mission_type, next=first, end=end,
+            received_at=self._host.now, requested_at=self._host.now, uses_int=self.requests_int,
+        )  # fmt: skip
+        self._uploads[self._key(upload.mission_type)] = upload
         return upload
 
     def _start(self, upload: ListUpload) -> None:
@@ -258,14 +269,16 @@ class MissionServer:
         self._uploads.pop(self._key(upload.mission_type), None)
 
     def _end(self, upload: ListUpload, result: int) -> None:
+        """End an upload with this MAV_MISSION_RESULT."""
         self._drop(upload)
-        opaque_id = self.id(upload.mission_type) if result == _R.ACCEPTED else 0
+        opaque_id = self.id(upload.mission_type) if result == _Result.ACCEPTED else 0
         self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
 
     def _request_item(self, upload: ListUpload) -> None:
         upload.requested_at = self._host.now
-        request = m.MissionRequestInt if upload.uses_int else m.MissionRequest
-        self._host.send(request(*upload.client, upload.next, upload.mission_type), upload.channel)
+        request_class = m.MissionRequestInt if upload.uses_int else m.MissionRequest
+        system, component = upload.client
+        self._host.send(request_class(system, component, upload.next, upload.mission_type), upload.channel)
 
     def _watch(self, upload: ListUpload) -> None:
         """Schedule the next retry or the time-out."""
@@ -293,17 +306,17 @@ class MissionServer:
         self._request_item(upload)
 
     def _time_out(self, upload: ListUpload) -> None:
-        self._end(upload, _R.OPERATION_CANCELLED)
+        self._end(upload, _Result.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
         """Process an item. Only the expected item from the client that uploads is stored."""
         upload = self._uploads.get(self._key(message.mission_type))
         if upload is None or message.mission_type != upload.mission_type:
-            self._answer_item(message, _R.ERROR, channel)
+            self._answer_item(message, _Result.ERROR, channel)
         elif message.seq != upload.next:
-            self._answer_item(message, _R.INVALID_SEQUENCE, upload.channel)
+            self._answer_item(message, _Result.INVALID_SEQUENCE, upload.channel)
         elif sender_of(message) != upload.client:
-            self._answer_item(message, _R.DENIED, upload.channel)
+            self._answer_item(message, _Result.DENIED, upload.channel)
         elif not upload.is_being_validated:
             self._receive_item(upload, message)
 
@@ -313,7 +326,7 @@ class MissionServer:
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
         """Store the expected item of an upload, and request the next one."""
         result = self._store_item(upload, message)
-        if result != _R.ACCEPTED:
+        if result != _Result.ACCEPTED:
             self._end(upload, result)
             return
         upload.received_at = self._host.now
@@ -329,14 +342,14 @@ class MissionServer:
 
         def answer(result: int) -> None:
             if self._is_running(upload):
-                if result == _R.ACCEPTED:
+                if result == _Result.ACCEPTED:
                     self.store(upload.mission_type, upload.items)
                 self._end(upload, result)
 
         try:
             self._validate(upload.mission_type, tuple(upload.items), answer)
         except InvalidArgument:
-            answer(_R.INVALID)
+            answer(_Result.INVALID)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
         """End the client's own upload. At the end of a download there is nothing to do."""
@@ -345,20 +358,20 @@ class MissionServer:
             upload is not None
             and sender_of(ack) == upload.client
             and not upload.is_being_validated
-            and ack.type != _R.ACCEPTED
+            and ack.type != _Result.ACCEPTED
         ):
             self._drop(upload)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
         client, kind = sender_of(request), request.mission_type
         if kind not in (*self.lists, MavMissionType.ALL):
-            self._acknowledge(client, kind, _R.UNSUPPORTED, channel)
+            self._acknowledge(client, kind, _Result.UNSUPPORTED, channel)
         elif self._clearing is not None:
             is_repeated = (sender_of(self._clearing), self._clearing.mission_type) == (client, kind)
             if not is_repeated:  # A repeated request is answered together with its first transmission.
-                self._acknowledge(client, kind, _R.DENIED, channel)
+                self._acknowledge(client, kind, _Result.DENIED, channel)
         elif self.transfer_is_open:
-            self._acknowledge(client, kind, _R.DENIED, channel)
+            self._acknowledge(client, kind, _Result.DENIED, channel)
         else:
             self._clearing = request
             non_empty: list[int] = [mission_type for mission_type in _TYPES if self.lists[mission_type]]
@@ -370,21 +383,22 @@ class MissionServer:
         def answer(result: int) -> None:
             if self._clearing is not request:  # The server was reset before the answer arrived.
                 return
-            if result == _R.ACCEPTED and kinds:
-                first, *others = kinds
-                self.store(first, ())
-                self._clear(others, request, channel)
+            if result == _Result.ACCEPTED and kinds:
+                cleared_kind, *other_kinds = kinds
+                self.store(cleared_kind, ())
+                self._clear(other_kinds, request, channel)
                 return
             self._clearing = None
             self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
         if not kinds:
-            answer(_R.ACCEPTED)
+            answer(_Result.ACCEPTED)
             return
+        next_kind = kinds[0]
         try:
-            self._validate(kinds[0], (), answer)
+            self._validate(next_kind, (), answer)
         except InvalidArgument:
-            answer(_R.INVALID)
+            answer(_Result.INVALID)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         if not self.set_current(request.seq):

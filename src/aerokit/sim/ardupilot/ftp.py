@@ -39,7 +39,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     max_sessions: ClassVar[int] = 1
     line_end: ClassVar[bytes] = b"\0\0"
     creates_missing: ClassVar[bool] = False
-    reply_kept: ClassVar[int] = DATA_SIZE
+    max_stored_reply_size: ClassVar[int] = DATA_SIZE
     crc_block: ClassVar[int] = 64
     crc_blocks_at_once: ClassVar[int] = 1 << 32
 

@@ -83,7 +83,7 @@ class PlanChannel:
                 *self._target,
                 window=self._context.autopilot.mission_download_window,
                 only=only,
-                gives_int=await self._supports_int(),
+                supports_int=await self._supports_int(),
                 **self._wire_options,
             )
         )
@@ -144,7 +144,7 @@ class PlanChannel:
             items,
             first=first_seq,
             window=window,
-            takes_int=await self._supports_int(),
+            supports_int=await self._supports_int(),
             **self._wire_options,
         )
 
