@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal import geo
-from aerokit.apps.cli.completion import assignments, offer
+from aerokit.apps.cli.completion import assignments, set_completions
 from aerokit.apps.cli.completion import kinds as kind_names
 from aerokit.apps.cli.misplaced import is_address, misplaced_file
 from aerokit.apps.cli.output import suggestion
@@ -36,15 +36,16 @@ def is_address_template(address: str) -> bool:
 def expand_address(address: str, number: int, system_id: int) -> str:
     """Fill in the placeholders of an address template for one vehicle.
 
-    ``{n}`` is the number of the vehicle, from 0, and ``{id}`` is its system id. ``{5760+10n}`` computes a port from
-    such a value.
+    ``{n}`` is the number of the vehicle, from 0, and ``{id}`` is its system id. A placeholder can have a factor and a
+    summand: ``{5760+10n}`` is 5760, 5770, 5780 …
     """
 
-    def value(match: re.Match[str]) -> str:
-        start, factor, name = match.groups()
-        return str(int(start or 0) + int(factor or 1) * (number if name == "n" else system_id))
+    def expand(match: re.Match[str]) -> str:
+        summand, factor, name = match.groups(default="")
+        value = number if name == "n" else system_id
+        return str(int(summand or 0) + int(factor or 1) * value)
 
-    return _TEMPLATE_FIELD.sub(value, address)
+    return _TEMPLATE_FIELD.sub(expand, address)
 
 
 def address(text: str) -> str:
@@ -115,6 +116,8 @@ def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     if name == "rc_lost":
         at_s = max(at_s, TRANSMITTER_ON_S)
     if name in _SHARE_FAULTS:
+        if not value:
+            raise ArgumentTypeError(f"{name} needs the share of frames to lose: {name}=0.2")
         return name, number(0, 1)(value), at_s
     if name == "prearm_failures":
         if not value:
@@ -229,7 +232,7 @@ def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
     kind = command.add_argument(
         "--vehicle", type=vehicle_kind, default="copter", metavar="KIND", help=f"simulated vehicle: {kinds}"
     )
-    offer(kind, kind_names)
+    set_completions(kind, kind_names)
 
 
 def add_baud(command: argparse._ActionsContainer) -> None:
@@ -259,7 +262,7 @@ def add_faults(command: argparse._ActionsContainer) -> None:
         help="fault of every simulated vehicle, from the start or after S simulated seconds (repeatable):"
         f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
     )
-    offer(faults, lambda: FAULTS)
+    set_completions(faults, lambda: FAULTS)
 
 
 def add_conditions(command: argparse._ActionsContainer) -> None:
@@ -273,7 +276,7 @@ def add_conditions(command: argparse._ActionsContainer) -> None:
         metavar="NAME=VALUE",
         help="parameter value instead of its default (repeatable): MNT1_TYPE=1 gives the copter's autopilot a gimbal",
     )
-    offer(parameters, assignments)
+    set_completions(parameters, assignments)
     command.add_argument(
         "--wind",
         type=wind,
@@ -288,9 +291,11 @@ def conditions(options: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options of `add_conditions`, as arguments of a simulated vehicle."""
     from aerokit.sim import SimulatedWind
 
-    optional = {
-        "battery_percent": options.battery,
-        "wind": None if options.wind is None else SimulatedWind(*options.wind),
-        "parameters": dict(options.parameters) or None,
-    }
-    return {name: value for name, value in optional.items() if value is not None}
+    arguments: dict[str, Any] = {}
+    if options.battery is not None:
+        arguments["battery_percent"] = options.battery
+    if options.wind is not None:
+        arguments["wind"] = SimulatedWind(*options.wind)
+    if options.parameters:
+        arguments["parameters"] = dict(options.parameters)
+    return arguments

@@ -12,7 +12,7 @@ import anyio
 
 from aerokit.apps.cli import connecting
 from aerokit.apps.cli.arguments import assignment, writable_file
-from aerokit.apps.cli.completion import assignments, offer, parameter_names
+from aerokit.apps.cli.completion import assignments, parameter_names, set_completions
 from aerokit.apps.cli.connecting import add_action
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, near_names, suggestion
 from aerokit.apps.cli.params_metadata import (
@@ -59,7 +59,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     pattern = listing.add_argument(
         "pattern", nargs="?", default="*", help="part of the names, or 'BATT_*' (default: all)"
     )
-    offer(pattern, parameter_names)
+    set_completions(pattern, parameter_names)
     add_metadata(listing)
     listing.add_argument(
         "--changed",
@@ -67,7 +67,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
         help="only those that differ from their default (on PX4: from that in --metadata FILE)",
     )
     get = add_action(actions, "get", _get, "Read single parameters.")
-    offer(get.add_argument("names", nargs="+", metavar="NAME"), parameter_names)
+    set_completions(get.add_argument("names", nargs="+", metavar="NAME"), parameter_names)
     add_metadata(get)
     save = add_action(actions, "save", _save, "Save all parameters to a file.")
     save.add_argument("file", type=writable_file)
@@ -79,7 +79,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     set_ = add_action(actions, "set", _set, "Set parameters. The vehicle confirms each value.")
-    offer(set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE"), assignments)
+    set_completions(set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE"), assignments)
     add_metadata(set_, checks=True)
     load = add_action(actions, "load", _load, "Set all parameters in a file that differ on the vehicle.")
     load.add_argument("file")
@@ -179,8 +179,8 @@ async def _set(options: argparse.Namespace) -> int:
     if not options.force and (metadata is not None or options.json):
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
     code = _emit_results(options, results.values(), known, metadata)
-    was_set = any(result.error is None and result.outcome != "unchanged" for result in results.values())
-    if was_set and metadata is None and not (options.force or options.json):
+    has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
+    if has_changed and metadata is None and not (options.force or options.json):
         print(metadata_source(vehicle))
     return code
 

@@ -85,7 +85,7 @@ async def metadata_for_check(
 async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
     from aerokit.parameters.metadata import parse_metadata
 
-    problem = f"not read within {_READ_TIMEOUT_S:g} s"
+    problem = f"time-out after {_READ_TIMEOUT_S:g} s"
     with anyio.move_on_after(_READ_TIMEOUT_S):
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")
@@ -94,8 +94,11 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
             return None
         except AerokitError as error:
             problem = str(error)
-    text = f"the ranges of the values are not checked: the vehicle's metadata: {problem}; use --metadata FILE"
-    print(f"aerokit: {text}", file=sys.stderr)
+    print(
+        "aerokit: the ranges of the values are not checked, because reading the metadata from the vehicle failed:"
+        f" {problem}; use --metadata FILE",
+        file=sys.stderr,
+    )
     return None
 
 

@@ -97,9 +97,11 @@ def simulated_fleet(
 
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
-    if system_id + count - 1 > 255:
-        last = system_id + count - 1
-        raise InvalidArgument(f"{count} vehicles from system id {system_id} need ids up to {last}; the maximum is 255")
+    last_id = system_id + count - 1
+    if last_id > 255:
+        raise InvalidArgument(
+            f"{count} vehicles from system id {system_id} need ids up to {last_id}; the maximum is 255"
+        )
     latitude_deg, longitude_deg, altitude_m = home or HOME
     frame = LocalFrame(GlobalPoint(round(latitude_deg * 1e7), round(longitude_deg * 1e7), altitude_m))
     homes = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
@@ -240,7 +242,7 @@ async def run_sim(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with server, faults_begin(vehicles, options):
-            _emit(server, options)
+            _emit_addresses(server, options)
             real_duration_s = None if options.duration is None else options.duration / options.speedup
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(stop.wait(), real_duration_s)
@@ -315,7 +317,8 @@ def _tracks(vehicles: Sequence[SimulatedVehicle], picture: str | None) -> list[T
 
 def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], speedup: float) -> SimulatorServer:
     """Create the server. An address template becomes one link for each vehicle, any other address one link for all."""
-    links, vehicles_on = [], []
+    links = []
+    vehicles_on = []
     for address in addresses:
         groups = [[vehicle] for vehicle in vehicles] if is_address_template(address) else [list(vehicles)]
         for index, group in enumerate(groups):
@@ -324,7 +327,7 @@ def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], spee
     return SimulatorServer(vehicles, links, speedup=speedup, vehicles_on=vehicles_on)
 
 
-def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
+def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> None:
     """Print the addresses of the vehicles, and commands to try."""
     for address, vehicles in zip(server.addresses, server.vehicles_on, strict=True):
         record = {
@@ -333,9 +336,12 @@ def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
             "speedup": options.speedup,
         }
         # Without --json, the addresses that serve the same vehicles are printed together on one line.
-        same = [other for other, others in zip(server.addresses, server.vehicles_on, strict=True) if others == vehicles]
-        text = f"{_systems(vehicles)} on {' and '.join(same)}, speed {options.speedup:g}x"
-        emit(options, "simulated", record, text if address == same[0] else None)
+        shared = []
+        for other_address, other_vehicles in zip(server.addresses, server.vehicles_on, strict=True):
+            if other_vehicles == vehicles:
+                shared.append(other_address)
+        text = f"{_systems(vehicles)} on {' and '.join(shared)}, speed {options.speedup:g}x"
+        emit(options, "simulated", record, text if address == shared[0] else None)
     if not options.json:
         vehicles = server.vehicles_on[0]
         client = _client_address(server.addresses[0], options.addresses[0])
@@ -368,7 +374,8 @@ def _client_address(address: str, argument: str) -> str:
 def _zenoh_options(address: str) -> str:
     """Return the query of a client's zenoh address, which connects to an endpoint of the simulator."""
     parsed = parse_address(expand_address(address, 0, 1))
-    endpoints, config = parsed.option("listen") or parsed.option("connect"), parsed.option("config")
+    endpoints = parsed.option("listen") or parsed.option("connect")
+    config = parsed.option("config")
     options = []
     if endpoints:
         options.append(f"connect={endpoints.replace('0.0.0.0', '127.0.0.1')}")

@@ -17,7 +17,7 @@ import anyio
 
 from aerokit import events
 from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
-from aerokit.apps.readiness import Readiness, arms_but, readiness
+from aerokit.apps.readiness import arms_but, readiness
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -68,8 +68,10 @@ class SupervisedFlight(ABC):
     _prints_reasons = True  # False if the command prints the error with its reasons when it ends
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
-        self._vehicle, self._print, self._interrupts = vehicle, report.print_line, interrupts
+        self._vehicle = vehicle
+        self._interrupts = interrupts
         self._report = report
+        self._print = report.print_line
         self._on_interrupt = on_interrupt
         self.armed_by_us: bool = False
         """True once this program has sent an arm command."""
@@ -167,6 +169,7 @@ class SupervisedFlight(ABC):
                 self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
+            # The vehicle is still armed, so it gets the command for a flying vehicle.
         text = INTERRUPT_ACTIONS[action]
         self._print(text if action == "nothing" else f"{text}; Ctrl-C exits at once")
         if action == "return":
@@ -200,6 +203,7 @@ class SupervisedFlight(ABC):
         self._print("disarmed")
 
     def _check_control(self) -> bool:
+        """Return True if this program still has control. Otherwise, print why no command is sent."""
         if not self._is_in_our_mode:
             mode, now = self._vehicle.mode_name, self._vehicle.describe_now()
             self._print(
@@ -228,16 +232,20 @@ class FlightReport:
     """
 
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
-        self._vehicle, self._options = vehicle, options
+        self._vehicle = vehicle
+        self._options = options
         self.speedup: float = speedup
         self._clocks = ClockComparison()
         # Seconds of this computer's clock, not of the vehicle's, which a simulation may speed up.
         self._armed_at: float | None = None
         self._armed_s = 0.0
-        self._fast_sink_at: float | None = None  # when the vehicle last sank as fast as before an impact
+        self._fast_sink_at: float | None = None  # when the vehicle last sank at IMPACT_M_S or faster
         self._impact_s: float | None = None  # seconds from arming to an impact on the ground
-        self._started_at = self._last_line_at = vehicle.connection.now()
-        self._highest_m = self._fastest_m_s = self._flown_m = 0.0
+        self._started_at = vehicle.connection.now()
+        self._last_line_at = self._started_at
+        self._highest_m = 0.0
+        self._fastest_m_s = 0.0
+        self._flown_m = 0.0
         self._previous_position: Position | None = None
         self.prints_status: bool = True
         """True if status lines are printed when there is no other output. Set it to False during questions."""
@@ -331,7 +339,7 @@ class FlightReport:
         self._emit("flight_summary", record, "\n".join(lines))
 
     def _describe_armed(self, speed: float) -> str:
-        """Return a clause such as "armed for 47 s". Notes give the time until an impact, and that of a simulation."""
+        """Return "armed for 47 s", with notes on the time until an impact and on the speed of a simulation."""
         notes = []
         if self._impact_s is not None:
             notes.append(f"{_duration(speed * self._impact_s)} until the impact")
@@ -382,12 +390,13 @@ class FlightReport:
                 seconds = self.speedup * vehicle.heartbeat_age
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
-            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle, changes_mode=True)
-            if found.against_arming:
-                yet = " yet" if found.is_known else ""
-                self.print_line(f"  {found.prefix}{yet}: {'; '.join([*found.against_arming, *found.against_flight])}")
-            elif found.against_flight:
-                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
+            checks = None if vehicle.is_armed else readiness(vehicle, changes_mode=True)
+            if checks is not None and checks.against_arming:
+                yet = " yet" if checks.is_known else ""
+                reasons = "; ".join([*checks.against_arming, *checks.against_flight])
+                self.print_line(f"  {checks.prefix}{yet}: {reasons}")
+            elif checks is not None and checks.against_flight:
+                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(checks.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 
