@@ -46,8 +46,10 @@ class ServedFlight:
         """Injects faults."""
         self.recording: FlightRecording | None = recording
         """Recording of the vehicle's link; None without ``record=True``."""
-        self._portal, self._server = portal, server
-        self._scheduler, self._interruption = scheduler, interruption
+        self._portal = portal
+        self._server = server
+        self._scheduler = scheduler
+        self._interruption = interruption
         self._is_raised = False
         scheduler.refresh_with(lambda: portal.call(self._refresh))
 
@@ -124,7 +126,8 @@ def hosted_flight(
     options.setdefault("boot_time_s", 1.0)
     vehicle: Any = simulated(kind, **options)
     scale_timeouts([vehicle], speedup, leave=options.get("parameters") or ())
-    scheduler, interruption = FlightScheduler([vehicle]), Interruption()
+    scheduler = FlightScheduler([vehicle])
+    interruption = Interruption()
     recording = FlightRecording() if record else None
 
     @asynccontextmanager

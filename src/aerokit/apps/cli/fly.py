@@ -57,7 +57,7 @@ class PlanFlight(SupervisedFlight):
         self._plan = plan
         self._options = options
         self.sent_text: str = _NOTHING_SENT
-        """What was sent to the vehicle before arming, in words for the message after Ctrl-C."""
+        """Text about what was sent to the vehicle before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle
