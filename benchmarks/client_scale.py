@@ -37,7 +37,7 @@ __all__ = ["COUNTS", "rows"]
 COUNTS = (1, 10, 50, 100, 200, 500)
 MAX_VEHICLES_ON_LINK = 250
 MIN_LINEARITY = 0.8
-"""Minimum ratio of the cost of one vehicle among 10 to that of one vehicle among more than 10."""
+"""Target: the cost of a vehicle among 10, divided by the cost of a vehicle among more than 10."""
 MAX_MIB = 0.15
 # Interval at which every vehicle sends all messages.
 TURN_S = 0.25

@@ -77,6 +77,7 @@ async def _in_turns(
 
 
 async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:
+    """Return the rate at which a subscriber reads all messages by ``async for``."""
     message_types = {STANDARD[Frame.parse(raw).message_id] for raw in frames}
     cpu_s = 0.0
     read_count = 0
@@ -105,6 +106,7 @@ async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:
 
 
 async def _telemetry(frames: list[bytes], pieces: list[bytes]) -> float:
+    """Return the rate at which the telemetry of a vehicle processes frames."""
     link = FedLink("recording")
     async with aerokit.open_connection(link) as connection:
         for raw in frames:

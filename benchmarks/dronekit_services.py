@@ -169,6 +169,7 @@ class Services:
         reply.send(ACK, 0, struct.pack("<I", 1 << 20))
 
     def _send_burst(self, due_at: float, burst_number: int, reply: _Reply, offset: int, size: int) -> None:
+        """Send one block of a burst, and schedule the next block. Stop if the client has requested another burst."""
         if burst_number != self._burst_number:
             return
         block = self._file[offset : offset + size]

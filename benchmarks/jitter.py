@@ -71,7 +71,7 @@ async def _stream(vehicle: aerokit.Vehicle, rate_hz: float, seconds: float) -> l
 
 
 async def _timer(rate_hz: float, seconds: float) -> list[float]:
-    """Return the times at which a timer fired, whose callback only records the time."""
+    """Return the times at which a timer fired. Its callback only records the time."""
     loop = asyncio.get_running_loop()
     period_s = 1 / rate_hz
     times: list[float] = []

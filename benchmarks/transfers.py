@@ -244,23 +244,24 @@ def _check(task: str, contender: Contender, sizes: Sizes, folder: Path) -> None:
             raise _FailedError("the content of the file is wrong")
 
 
-def _check_parameters(found: dict[str, float], expected: dict[str, float]) -> None:
-    if set(found) != set(expected):
-        raise _FailedError(f"{len(set(expected) - set(found))} of {len(expected)} parameters are missing")
-    wrong = [
-        name for name, value in expected.items() if not math.isclose(found[name], value, rel_tol=1e-6, abs_tol=1e-6)
-    ]
+def _check_parameters(received: dict[str, float], expected: dict[str, float]) -> None:
+    if set(received) != set(expected):
+        raise _FailedError(f"{len(set(expected) - set(received))} of {len(expected)} parameters are missing")
+    wrong = []
+    for name, value in expected.items():
+        if not math.isclose(received[name], value, rel_tol=1e-6, abs_tol=1e-6):
+            wrong.append(name)
     if wrong:
         raise _FailedError(f"{len(wrong)} parameters have wrong values: {wrong[:3]}")
 
 
-def _check_mission(found: list[list[float]], count: int, contender: Contender) -> None:
+def _check_mission(received: list[list[float]], count: int, contender: Contender) -> None:
     expected = mission_items(count)
-    if len(found) != len(expected):
-        raise _FailedError(f"{len(found)} items instead of {len(expected)}")
+    if len(received) != len(expected):
+        raise _FailedError(f"{len(received)} items instead of {len(expected)}")
     # DroneKit uses MISSION_ITEM, whose coordinates are 32-bit floats with errors of up to 1.5 m.
     max_error = 200 if contender.library == "dronekit" else 0
-    for index, (item, expected_item) in enumerate(zip(found, expected, strict=True)):
+    for index, (item, expected_item) in enumerate(zip(received, expected, strict=True)):
         # The frame is not compared, because it may change to the equivalent frame of the other message.
         command, _, *params, x, y, z = item
         expected_command, _, *expected_params, expected_x, expected_y, expected_z = expected_item

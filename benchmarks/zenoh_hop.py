@@ -104,6 +104,7 @@ def _measure(name: str, count: int) -> dict[str, float]:
 
 
 async def _measure_link(address: str, count: int) -> dict[str, float]:
+    """Measure ``count`` round trips one by one, and how many frames of a burst return."""
     link = create_link(address)
     receiver = EchoReceiver()
     encoder = FrameEncoder(255, 190)

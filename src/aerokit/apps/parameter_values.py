@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
-    """Raise InvalidArgument if the metadata does not allow a value; the text lists all such values.
+    """Raise InvalidArgument if the metadata does not allow a value; the text lists all these values.
 
-    Names without metadata are accepted. The text names ``force``, the option that sets such values nevertheless.
+    Names without metadata are accepted. The text also names ``force``, the option that sets the values nevertheless.
     """
     if metadata is None:
         return

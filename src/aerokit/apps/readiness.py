@@ -163,8 +163,7 @@ def _refused_mode(vehicle: Vehicle) -> list[str]:
 
 def own_flight_modes(vehicle: Vehicle) -> str:
     """Return the names of the modes in which the vehicle flies by itself, such as ``GUIDED, AUTO, RTL``."""
-    mode_for, is_vtol = vehicle.autopilot.mode_for, vehicle.is_vtol
-    modes = (mode_for(purpose, is_vtol=is_vtol) for purpose in _OWN_FLIGHT_PURPOSES)
+    modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in _OWN_FLIGHT_PURPOSES]
     return ", ".join(dict.fromkeys(mode.name for mode in modes if mode is not None))
 
 

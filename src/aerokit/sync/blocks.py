@@ -289,7 +289,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
         self._context = context
 
     def vehicles(self) -> Iterator[VehicleFound]:
-        """Yield each autopilot once, until the connection ends: first those already known, then new ones.
+        """Yield each autopilot once, until the connection ends: first the known autopilots, then new ones.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.

@@ -35,7 +35,7 @@ from aerokit.sync.originals import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-WIDTH = 120  # the line length of `ruff format`, whose style the output follows
+WIDTH = 120  # the line length of `ruff format`; the output has its style
 
 
 def outer_name(annotation: ast.expr | None) -> str:
@@ -139,14 +139,14 @@ FILE = FILES["twins"]
 # Base classes of twins that are generic in the asynchronous class.
 GENERIC_BASES = ("TwinOf", "BlockTwin", "SelectionTwin")
 
-# For each generated file (page), the asynchronous functions that open a context, such as ``connect``.
+# Maps each generated file (page) to the asynchronous functions that open a context, such as ``connect``.
 FUNCTIONS: dict[str, tuple[str, ...]] = {
     "twins": ("aerokit.connection.opening.open_connection", "aerokit.vehicle.connect.connect"),
     "fleet_twins": ("aerokit.fleets.opening.fleet",),
     "component_twins": ("aerokit.onboard.opening.component",),
 }
 
-# For each page, (module, name) of the function that opens such a context on a loop thread.
+# Maps each page to the module and name of the function that opens these contexts on a loop thread.
 OPENERS = {
     "twins": ("aerokit.sync.blocks", "opened"),
     "fleet_twins": ("aerokit.sync.fleet_blocks", "opened_fleet"),

@@ -174,7 +174,7 @@ class FaultyPath:
 
 
 def split_frames(data: bytes) -> Sequence[bytes]:
-    """Split a write or datagram into MAVLink frames. Bytes that are no complete frame form one piece.
+    """Split a write or datagram into MAVLink frames. If no complete frame begins at a byte, the rest is one piece.
 
     Only the lengths of frames are checked, not their checksums.
     """

@@ -331,7 +331,8 @@ def _colours(count: int) -> list[str]:
 
 
 def _with_margin(values: Sequence[float]) -> tuple[float, float]:
-    low, high = min(values), max(values)
+    low = min(values)
+    high = max(values)
     return _widened((low, high), max(1.1 * (high - low), 2.0))
 
 

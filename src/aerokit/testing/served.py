@@ -97,7 +97,7 @@ class ServedFlight:
 
 @contextmanager
 def serve_flight(kind: str = "copter", **options: Any) -> Iterator[ServedFlight]:
-    """Serve a vehicle while the block runs; ``options`` are those of the vehicle and of `hosted_flight`.
+    """Serve a vehicle while the block runs; ``options`` are the options of the vehicle and of `hosted_flight`.
 
     An exception in the simulated vehicle ends the block at once, see `ServedFlight.raising_vehicle_errors`.
     """
@@ -114,7 +114,7 @@ def hosted_flight(
     record: bool = False,
     **options: Any,
 ) -> Iterator[ServedFlight]:
-    """Serve a vehicle on an address while the block runs; ``options`` are those of the vehicle.
+    """Serve a vehicle on an address while the block runs; ``options`` are the options of the vehicle.
 
     Timeouts after which the vehicle reacts to a silent client are multiplied by ``speedup``, except those in
     ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, and

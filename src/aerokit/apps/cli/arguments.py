@@ -175,7 +175,7 @@ def assignment(text: str) -> tuple[str, int | float]:
     try:
         number = parse_number(value)
     except ValueError:
-        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number") from None
+        raise ArgumentTypeError(f"the value in {text!r} is not a finite number; expected NAME=VALUE") from None
     try:
         checked_value(check_name(name), number, ParameterType.REAL32)
     except InvalidArgument as error:
@@ -215,7 +215,7 @@ def log_file(text: str) -> str:
     if is_address(text):
         raise ArgumentTypeError(f"{text!r} is an address; the recording must follow the address: ADDRESS flight.tlog")
     if not text.lower().endswith(".tlog"):
-        raise ArgumentTypeError(f"{text!r} does not end in .tlog")
+        raise ArgumentTypeError(f"{text!r} is not a name for a recording, because it does not end in .tlog")
     return writable_file(text)
 
 

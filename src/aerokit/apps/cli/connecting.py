@@ -110,7 +110,8 @@ def add_address(
     """
     keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
     if default_text is None:
-        default, default_text = default_address(), f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
+        default = default_address()
+        default_text = f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
     else:
         default = None
     argument = command.add_argument(

@@ -193,6 +193,7 @@ class LinkExamination:
         yield Finding("problem", "vehicle", text, advice)
 
     def _ids(self) -> Iterator[Finding]:
+        """Yield problems with system and component ids: ids with several senders, ids of programs, and system id 0."""
         ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
         for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
             yield Finding(
@@ -264,6 +265,7 @@ class LinkExamination:
             )
 
     def _undecoded(self) -> Iterator[Finding]:
+        """Yield findings on messages of unknown dialects, and on bytes that are not MAVLink."""
         unknown_messages: Counter[int] = Counter()
         for statistics in self._connection.statistics():
             unknown_messages.update(statistics.unknown_messages)

@@ -113,7 +113,7 @@ async def _list(options: argparse.Namespace) -> int:
 
 
 def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle) -> ParameterTable:
-    """Return the parameters that differ from their default, which is that of the metadata if the vehicle reports none.
+    """Return the parameters that differ from their default, which the vehicle or else the metadata provides.
 
     Raises:
         ValueUnknownError: no default is known; the text names the options that help.
@@ -166,16 +166,17 @@ async def _diff(options: argparse.Namespace) -> int:
 
 
 async def _set(options: argparse.Namespace) -> int:
+    values = dict(options.values)
     metadata = load_metadata_option(options)
     if not options.force:
-        check_allowed(metadata, dict(options.values))  # with a file of metadata, already before connecting
+        check_allowed(metadata, values)  # with a file of metadata, already before connecting
     async with connected(options, changes=True) as vehicle:
         if metadata is None:
             metadata = await metadata_for_check(vehicle, from_file=None, options=options)
-            check_allowed(metadata, dict(options.values))
-        results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
+            check_allowed(metadata, values)
+        results = await vehicle.parameters.set_many(values, idle_timeout_s=options.patience)
         known = await _names_for_hints(vehicle, results.values())
-    # Without metadata, a single line below replaces the notes on the results.
+    # Without metadata, one line at the end replaces the notes on the results.
     if not options.force and (metadata is not None or options.json):
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
     code = _emit_results(options, results.values(), known, metadata)
@@ -217,11 +218,12 @@ def _check_file(file_values: ParameterFile, table: ParameterTable, vehicle: Vehi
     """Check that all values of a file fit the types of the vehicle's parameters.
 
     Raises:
-        InvalidArgument: a value does not have the type of its parameter. The text names all such values, and the names
+        InvalidArgument: a value does not have the type of its parameter. The text lists these values, and the names
             that the vehicle does not have, with their lines.
     """
     names_are_upper_case = vehicle.autopilot.name == "ArduPilot"
-    invalid, unknown = [], []
+    invalid = []
+    unknown = []
     for name, value in file_values.items():
         line = file_values.places[name]
         known = resolve_known(name.upper() if names_are_upper_case else name, table)

@@ -103,7 +103,7 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
 
 
 def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
-    """Raise InvalidArgument if the metadata does not allow a value; the text lists all such values."""
+    """Raise InvalidArgument if the metadata does not allow a value; the text lists all these values."""
     check_values(metadata, values, "--force")
 
 

@@ -122,7 +122,7 @@ def _recorded(path: str, count: int) -> SimulatedVehicle:
     from aerokit.testing.recorded import RecordedVehicle
 
     if count != 1:
-        raise InvalidArgument(f"count = {count}: the recording {path} has one vehicle only")
+        raise InvalidArgument(f"count = {count} is not allowed: the recording {path} has only one vehicle")
     return RecordedVehicle(path)
 
 
@@ -287,10 +287,11 @@ def _begin_of(fault: tuple[str, object, float]) -> float:
 
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
-    optional: dict[str, Any] = {
-        "boot_time_s": options.boot_time,
-        "signing_key": options.signing_key,
-    }
+    arguments = conditions(options)
+    if options.boot_time is not None:
+        arguments["boot_time_s"] = options.boot_time
+    if options.signing_key is not None:
+        arguments["signing_key"] = options.signing_key
     return simulated_fleet(
         options.vehicle,
         options.count,
@@ -300,8 +301,7 @@ def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
         seed=options.seed,
         boot_text=True,
         components=lambda: _devices(options),
-        **conditions(options),
-        **{name: value for name, value in optional.items() if value is not None},
+        **arguments,
     )
 
 
@@ -352,14 +352,15 @@ def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> Non
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
-    first, last = vehicles[0].system_id, vehicles[-1].system_id
+    first = vehicles[0].system_id
+    last = vehicles[-1].system_id
     return f"system {first}" if first == last else f"systems {first} to {last}"
 
 
 def _client_address(address: str, argument: str) -> str:
     """Return the address with which a client on this machine connects.
 
-    ``address`` is that of the open link, ``argument`` the address or template in the command line.
+    ``address`` is the address of the open link, ``argument`` the address or template in the command line.
     """
     scheme, _, location = address.partition(":")
     if scheme == "zenohin":

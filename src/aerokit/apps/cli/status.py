@@ -75,7 +75,7 @@ def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
         f"  position {_position(vehicle)}",
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
-        f"  link     {_link(vehicle, frame)}",
+        f"  link     {_vehicle_link_text(vehicle, frame)}",
         *_aligned("failsafe", active_failsafe(vehicle) or ()),
         *_readiness(vehicle, checks),
     ]
@@ -92,7 +92,7 @@ def _readiness(vehicle: Vehicle, checks: Readiness) -> list[str]:
     return _aligned("ready", ["no reason against arming is reported"])
 
 
-def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
+def _component_record_and_text(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
     kind = kind_of(heartbeat, component_id)
     record = {
         "system_id": system_id,
@@ -121,7 +121,7 @@ def _link_line(record: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _link(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
+def _vehicle_link_text(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
     received, lost = vehicle.connection.counts(vehicle.system_id)
     report = vehicle.link_quality.latest
     round_trip_s = None if report is None else report.round_trip_s
@@ -235,6 +235,7 @@ async def run_status(options: argparse.Namespace) -> int:
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
+    """Request the states that the vehicle does not stream, then return what it lacks."""
     # `why_not_armable` requests the estimator's messages, which depend on the firmware, from disarmed vehicles only.
     needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()
     estimator_messages = [("estimator", message) for message in needed]
@@ -279,5 +280,5 @@ def _emit_components(connection: Connection, options: argparse.Namespace, vehicl
         system_id, component_id = source
         if system_id in vehicles and vehicles[system_id].component_id == component_id:
             continue
-        record, text = _component_line(heartbeat, system_id, component_id)
+        record, text = _component_record_and_text(heartbeat, system_id, component_id)
         emit(options, "component", record, text)

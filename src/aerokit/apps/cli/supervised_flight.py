@@ -119,7 +119,8 @@ class SupervisedFlight(ABC):
     async def _arm(self) -> None:
         """Arm the vehicle, and record this before the command is sent, because its result may remain unknown."""
         self._check_disarmed()
-        self.armed_by_us = self._may_arm_late = True
+        self.armed_by_us = True
+        self._may_arm_late = True
         self._modes_armed_in.add(self._vehicle.mode_name)
         try:
             await self._vehicle.arm()
@@ -156,7 +157,8 @@ class SupervisedFlight(ABC):
 
     async def _after_interrupt(self) -> int:
         """Disarm a vehicle on the ground. In the air, perform ``--on-interrupt`` if this program still has control."""
-        vehicle, action = self._vehicle, self._on_interrupt
+        vehicle = self._vehicle
+        action = self._on_interrupt
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
             return DONE
@@ -205,9 +207,9 @@ class SupervisedFlight(ABC):
     def _check_control(self) -> bool:
         """Return True if this program still has control. Otherwise, print why no command is sent."""
         if not self._is_in_our_mode:
-            mode, now = self._vehicle.mode_name, self._vehicle.describe_now()
             self._print(
-                f"no command is sent, because the vehicle itself or another party changed the mode to {mode}: {now}"
+                "no command is sent, because the vehicle itself or another party changed the mode to"
+                f" {self._vehicle.mode_name}: {self._vehicle.describe_now()}"
             )
         return self._is_in_our_mode
 
@@ -220,8 +222,7 @@ class SupervisedFlight(ABC):
         vehicle = self._vehicle
         if not self._has_started and vehicle.mode_name in self._modes_armed_in:
             return True
-        mode_for, is_vtol = vehicle.autopilot.mode_for, vehicle.is_vtol
-        modes = [mode_for(purpose, is_vtol=is_vtol) for purpose in self._our_purposes()]
+        modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 
 
@@ -374,10 +375,12 @@ class FlightReport:
 
     def _is_about_mode(self, text: str) -> bool:
         """Return True for "Arm: AUTO mode not armable", after which `Vehicle.arm` changes the mode and arms there."""
-        autopilot, mode = self._vehicle.autopilot, self._vehicle.mode_name
+        autopilot = self._vehicle.autopilot
+        mode = self._vehicle.mode_name
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"
 
     async def _print_status(self) -> None:
+        """Print a status line whenever nothing else was printed for some seconds."""
         vehicle = self._vehicle
         while vehicle.connection.is_open:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)

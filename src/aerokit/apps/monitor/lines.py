@@ -85,7 +85,8 @@ class VehicleText:
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
-        vehicle, cell = self._vehicle, self.cell
+        vehicle = self._vehicle
+        cell = self.cell
         rows = [
             ("mode", Text("  ").join([cell(vehicle.mode, _name, "bold"), self._armed()])),
             ("link" if self._silent_s else "missing", self.silence() or self._missing()),
@@ -102,7 +103,8 @@ class VehicleText:
         return rows
 
     def _more_rows(self) -> list[tuple[str, Text]]:
-        vehicle, cell = self._vehicle, self.cell
+        vehicle = self._vehicle
+        cell = self.cell
         return [
             ("home", self._home()),
             ("mission", cell(vehicle.mission_current, _mission)),
@@ -114,7 +116,8 @@ class VehicleText:
 
     def row(self, *, is_selected: bool, more: bool) -> Text:
         """Return this vehicle's line in the list of vehicles."""
-        vehicle, cell = self._vehicle, self.cell
+        vehicle = self._vehicle
+        cell = self.cell
         text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
         text.append(f"{vehicle.system_id:>3} ", "bold")
         columns = [
@@ -154,11 +157,13 @@ class VehicleText:
         return Text("armed" if self._vehicle.armed.latest else "ready")
 
     def _speeds(self) -> Text:
-        ground, climb = self._vehicle.ground_speed_m_s, self._vehicle.climb_m_s
-        return Text.assemble(self.cell(ground, _speed), "  climb ", self.cell(climb, _climb))
+        ground_speed = self.cell(self._vehicle.ground_speed_m_s, _speed)
+        climb = self.cell(self._vehicle.climb_m_s, _climb)
+        return Text.assemble(ground_speed, "  climb ", climb)
 
     def _home(self) -> Text:
-        home, position = self._vehicle.home.latest, self._vehicle.position.latest
+        home = self._vehicle.home.latest
+        position = self._vehicle.position.latest
         if home is None or position is None:
             return Text(UNKNOWN, "dim")
         distance_m = position.distance_to(home.position)
@@ -166,7 +171,8 @@ class VehicleText:
         return Text(f"{number(distance_m, 0)} m away{bearing}")
 
     def _link(self) -> Text:
-        quality, state = self._vehicle.link_quality, self._link_state
+        quality = self._vehicle.link_quality
+        state = self._link_state
         text = Text() if state is None else Text(f"{state.value}  ", LINK_STYLES[state])
         text.append("loss ").append_text(self.cell(quality, lambda report: number(report.loss_percent, 1, " %")))
         text.append("  round trip ")
@@ -279,7 +285,8 @@ class Canvas:
     def __init__(self, columns: int, rows: int, points: Iterable[tuple[float, float]]) -> None:
         self._columns = max(columns, 2)
         self._rows = max(rows - 1, 2)
-        norths, easts = zip(*(list(points) or [(0.0, 0.0)]), strict=True)
+        all_points = list(points) or [(0.0, 0.0)]
+        norths, easts = zip(*all_points, strict=True)
         self._middle_north = (max(norths) + min(norths)) / 2
         self._middle_east = (max(easts) + min(easts)) / 2
         # Each Braille character has two columns and four rows of dots.

@@ -107,7 +107,8 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
 
     Adds the types that the schema refers to by name to ``definitions``.
     """
-    origin, arguments = typing.get_origin(value_type), typing.get_args(value_type)
+    origin = typing.get_origin(value_type)
+    arguments = typing.get_args(value_type)
     if origin in (typing.Union, types.UnionType):
         return {"anyOf": [_schema_of(argument, definitions) for argument in arguments]}
     if origin in (tuple, list):

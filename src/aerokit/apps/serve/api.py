@@ -154,6 +154,7 @@ def document(operations: Iterable[Operation], root_path: str = "") -> dict[str, 
 
 
 def _operation(operation: Operation) -> dict[str, Any]:
+    """Return the OpenAPI description of an operation."""
     is_order = operation.order is not None
     answer = {"$ref": "#/components/schemas/Order"} if is_order else {"type": "object"}
     description: dict[str, Any] = {
@@ -443,6 +444,7 @@ class HttpApi:
         return json_response(self._orders.get(request.path_params["key"]).to_dict())
 
     async def _run_order(self, order_type: OrderType, request: Request) -> Response:
+        """Start an order and answer when it has ended or, with ``wait=false``, after a short time."""
         vehicle = self._vehicle_of(request)
         waits = query_flag(request, "wait", default=True)
         arguments = await read_body(request, order_type.max_body_size)

@@ -93,7 +93,7 @@ class FlightWatch:
     def crash(self) -> dict[str, Any] | None:
         """The crash: ``text``, such as "hit the ground at 11.6 m/s", and ``at_unix_s``, the time of the impact.
 
-        None if there was no crash, or if the vehicle has moved, taken off or was armed again since the crash.
+        It is None if there was no crash, or if the vehicle has moved, taken off or was armed again since the crash.
         """
         return self._crash
 
@@ -160,6 +160,7 @@ class FlightWatch:
                 self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
+        """Detect the begin and the end of an impact, and evaluate an impact with each new velocity."""
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
         at = self._vehicle.velocity.updated_at

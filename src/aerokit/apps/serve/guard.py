@@ -144,6 +144,7 @@ class SecurityMiddleware:
         await self._app(scope, receive, send_with_headers)
 
     def _check(self, headers: Headers) -> None:
+        """Raise HttpProblem if the request is for another host, or comes from a page of another site."""
         host = headers.get("host", "")
         if not self._is_own_host(host):
             raise HttpProblem(421, "WrongHost", f"host name {host[:100]!r} is not allowed; --allow-host allows it")

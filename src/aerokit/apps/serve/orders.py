@@ -380,6 +380,7 @@ class OrderRunner:
             )
 
     def _store(self, record: OrderRecord) -> None:
+        """Store an order. If there are too many, drop the oldest orders that have ended, except their keys."""
         self._records[record.key] = record
         ended_keys = [key for key, stored in self._records.items() if stored.state != "running"]
         for key in ended_keys:

@@ -83,6 +83,7 @@ class StateStream:
         return rate_hz
 
     async def _serve(self, socket: WebSocket, period_s: float) -> None:
+        """Send messages until the client disconnects, does not read, or sends a message itself."""
         sending = asyncio.ensure_future(self._send_messages(socket, period_s))
         receiving = asyncio.ensure_future(_receive(socket))
         tasks = {sending, receiving}
@@ -102,6 +103,7 @@ class StateStream:
             await asyncio.wait_for(socket.close(code), 1.0)
 
     async def _send_messages(self, socket: WebSocket, period_s: float) -> None:
+        """Send the message ``hello``, then the state at each period, and all other messages at once."""
         loop = asyncio.get_running_loop()
         queue: deque[dict[str, Any]] = deque()
         changed = asyncio.Event()
