@@ -29,7 +29,7 @@ def perform(task: Task) -> Any:
     fetch_all = vehicle._master.param_fetch_all
     has_begun = False
 
-    def begin_and_fetch_all() -> None:
+    def begin_and_fetch_all() -> None:  # DroneKit itself calls this while it connects, and may repeat the call
         nonlocal has_begun
         if not has_begun:
             has_begun = True

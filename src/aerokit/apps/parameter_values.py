@@ -23,7 +23,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
         return
     problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
     if problems:
-        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets such values too")
+        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets these values nevertheless")
 
 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:

@@ -306,13 +306,12 @@ TYPE_VARIABLES = {
 
 
 def generate(name: str = "twins") -> str:
-    """Return the source of one file."""
+    """Return the source of one generated file: its imports, ``__all__``, classes and functions."""
     page = Page(name)
     twins = [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
-    function_names = [path.rpartition(".")[2] for path in FUNCTIONS[name]]
-    exports = sorted([*(twin.name for twin in twins), *function_names])
+    exports = [twin.name for twin in twins]
     # `_class` and `_opener` have added the imports that their code needs. The following imports are needed in any case.
     page.at_run_time |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
     page.at_run_time |= {OPENERS[name], ("aerokit._internal.arguments", "checked")}
@@ -324,6 +323,7 @@ def generate(name: str = "twins") -> str:
     for path in FUNCTIONS[name]:
         module, _, function_name = path.rpartition(".")
         page.at_run_time.add((module, f"{function_name} as {function_name}_async"))
+        exports.append(function_name)
     page.for_types -= page.at_run_time
     # Imports in HEAD that this file does not use are left out.
     text = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
@@ -331,7 +331,7 @@ def generate(name: str = "twins") -> str:
         text = text.replace("from functools import cached_property\n", "")
     head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.for_types, "    ") + "\n"
-    head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in exports) + "]\n"
+    head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in sorted(exports)) + "]\n"
     head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'

@@ -136,7 +136,7 @@ def test_doctor_signed_frames_without_key_is_problem(capsys: pytest.CaptureFixtu
     encoder.signing = Signing(SigningKey.from_passphrase("secret"))
     code = doctor_of_senders(encoder)
     assert code == 1
-    assert "1/1 signs its frames, but no key is given" in capsys.readouterr().out
+    assert "frames from 1/1 are signed, but no key is given" in capsys.readouterr().out
 
 
 def test_doctor_wrong_signing_key_is_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

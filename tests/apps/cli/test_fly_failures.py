@@ -241,7 +241,9 @@ def test_fly_not_ready_prints_no_empty_list(capsys: pytest.CaptureFixture[str]) 
         ("gps_lost@15", "end of the recording: in LAND, disarmed, 0.0 m above home"),
         exhaustive(pytest.param("rc_lost@25", "end of the recording: in RTL, disarmed, 0.0 m above home")),
         exhaustive(
-            pytest.param("silent@25", "the recording ends with the vehicle armed, because it was silent for 10 s")
+            pytest.param(
+                "silent@25", "the vehicle has been silent for 10 s: the recording ends, although it is still armed"
+            )
         ),
     ],
 )

@@ -260,7 +260,7 @@ class LinkExamination:
             yield Finding(
                 "problem",
                 "signing",
-                f"{names} signs its frames, but no key is given: it will ignore this computer",
+                f"frames from {names} are signed, but no key is given: their senders will ignore this computer",
                 "give the key: --signing-key FILE, or the variable AEROKIT_SIGNING_KEY",
             )
 

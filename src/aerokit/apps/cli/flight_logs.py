@@ -60,14 +60,12 @@ async def _convert(options: argparse.Namespace) -> int:
         result = convert(options.log, options.out, tables=options.tables, force=options.force, on_progress=on_progress)
     for note in result.notes:
         print(printable(f"aerokit: {options.log}: {note}"), file=sys.stderr)
-    emit(
-        options,
-        "conversion",
-        {**result.to_dict(), "log": options.log},
-        f"{result.target}: {_counted_noun(result.written, _WRITTEN_NOUNS.get(result.target.suffix.lower(), 'row'))}"
-        f" from {_counted_noun(result.entries, 'entry')}, {_size(result.bytes)},"
-        f" {_utc_text(result.begins_at)} to {_utc_text(result.ends_at)} UTC",
+    noun = _WRITTEN_NOUNS.get(result.target.suffix.lower(), "row")
+    text = (
+        f"{result.target}: {_counted_noun(result.written, noun)} from {_counted_noun(result.entries, 'entry')},"
+        f" {_size(result.bytes)}, {_utc_text(result.begins_at)} to {_utc_text(result.ends_at)} UTC"
     )
+    emit(options, "conversion", {**result.to_dict(), "log": options.log}, text)
     return DONE
 
 

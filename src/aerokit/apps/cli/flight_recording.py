@@ -44,12 +44,12 @@ async def record_to_end(
     """Stay connected to an armed vehicle until it is disarmed or silent for 10 s, or until Ctrl-C.
 
     A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion.
-    These are simulated seconds, of which a simulation has ``speedup`` in a real second.
+    In a simulation, these are simulated seconds, which pass ``speedup`` times as fast.
     """
     if not vehicle.is_armed or not vehicle.connection.is_open:
         return
     if vehicle.heartbeat_age >= MAX_SILENCE_S:
-        print_line(f"the recording ends with the vehicle armed, because it was silent for {MAX_SILENCE_S:g} s")
+        print_line(f"the recording ends after {MAX_SILENCE_S:g} s of silence; the vehicle was armed")
         return
     print_line(
         f"still armed: the recording goes on until the vehicle disarms, lies still for {_MAX_STILL_S:g} s,"

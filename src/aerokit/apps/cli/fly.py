@@ -302,8 +302,8 @@ async def _connect_and_fly(
                 await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
         if flight.armed_by_us:
             report.print_summary(options.record)
-    if error is not None:
-        raise error
+        if error is not None:
+            raise error
     return code
 
 

@@ -71,6 +71,7 @@ async def run_record(options: argparse.Namespace) -> int:
 
 
 async def _record_link(options: argparse.Namespace) -> int:
+    """Record until the end, print the number of messages, and return the exit code."""
     counts: Counter[tuple[int, int]] = Counter()
 
     def count(frame: Frame, peer: Peer) -> None:

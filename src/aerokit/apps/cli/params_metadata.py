@@ -85,7 +85,7 @@ async def metadata_for_check(
 async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
     from aerokit.parameters.metadata import parse_metadata
 
-    problem = f"time-out after {_READ_TIMEOUT_S:g} s"
+    problem = f"time-out after {_READ_TIMEOUT_S:g} s"  # unless another error is raised before
     with anyio.move_on_after(_READ_TIMEOUT_S):
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")

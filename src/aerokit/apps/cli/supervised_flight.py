@@ -295,9 +295,10 @@ class FlightReport:
         """Print the statistics of the flight, the link and the batteries."""
         vehicle = self._vehicle
         received, lost = vehicle.connection.counts(vehicle.system_id)
-        measured = self._clocks.speed
-        is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured)
-        speed = measured if is_unknown_simulation else self.speedup
+        # The clock of a vehicle reveals a simulation that this program has not started itself.
+        measured_speed = self._clocks.speed
+        is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured_speed)
+        speed = measured_speed if is_unknown_simulation else self.speedup
         seconds = speed * (vehicle.connection.now() - self._started_at)
         self._on_armed(None, is_armed=False)  # if the vehicle is still armed, adds the time since arming
         version = vehicle.version.latest

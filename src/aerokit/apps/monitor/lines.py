@@ -205,7 +205,8 @@ class VehicleText:
         texts: list[str] = []
         for shown in range(len(missing), 0, -1):
             texts = _with_count(missing, shown)
-            if sum(len(textwrap.wrap(text, max(1, width), break_on_hyphens=False)) for text in texts) <= max_lines:
+            wrapped = [textwrap.wrap(text, max(1, width), break_on_hyphens=False) for text in texts]
+            if sum(map(len, wrapped)) <= max_lines:
                 break
         return Text("\n".join(texts), WARNING)
 

@@ -161,7 +161,7 @@ class SecurityMiddleware:
             if name in self._hosts:
                 return True
             ipaddress.ip_address(name)
-        except ValueError:
+        except ValueError:  # neither an allowed name nor an IP address
             return False
         return True
 

@@ -80,7 +80,10 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Check the names of the arguments; raise InvalidArgument for wrong names. The library checks the values."""
+        """Raise InvalidArgument if an argument is unknown or missing, or if it is wrongly a bool or no bool.
+
+        The library checks the other values.
+        """
         for name in values:
             if name not in self.arguments:
                 names = ", ".join(self.arguments) or "none"
