@@ -44,6 +44,8 @@ END_OF_FILE = 6
 NOT_FOUND = 10
 DATA_SIZE = 239
 PACK = "@PARAM/param.pck"
+PACKED_FLOAT = 4
+"""Type of a 32-bit float in this file."""
 GROUPS = ("ATC", "BATT", "EK3", "INS", "RC", "SERVO", "PSC", "WPNAV")
 
 
@@ -221,13 +223,13 @@ def _packed_parameters(parameters: list[tuple[str, float]], *, with_defaults: bo
     file = bytearray(struct.pack("<HHH", magic, count, count))
     previous_name = ""
     for name, value in parameters:
-        common = 0
-        while common < min(len(name), len(previous_name), 15) and name[common] == previous_name[common]:
-            common += 1
-        rest = name[common:].encode()
-        lengths = (len(rest) - 1) << 4 | common
+        shared = 0
+        while shared < min(len(name), len(previous_name), 15) and name[shared] == previous_name[shared]:
+            shared += 1
+        rest = name[shared:].encode()
+        lengths = (len(rest) - 1) << 4 | shared
         packed_value = struct.pack("<f", value)
-        entry = bytes([4, lengths]) + rest + packed_value
+        entry = bytes([PACKED_FLOAT, lengths]) + rest + packed_value
         bytes_in_next_block = (len(file) + len(entry)) % DATA_SIZE
         if 0 < bytes_in_next_block < len(packed_value):
             file += bytes(len(packed_value) - bytes_in_next_block)

@@ -235,7 +235,8 @@ def _latencies(quick: bool) -> list[Row]:
     for _ in range(1 if quick else 5):
         for name, delays in series.items():
             with _hub(name, 4) as (_, sender, receivers):
-                delays += _delays(sender, receivers[0], 100 if quick else 500)
+                first_receiver, *_ = receivers
+                delays += _delays(sender, first_receiver, 100 if quick else 500)
     rows: list[Row] = []
     for name, share in (("median", 0.5), ("p99", 0.99)):
         own = 1e6 * table.quantile(series["aerokit"], share)

@@ -133,8 +133,8 @@ def wind(text: str) -> tuple[float, ...]:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    gusts = values[2:]  # empty, or one value
-    is_in_range = all(abs(value) <= _MAX_WIND_M_S for value in values) and all(gust >= 0 for gust in gusts)
+    has_gusts = len(values) == 3
+    is_in_range = all(abs(value) <= _MAX_WIND_M_S for value in values) and not (has_gusts and values[-1] < 0)
     if len(values) not in (2, 3) or not is_in_range:
         raise ArgumentTypeError(
             f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to {_MAX_WIND_M_S:g}"

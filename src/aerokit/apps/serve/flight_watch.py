@@ -160,7 +160,7 @@ class FlightWatch:
                 self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
-        """Detect the begin and the end of an impact, and evaluate an impact with each new velocity."""
+        """Detect when an impact begins or is over, and evaluate it with each new velocity."""
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
         at = self._vehicle.velocity.updated_at

@@ -195,12 +195,14 @@ class ServedVehicles:
                     silent.add(system_id)
                     continue
                 track = self._tracks.setdefault(system_id, [])
-                last_position, _ = track[-1] if track else (None, False)
-                if last_position is None or last_position.distance_to(position) >= MIN_TRACK_STEP_M:
-                    if len(track) >= MAX_TRACK_POINTS:
-                        del track[1::2]
-                    track.append((position, system_id in silent))
-                    silent.discard(system_id)
+                if track:
+                    last_position, _ = track[-1]
+                    if last_position.distance_to(position) < MIN_TRACK_STEP_M:
+                        continue
+                if len(track) >= MAX_TRACK_POINTS:
+                    del track[1::2]
+                track.append((position, system_id in silent))
+                silent.discard(system_id)
             await anyio.sleep(TRACK_INTERVAL_S)
 
     async def _request_arming_checks(self) -> None:
