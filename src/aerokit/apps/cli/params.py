@@ -175,11 +175,12 @@ async def _set(options: argparse.Namespace) -> int:
             metadata = await metadata_for_check(vehicle, from_file=None, options=options)
             check_allowed(metadata, values)
         results = await vehicle.parameters.set_many(values, idle_timeout_s=options.patience)
-        known = await _names_for_hints(vehicle, results.values())
-    # Without metadata, one line at the end replaces the notes on the results.
-    if not options.force and (metadata is not None or options.json):
+        known_names = await _names_for_hints(vehicle, results.values())
+    # Without metadata, one line at the end replaces the notes on the results. JSON always has the notes.
+    has_notes = metadata is not None or options.json
+    if has_notes and not options.force:
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
-    code = _emit_results(options, results.values(), known, metadata)
+    code = _emit_results(options, results.values(), known_names, metadata)
     has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
     if has_changed and metadata is None and not (options.force or options.json):
         print(metadata_source(vehicle))
