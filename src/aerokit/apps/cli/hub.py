@@ -64,7 +64,8 @@ def _add_filter(command: argparse.ArgumentParser, option: str, read: Callable[[s
 def _named_address(text: str) -> tuple[str, str]:
     """Parse ``[NAME=]ADDRESS`` into the name of an endpoint and its address."""
     match = _NAMED_ADDRESS.fullmatch(text)
-    return (match[1], address(match[2])) if match else (text, address(text))
+    name, endpoint_address = (text, text) if match is None else match.groups()
+    return name, address(endpoint_address)
 
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:

@@ -343,10 +343,10 @@ def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> Non
         text = f"{_systems(vehicles)} on {' and '.join(shared)}, speed {options.speedup:g}x"
         emit(options, "simulated", record, text if address == shared[0] else None)
     if not options.json:
-        vehicles = server.vehicles_on[0]
+        first_vehicle, *other_vehicles = server.vehicles_on[0]
         client = _client_address(server.addresses[0], options.addresses[0])
-        choice = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
-        print(f"try: aerokit demo --connect {client}{choice}", flush=True)
+        system_option = f" --system-id {first_vehicle.system_id}" if other_vehicles else ""
+        print(f"try: aerokit demo --connect {client}{system_option}", flush=True)
         if client != _SERIAL_END:
             print(f"or:  aerokit status {client}, aerokit monitor {client}, aerokit serve {client}", flush=True)
 

@@ -6,6 +6,7 @@ import math
 import re
 import time
 from collections import Counter, defaultdict, deque
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
@@ -99,7 +100,8 @@ class MonitorModel:
                 name = f"message {message_id}" if message is None else message.NAME
                 received = count - first.counts[sender_id, message_id]
                 rates.append((name, received / duration_s))
-        return sorted(rates, key=lambda rate: (-rate[1], rate[0]))
+        rates.sort()  # by name, which decides between equal rates
+        return sorted(rates, key=itemgetter(1), reverse=True)
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Convert a position to metres north and east of ``reference``. The first position becomes the reference."""

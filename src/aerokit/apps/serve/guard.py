@@ -259,4 +259,7 @@ def _oldest_of_busiest_host(connections: Iterable[_HttpConnection]) -> _HttpConn
 
 
 def _host(connection: H11Protocol) -> object:
-    return connection.client and connection.client[0]
+    if connection.client is None:
+        return None
+    host, _port = connection.client
+    return host
