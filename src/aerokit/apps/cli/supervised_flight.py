@@ -287,7 +287,7 @@ class FlightReport:
     def record_impact(self) -> None:
         """Record that the vehicle has just hit the ground, so that the summary distinguishes the time before."""
         if self._impact_s is None and self._armed_at is not None:
-            # An impact is detected only some time after it, because the vehicle must then lie still.
+            # The impact is detected only later, because the vehicle must first lie still for some time.
             impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at
             self._impact_s = self._armed_s + impact_at - self._armed_at
 
