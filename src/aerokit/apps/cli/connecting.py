@@ -303,7 +303,7 @@ def _simulator_hint(connection: Connection) -> str:
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:
     """Wait for Ctrl-C or for ``seconds``. Return True after Ctrl-C.
 
-    If the connection ends, raises its error. The wait also ends when the background task ``work`` ends.
+    Raise the connection's error if the connection ends first. The wait also ends when the task ``work`` ends.
     """
     ended = asyncio.Event()
     interrupted = False

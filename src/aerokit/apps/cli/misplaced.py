@@ -54,9 +54,10 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     has_address_argument = any("address" in action.dest or action.dest == "endpoints" for action in parser._actions)
     if has_address_argument and not takes_connect:
         return _superfluous_connect(parser, words)
+    takes_vehicle_paths = command[1:2] == ["files"]
     for index, word in enumerate(words):
-        # `aerokit files` takes paths on the vehicle, which may begin with /dev.
-        is_path = word.startswith("/") and command[1] == "files"
+        # A path on the vehicle may begin with /dev, like the address of a serial port.
+        is_path = takes_vehicle_paths and word.startswith("/")
         is_option_value = index > 0 and _takes_value(parser, words[index - 1])
         if is_path or not is_address(word) or is_option_value:
             continue
