@@ -17,6 +17,7 @@ from pathlib import Path
 
 from content import DOWNLOAD_PATH, PARAMETERS, UPLOAD_PATH, as_numbers, file_content, mission_items
 
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedCopter, SimulatorServer
 from aerokit.testing import FaultModel, FaultyLink
@@ -31,16 +32,16 @@ QUICK_PARAMETERS = 100
 def main(arguments: list[str]) -> None:
     """Serve until the process is terminated."""
     task, port, loss, seed, delay_s, size = arguments
-    bad = FaultModel(loss=float(loss), delay_s=float(delay_s))
-    radio = FaultyLink(create_link(f"udpout:127.0.0.1:{port}"), bad, seed=int(seed))
+    faults = FaultModel(loss=float(loss), delay_s=float(delay_s))
+    radio = FaultyLink(create_link(f"udpout:127.0.0.1:{port}"), faults, seed=int(seed))
     asyncio.run(_serve(radio, _copter(task, int(size))))
 
 
 async def _serve(radio: FaultyLink, copter: SimulatedCopter) -> None:
     def on_line() -> None:
-        words = sys.stdin.readline().split()
-        if words:
-            _dump(copter, Path(words[1]))
+        line = sys.stdin.readline()
+        if line:
+            _dump(copter, Path(line.removeprefix("dump ").rstrip()))
             print("dumped", flush=True)
 
     async with SimulatorServer(copter, radio):
@@ -51,11 +52,13 @@ async def _serve(radio: FaultyLink, copter: SimulatedCopter) -> None:
 
 def _copter(task: str, size: int) -> SimulatedCopter:
     copter = SimulatedCopter(boot_time_s=0.0, parameter_count=None if task == "parameters" else QUICK_PARAMETERS)
-    while task == "parameters" and len(copter.parameters) < PARAMETERS:
-        copter.parameters.add(f"BENCH_{len(copter.parameters)}", 0.5)
+    if task == "parameters":
+        while len(copter.parameters) < PARAMETERS:
+            copter.parameters.add(f"BENCH_{len(copter.parameters)}", 0.5)
     if task == "mission_download":
-        home = MissionItem(16, 0)
-        copter.missions.replace(0, [home, *(MissionItem(*item) for item in mission_items(size))])
+        home = MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
+        waypoints = [MissionItem(*item) for item in mission_items(size)]
+        copter.missions.replace(MavMissionType.MISSION, [home, *waypoints])
     if task == "file_download":
         copter.files.put(DOWNLOAD_PATH, file_content(size))
     return copter
@@ -64,7 +67,8 @@ def _copter(task: str, size: int) -> SimulatedCopter:
 def _dump(copter: SimulatedCopter, folder: Path) -> None:
     values = {name: copter.parameters[name] for name in copter.parameters}
     (folder / "vehicle-parameters.json").write_text(json.dumps(values))
-    (folder / "vehicle.json").write_text(json.dumps([as_numbers(item) for item in copter.missions.items(0)[1:]]))
+    _home, *waypoints = copter.missions.items(MavMissionType.MISSION)
+    (folder / "vehicle.json").write_text(json.dumps([as_numbers(item) for item in waypoints]))
     if UPLOAD_PATH in copter.files:
         (folder / "vehicle.bin").write_bytes(copter.files.get(UPLOAD_PATH))
 

@@ -1,8 +1,8 @@
 """Shared code of the clients of ``transfers.py``: runs and times one task, and prints the result as JSON.
 
-    python benchmarks/client_….py TASK WAY PORT SIZE FOLDER
+    python benchmarks/client_….py TASK METHOD PORT SIZE FOLDER
 
-``WAY`` selects a transfer method of the library. Downloads are written to FOLDER (``out.json``, ``out.bin``); uploads
+``METHOD`` is a transfer method of the library. Downloads are written to FOLDER (``out.json``, ``out.bin``); uploads
 are read from there (``in.bin``).
 """
 
@@ -22,8 +22,12 @@ __all__ = ["Task", "run"]
 class Task:
     """One task and its duration."""
 
-    def __init__(self, name: str, way: str, port: int, size: int, folder: Path) -> None:
-        self.name, self.way, self.port, self.size, self.folder = name, way, port, size, folder
+    def __init__(self, name: str, method: str, port: int, size: int, folder: Path) -> None:
+        self.name = name
+        self.method = method
+        self.port = port
+        self.size = size
+        self.folder = folder
         self.address = f"udpin:127.0.0.1:{port}"
         self._began_at = time.perf_counter()
         self._seconds: float | None = None
@@ -44,8 +48,8 @@ class Task:
 
 def run(perform: Callable[[Task], Any]) -> None:
     """Run the task of the command line with one library. The last line of standard output is the result."""
-    name, way, port, size, folder = sys.argv[1:]
-    task = Task(name, way, int(port), int(size), Path(folder))
+    name, method, port, size, folder = sys.argv[1:]
+    task = Task(name, method, int(port), int(size), Path(folder))
     outcome: dict[str, Any] = {}
     try:
         content = perform(task)

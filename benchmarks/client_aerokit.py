@@ -1,6 +1,6 @@
 """The aerokit client of ``transfers.py``, which uses the public API.
 
-The way ``auto`` uses MAVFTP if possible; ``list`` and ``items`` never do.
+The method ``auto`` uses MAVFTP if possible; ``list`` and ``items`` never do.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def perform(task: Task) -> Any:
 
 async def _perform(task: Task) -> Any:
     async with aerokit.connect(task.address, rates={}) as vehicle:
-        work = {
+        transfer = {
             "parameters": _parameters,
             "mission_upload": _mission_upload,
             "mission_download": _mission_download,
@@ -30,22 +30,22 @@ async def _perform(task: Task) -> Any:
             "file_upload": _file_upload,
         }[task.name]
         task.begin()
-        content = await work(vehicle, task)
+        content = await transfer(vehicle, task)
         task.end()
         return content
 
 
 async def _parameters(vehicle: Any, task: Task) -> dict[str, float]:
-    return dict((await vehicle.parameters.download(method=task.way)).values_by_name())
+    return dict((await vehicle.parameters.download(method=task.method)).values_by_name())
 
 
 async def _mission_upload(vehicle: Any, task: Task) -> None:
     items = [MissionItem(*item) for item in mission_items(task.size)]
-    await vehicle.mission.upload(Mission(items), method=task.way)
+    await vehicle.mission.upload(Mission(items), method=task.method)
 
 
 async def _mission_download(vehicle: Any, task: Task) -> list[Any]:
-    return [as_numbers(item) for item in await vehicle.mission.download(method=task.way)]
+    return [as_numbers(item) for item in await vehicle.mission.download(method=task.method)]
 
 
 async def _file_download(vehicle: Any, task: Task) -> None:

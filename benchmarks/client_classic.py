@@ -21,6 +21,8 @@ import timeit
 from collections.abc import Callable
 from typing import Any
 
+from stopwatch import Stopwatch
+
 __all__ = ["READS"]
 
 REPEATS = 7
@@ -32,62 +34,61 @@ READS = (
 )  # fmt: skip
 """Attributes whose read time is measured."""
 # Attributes that a typical program listens to, besides the message HEARTBEAT.
-USUAL = (
+TYPICAL_ATTRIBUTES = (
     "mode", "armed", "attitude", "location.global_relative_frame", "heading", "battery", "gps_0",
 )  # fmt: skip
 
-Found = dict[str, Any]
+Result = dict[str, Any]
 
 
 def main(arguments: list[str]) -> None:
     """Run one task and print its result."""
-    module, options = arguments[0], json.loads(arguments[1])
+    module, options_text = arguments
+    options = json.loads(options_text)
     began_at = time.perf_counter()
     collections.MutableMapping = collections.abc.MutableMapping  # type: ignore[attr-defined]  # for DroneKit
     dronekit = importlib.import_module(module)
     imported_s = time.perf_counter() - began_at
     logging.disable(logging.CRITICAL)
-    found = TASKS[options.pop("task")](dronekit, **options)
-    print(json.dumps({**found, "import_s": imported_s}), flush=True)
+    result = TASKS[options.pop("task")](dronekit, **options)
+    print(json.dumps({**result, "import_s": imported_s}), flush=True)
     os._exit(0)  # threads of DroneKit would keep the process alive
 
 
 # --------------------------------------------------------------------------------------- the tasks
 
 
-def connect_ready(dronekit: Any, address: str) -> Found:
+def connect_ready(dronekit: Any, address: str) -> Result:
     """Measure the duration of ``connect(wait_ready=True)``."""
     print("connecting", flush=True)
-    cpu, began_at = time.process_time(), time.perf_counter()
+    stopwatch = Stopwatch()
     vehicle = dronekit.connect(address, wait_ready=True, timeout=120)
-    seconds = time.perf_counter() - began_at
-    return {"seconds": seconds, "cpu": time.process_time() - cpu, "parameters": len(vehicle.parameters)}
+    return {"seconds": stopwatch.real_s, "cpu": stopwatch.cpu_s, "parameters": len(vehicle.parameters)}
 
 
-def cpu(dronekit: Any, address: str, listeners: str, settle_s: float, window_s: float) -> Found:
+def cpu(dronekit: Any, address: str, listeners: str, settle_s: float, window_s: float) -> Result:
     """Measure the processor time of this process with all threads, and count the messages received meanwhile."""
-    vehicle = _connected(dronekit, address)
+    vehicle = _connect(dronekit, address)
     calls = LISTENERS[listeners](vehicle)
     _report_connected()
     time.sleep(settle_s)
-    received, called, used, began_at = (
-        _received(vehicle),
-        len(calls),
-        time.process_time(),
-        time.perf_counter(),
-    )
+    received_before = _received_frames(vehicle)
+    calls_before = len(calls)
+    stopwatch = Stopwatch()
     time.sleep(window_s)
-    used, seconds = time.process_time() - used, time.perf_counter() - began_at
     return {
-        "cpu_s": used, "seconds": seconds, "received": _received(vehicle) - received, "called": len(calls) - called,
-    }  # fmt: skip
+        "cpu_s": stopwatch.cpu_s,
+        "seconds": stopwatch.real_s,
+        "received": _received_frames(vehicle) - received_before,
+        "called": len(calls) - calls_before,
+    }
 
 
-def latency(dronekit: Any, address: str, settle_s: float, window_s: float) -> Found:
+def latency(dronekit: Any, address: str, settle_s: float, window_s: float) -> Result:
     """Record the time of each call of a listener, in ns of the monotonic clock, with the round number of the value."""
-    from dronekit_traffic import keys_of
+    from dronekit_traffic import round_number_of
 
-    vehicle = _connected(dronekit, address)
+    vehicle = _connect(dronekit, address)
     calls: list[tuple[int, str, Any]] = []
     clock = time.monotonic_ns
 
@@ -97,27 +98,31 @@ def latency(dronekit: Any, address: str, settle_s: float, window_s: float) -> Fo
     _add_typical_listeners(vehicle, record, record)
     _report_connected()
     time.sleep(settle_s)
-    first = len(calls)
+    calls.clear()
     time.sleep(window_s)
-    keyed = [(at, name, keys_of(name, value)) for at, name, value in calls[first:]]
-    return {"calls": [entry for entry in keyed if entry[2] is not None]}
+    numbered_calls = []
+    for called_at, name, value in tuple(calls):
+        number = round_number_of(name, value)
+        if number is not None:
+            numbered_calls.append((called_at, name, number))
+    return {"calls": numbered_calls}
 
 
-def reads(dronekit: Any, address: str, names: list[str], settle_s: float) -> Found:
+def reads(dronekit: Any, address: str, names: list[str], settle_s: float) -> Result:
     """Measure the nanoseconds that reading each attribute takes while messages arrive."""
-    vehicle = _connected(dronekit, address)
+    vehicle = _connect(dronekit, address)
     _report_connected()
     vehicle.wait_ready("gps_0", "armed", "mode", "attitude", timeout=30)
     time.sleep(settle_s)
     return {"ns": {name: _nanoseconds(f"vehicle.{name}", vehicle) for name in names}}
 
 
-def only_import(dronekit: Any) -> Found:
+def only_import(dronekit: Any) -> Result:
     """Do nothing: the import time is reported in any case."""
     return {}
 
 
-TASKS: dict[str, Callable[..., Found]] = {
+TASKS: dict[str, Callable[..., Result]] = {
     "connect": connect_ready, "cpu": cpu, "latency": latency, "reads": reads, "import": only_import,
 }  # fmt: skip
 
@@ -132,20 +137,20 @@ def _no_listeners(vehicle: Any) -> list[None]:
 def _usual_listeners(vehicle: Any) -> list[None]:
     calls: list[None] = []
 
-    def note(_: Any, name: str, value: Any) -> None:
+    def record(_: Any, name: str, value: Any) -> None:
         calls.append(None)
 
-    _add_typical_listeners(vehicle, note, note)
+    _add_typical_listeners(vehicle, record, record)
     return calls
 
 
 def _every_message(vehicle: Any) -> list[None]:
     calls: list[None] = []
 
-    def note(_: Any, name: str, message: Any) -> None:
+    def record(_: Any, name: str, message: Any) -> None:
         calls.append(None)
 
-    vehicle.add_message_listener("*", note)
+    vehicle.add_message_listener("*", record)
     return calls
 
 
@@ -158,14 +163,14 @@ def _add_typical_listeners(
     vehicle: Any, on_attribute: Callable[[Any, str, Any], None], on_message: Callable[[Any, str, Any], None]
 ) -> None:
     vehicle.on_message("HEARTBEAT")(on_message)
-    for name in USUAL:
+    for name in TYPICAL_ATTRIBUTES:
         vehicle.on_attribute(name)(on_attribute)
 
 
 # ------------------------------------------------------------------------------------------ helpers
 
 
-def _connected(dronekit: Any, address: str) -> Any:
+def _connect(dronekit: Any, address: str) -> Any:
     print("connecting", flush=True)
     return dronekit.connect(address, wait_ready=["mode"], rate=None)
 
@@ -174,15 +179,14 @@ def _report_connected() -> None:
     print("connected", flush=True)
 
 
-def _received(vehicle: Any) -> int:
+def _received_frames(vehicle: Any) -> int:
     """Return the number of received frames, from the counters of the library, which does not decode all frames."""
-    if hasattr(vehicle, "aio"):
-        return sum(
-            source.received
-            for statistics_ in vehicle.aio.connection.statistics()
-            for source in statistics_.sources.values()
-        )
-    return int(vehicle._master.mav.total_packets_received)
+    if not hasattr(vehicle, "aio"):  # not aerokit
+        return int(vehicle._master.mav.total_packets_received)
+    received = 0
+    for peer in vehicle.aio.connection.statistics():
+        received += sum(source.received for source in peer.sources.values())
+    return received
 
 
 def _nanoseconds(expression: str, vehicle: Any) -> float:

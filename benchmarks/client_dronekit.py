@@ -16,7 +16,7 @@ from typing import Any
 os.environ["MAVLINK20"] = "1"
 
 from client import Task, run
-from content import LIMIT_S, mission_items
+from content import LIMIT_S, items_with_home
 
 collections.MutableMapping = collections.abc.MutableMapping  # type: ignore[attr-defined]
 
@@ -27,11 +27,12 @@ def perform(task: Task) -> Any:
     logging.disable(logging.CRITICAL)
     vehicle = dronekit.connect(task.address, _initialize=False)
     fetch_all = vehicle._master.param_fetch_all
-    begun: list[bool] = []
+    has_begun = False
 
-    def begin_and_fetch_all() -> None:
-        if not begun:
-            begun.append(True)
+    def begin_and_fetch_all() -> None:  # DroneKit itself calls this while it connects, and may repeat the call
+        nonlocal has_begun
+        if not has_begun:
+            has_begun = True
             task.begin()
         fetch_all()
 
@@ -45,11 +46,14 @@ def perform(task: Task) -> Any:
 
 
 def _upload(vehicle: Any, task: Task) -> None:
-    follow_up_command: Any = importlib.import_module("dronekit").Command
+    make_command: Any = importlib.import_module("dronekit").Command
     commands = vehicle.commands
     commands.clear()
-    for command, frame, p1, p2, p3, p4, x, y, z in [mission_items(1)[0], *mission_items(task.size)]:
-        commands.add(follow_up_command(0, 0, 0, frame, command, 0, 1, p1, p2, p3, p4, x * 1e-7, y * 1e-7, z))
+    for command, frame, p1, p2, p3, p4, x, y, z in items_with_home(task.size):
+        commands.add(make_command(
+            target_system=0, target_component=0, seq=0, frame=frame, command=command, current=0, autocontinue=1,
+            param1=p1, param2=p2, param3=p3, param4=p4, x=x * 1e-7, y=y * 1e-7, z=z,
+        ))  # fmt: skip
     commands.upload(timeout=LIMIT_S)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from client import Task, run
-from content import DOWNLOAD_PATH, UPLOAD_PATH, mission_items
+from content import DOWNLOAD_PATH, UPLOAD_PATH, items_with_home
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 
 
@@ -27,14 +27,14 @@ async def _perform(task: Task) -> Any:
     mavsdk = Mavsdk(configuration)
     await mavsdk.add_any_connection(f"udpin://127.0.0.1:{task.port}")
     system = await mavsdk.first_autopilot(timeout_s=30.0)
-    work = {
+    transfer = {
         "parameters": _parameters,
         "mission_upload": _mission_upload,
         "mission_download": _mission_download,
         "file_download": _file_download,
         "file_upload": _file_upload,
     }[task.name]
-    return await work(system, task)
+    return await transfer(system, task)
 
 
 async def _parameters(system: Any, task: Task) -> dict[str, float]:
@@ -42,8 +42,8 @@ async def _parameters(system: Any, task: Task) -> dict[str, float]:
 
     plugin = ParamAsync(system)
     task.begin()
-    found = await plugin.get_all_params()
-    return {parameter.name: parameter.value for parameter in (*found.int_params, *found.float_params)}
+    parameters = await plugin.get_all_params()
+    return {parameter.name: parameter.value for parameter in (*parameters.int_params, *parameters.float_params)}
 
 
 async def _mission_upload(system: Any, task: Task) -> None:
@@ -51,12 +51,12 @@ async def _mission_upload(system: Any, task: Task) -> None:
     from mavsdk.plugins.mission_raw import MissionItem
 
     plugin = MissionRawAsync(system)
-    items = [
-        MissionItem(number, frame, command, int(number == 0), 1, p1, p2, p3, p4, x, y, z, 0)
-        for number, (command, frame, p1, p2, p3, p4, x, y, z) in enumerate(
-            [mission_items(1)[0], *mission_items(task.size)]
-        )
-    ]
+    items = []
+    for seq, (command, frame, p1, p2, p3, p4, x, y, z) in enumerate(items_with_home(task.size)):
+        current = 1 if seq == 0 else 0
+        autocontinue = 1
+        mission_type = 0
+        items.append(MissionItem(seq, frame, command, current, autocontinue, p1, p2, p3, p4, x, y, z, mission_type))
     task.begin()
     await plugin.upload_mission(items)
 
@@ -66,10 +66,10 @@ async def _mission_download(system: Any, task: Task) -> list[Any]:
 
     plugin = MissionRawAsync(system)
     task.begin()
-    items = await plugin.download_mission()
+    _home, *waypoints = await plugin.download_mission()
     return [
         (item.command, item.frame, item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
-        for item in items[1:]
+        for item in waypoints
     ]
 
 

@@ -15,13 +15,13 @@ import gc
 import json
 import statistics
 import sys
-import time
 import tracemalloc
 from collections.abc import Sequence
 from contextlib import AsyncExitStack
 
 import decode
 from deliver import FedLink
+from stopwatch import Stopwatch
 from table import Row, row
 
 import aerokit
@@ -35,13 +35,13 @@ from aerokit.vehicle.vehicle import Vehicle
 __all__ = ["COUNTS", "rows"]
 
 COUNTS = (1, 10, 50, 100, 200, 500)
-ON_A_LINK = 250
-LINEAR = 0.8
-"""Minimum ratio of the cost of one vehicle among 10 to that of one vehicle among more than 10."""
+MAX_VEHICLES_ON_LINK = 250
+MIN_LINEARITY = 0.8
+"""Target: the cost of a vehicle among 10, divided by the cost of a vehicle among more than 10."""
 MAX_MIB = 0.15
 # Interval at which every vehicle sends all messages.
 TURN_S = 0.25
-HEARTBEAT = messages.Heartbeat(2, 3, 81, 4, 4, 3)
+HEARTBEAT = messages.Heartbeat(type=2, autopilot=3, base_mode=81, custom_mode=4, system_status=4, mavlink_version=3)
 
 Turn = list[list[bytes]]
 """The datagrams that each link receives in one interval."""
@@ -49,82 +49,74 @@ Turn = list[list[bytes]]
 
 def rows(counts: Sequence[int] = COUNTS, turns: int = 16, rounds: int = 3) -> list[Row]:
     """Measure the share of a core per vehicle for each count, compared with 10 vehicles, and the memory per vehicle."""
-    found = {
-        count: statistics.median(asyncio.run(_share_of_each(count, turns)) for _ in range(rounds))
-        for count in sorted({10, *counts})
-    }
-    table: list[Row] = []
-    for count in counts:
-        percent, percent_of_ten = 100 * found[count], 100 * found[10]
-        shown = row(
-            f"clients_{count}", percent, percent_of_ten, "one of ten",
-            unit="% of a core each", ratio=percent_of_ten / percent, aim=LINEAR if count >= 10 else 0.0,
-        )  # fmt: skip
-        table.append({**shown, "note": f"{percent:.3f} % of a core each, {percent * count:.1f} % together"})
-    table += _fleet_rows(counts, turns, rounds)
+    table = _share_rows("clients", "", counts, turns, rounds)
+    table += _share_rows("fleet", "as one fleet: ", counts, turns, rounds, is_fleet=True)
     mib = asyncio.run(_mebibytes_of_each(max(counts)))
-    shown = row("client_memory", mib, MAX_MIB, "maximum", unit="MiB", ratio=MAX_MIB / mib, aim=1.0)
-    return [
-        *table,
-        {**shown, "note": f"{mib:.3f} MiB for each of {max(counts)} clients after one turn of messages"},
-    ]
+    memory_row = row("client_memory", mib, MAX_MIB, "maximum", unit="MiB", ratio=MAX_MIB / mib, aim=1.0)
+    memory_row["note"] = f"{mib:.3f} MiB for each of {max(counts)} clients after one turn of messages"
+    return [*table, memory_row]
 
 
-def _fleet_rows(counts: Sequence[int], turns: int, rounds: int) -> list[Row]:
-    """Measure the share of a core per fleet member for each count, compared with 10 members."""
-    found = {
-        count: statistics.median(asyncio.run(_share_of_each(count, turns, is_fleet=True)) for _ in range(rounds))
-        for count in sorted({10, *counts})
-    }
+def _share_rows(
+    prefix: str, note: str, counts: Sequence[int], turns: int, rounds: int, *, is_fleet: bool = False
+) -> list[Row]:
+    """Measure the share of a core per vehicle for each count, compared with 10 vehicles."""
+    percents = {}
+    for count in sorted({10, *counts}):
+        shares = [asyncio.run(_share_of_each(count, turns, is_fleet=is_fleet)) for _ in range(rounds)]
+        percents[count] = 100 * statistics.median(shares)
     table: list[Row] = []
     for count in counts:
-        percent, percent_of_ten = 100 * found[count], 100 * found[10]
-        shown = row(
-            f"fleet_{count}", percent, percent_of_ten, "one of ten",
-            unit="% of a core each", ratio=percent_of_ten / percent, aim=LINEAR if count >= 10 else 0.0,
+        percent = percents[count]
+        aim = MIN_LINEARITY if count >= 10 else 0.0
+        count_row = row(
+            f"{prefix}_{count}", percent, percents[10], "one of ten",
+            unit="% of a core each", ratio=percents[10] / percent, aim=aim,
         )  # fmt: skip
-        note = f"as one fleet: {percent:.3f} % of a core each, {percent * count:.1f} % together"
-        table.append({**shown, "note": note})
+        count_row["note"] = f"{note}{percent:.3f} % of a core each, {percent * count:.1f} % together"
+        table.append(count_row)
     return table
 
 
 async def _share_of_each(count: int, turns: int, *, is_fleet: bool = False) -> float:
     """Return the share of a core that each vehicle takes."""
     async with AsyncExitStack() as stack:
-        fleet = await _connected(stack, count, turns)
+        clients = await _connect_all(stack, count, turns)
         if is_fleet:
-            names = {f"member {number}": vehicle for number, vehicle in enumerate(fleet.vehicles)}
-            one = await stack.enter_async_context(aerokit.fleet(names, min_distance_m=5.0, on_too_close="report"))
-            stack.enter_context(one.events(capacity=10_000))
-        fleet.feed_turn()
+            members = {f"member {number}": vehicle for number, vehicle in enumerate(clients.vehicles)}
+            fleet = await stack.enter_async_context(aerokit.fleet(members, min_distance_m=5.0, on_too_close="report"))
+            stack.enter_context(fleet.events(capacity=10_000))
+        clients.feed_turn()
         await asyncio.sleep(TURN_S)
-        wall, used = time.perf_counter(), time.process_time()
+        stopwatch = Stopwatch()
         for _ in range(turns):
-            fleet.feed_turn()
-            await asyncio.sleep(max(0.0, TURN_S - (time.perf_counter() - wall) % TURN_S))
-        wall, used = time.perf_counter() - wall, time.process_time() - used
-        fleet.check()
-        return used / wall / count
+            clients.feed_turn()
+            await asyncio.sleep(TURN_S - stopwatch.real_s % TURN_S)
+        share = stopwatch.cpu_s / stopwatch.real_s
+        clients.check()
+        return share / count
 
 
 async def _mebibytes_of_each(count: int) -> float:
     async with AsyncExitStack() as stack:
         tracemalloc.start()
         stack.callback(tracemalloc.stop)
-        fleet = await _connected(stack, count, 0)
-        fleet.feed_turn()
-        fleet.check()
-        fleet.forget()
+        clients = await _connect_all(stack, count, 0)
+        clients.feed_turn()
+        clients.check()
+        clients.forget()
         gc.collect()
-        return tracemalloc.get_traced_memory()[0] / count / (1 << 20)
+        used_bytes, _peak = tracemalloc.get_traced_memory()
+        return used_bytes / count / (1 << 20)
 
 
-class _Fleet:
+class _Clients:
     """Connected clients, and the messages that their vehicles will send."""
 
     def __init__(self, vehicles: list[Vehicle], connections: list[Connection], turns: list[Turn]) -> None:
         self.vehicles = vehicles
-        self._connections, self._turns = connections, turns
+        self._connections = connections
+        self._turns = turns
 
     def feed_turn(self) -> None:
         for connection, datagrams in zip(self._connections, self._turns.pop(0), strict=True):
@@ -140,48 +132,56 @@ class _Fleet:
             raise AssertionError("a client received no messages of its vehicle")
 
 
-async def _connected(stack: AsyncExitStack, count: int, turns: int) -> _Fleet:
-    encoders = [FrameEncoder(1 + number % ON_A_LINK, 1) for number in range(count)]
-    connections = [
-        await stack.enter_async_context(aerokit.open_connection(FedLink(f"network {number}")))
-        for number in range(-(-count // ON_A_LINK))
-    ]
-    vehicles = []
-    for number, encoder in enumerate(encoders):
-        connection = connections[number // ON_A_LINK]
+async def _connect_all(stack: AsyncExitStack, count: int, turns: int) -> _Clients:
+    connections: list[Connection] = []
+    vehicles: list[Vehicle] = []
+    encoders: list[FrameEncoder] = []
+    for number in range(count):
+        index_on_link = number % MAX_VEHICLES_ON_LINK
+        if index_on_link == 0:
+            link = FedLink(f"network {len(connections)}")
+            connections.append(await stack.enter_async_context(aerokit.open_connection(link)))
+        system_id = 1 + index_on_link
+        encoder = FrameEncoder(system_id, 1)
         for _ in range(5):  # let the loop run, so that the connection does not report a blocked loop
             await asyncio.sleep(0)
-        connection.bytes_received(encoder.encode(HEARTBEAT), None)
-        system_id = 1 + number % ON_A_LINK
-        vehicles.append(await stack.enter_async_context(aerokit.connect(connection, system_id=system_id, rates={})))
-    return _Fleet(vehicles, connections, _made(encoders, turns + 1))
+        connections[-1].bytes_received(encoder.encode(HEARTBEAT), None)
+        connecting = aerokit.connect(connections[-1], system_id=system_id, rates={})
+        vehicles.append(await stack.enter_async_context(connecting))
+        encoders.append(encoder)
+    return _Clients(vehicles, connections, _encode_turns(encoders, turns + 1))
 
 
-def _made(encoders: Sequence[FrameEncoder], turns: int) -> list[Turn]:
-    """Return the messages of all turns: one of each kind from every vehicle, and a heartbeat in every fourth turn.
+def _encode_turns(encoders: Sequence[FrameEncoder], count: int) -> list[Turn]:
+    """Return the datagrams of all turns: each message from every vehicle, and a heartbeat in every fourth turn.
 
     Each message is a datagram.
     """
-    kinds = _kinds()
-    made: list[Turn] = []
-    for number in range(turns):
-        turn: Turn = [[] for _ in range(-(-len(encoders) // ON_A_LINK))]
-        for which, encoder in enumerate(encoders):
-            sent = [HEARTBEAT, *kinds] if number % 4 == 0 else kinds
-            turn[which // ON_A_LINK] += [encoder.encode(message) for message in sent]
-        made.append(turn)
-    return made
+    observed = _recorded_messages()
+    turns: list[Turn] = []
+    for number in range(count):
+        sent = [HEARTBEAT, *observed] if number % 4 == 0 else observed
+        turn: Turn = []
+        for begin in range(0, len(encoders), MAX_VEHICLES_ON_LINK):
+            datagrams: list[bytes] = []
+            for encoder in encoders[begin : begin + MAX_VEHICLES_ON_LINK]:
+                datagrams += [encoder.encode(message) for message in sent]
+            turn.append(datagrams)
+        turns.append(turn)
+    return turns
 
 
-def _kinds() -> list[Message]:
-    """Return the last message in the recorded flight of each kind that a client observes."""
-    wanted = {getattr(messages, name) for name in DEFAULT_RATES_HZ}
-    found: dict[type[Message], Message] = {}
-    for raw in decode.frames_of(next(iter(decode.RECORDINGS.values()))):
+def _recorded_messages() -> list[Message]:
+    """Return the last message in the recorded flight of each type that a client observes."""
+    observed_types = {getattr(messages, name) for name in DEFAULT_RATES_HZ}
+    recording = next(iter(decode.RECORDINGS.values()))
+    latest: dict[type[Message], Message] = {}
+    for raw in decode.frames_of(recording):
         frame = Frame.parse(raw)
-        if STANDARD[frame.message_id] in wanted:
-            found[STANDARD[frame.message_id]] = STANDARD.decode(frame)
-    return list(found.values())
+        message_type = STANDARD[frame.message_id]
+        if message_type in observed_types:
+            latest[message_type] = STANDARD.decode(frame)
+    return list(latest.values())
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ __all__ = ["rows"]
 COMMAND = 181  # MAV_CMD_DO_SET_RELAY
 RESPONDER = Path(__file__).with_name("responder.py")
 # Number of round trips before the first measured one.
-TRIPS_BEFORE = 50
+WARM_UP_TRIPS = 50
 
 Block = Callable[[int], Awaitable[list[float]]]
 """Makes this many round trips and returns their durations in microseconds."""
@@ -46,47 +46,41 @@ def rows(rounds: int = 60, trips: int = 60) -> list[Row]:
 
 
 async def _measure(rounds: int, trips: int) -> list[Row]:
-    ports = _free_ports(3)
+    aerokit_port, pymavlink_port, mavsdk_port = _free_ports(3)
     async with AsyncExitStack() as stack:
-        stack.enter_context(_responder(ports))
+        stack.enter_context(_responder([aerokit_port, pymavlink_port, mavsdk_port]))
         blocks = {
-            "aerokit": await stack.enter_async_context(_aerokit(ports[0])),
-            "pymavlink": stack.enter_context(_pymavlink(ports[1])),
+            "aerokit": await stack.enter_async_context(_aerokit(aerokit_port)),
+            "pymavlink": stack.enter_context(_pymavlink(pymavlink_port)),
         }
         if _has_mavsdk():
-            blocks["mavsdk"] = await stack.enter_async_context(_mavsdk(ports[2]))
+            blocks["mavsdk"] = await stack.enter_async_context(_mavsdk(mavsdk_port))
         return _rows(await _in_turns(blocks, rounds, trips))
 
 
-def _rows(taken: dict[str, list[float]]) -> list[Row]:
-    own = taken["aerokit"]
-    found = [
-        faster_is_better(
-            "command_rtt_pymavlink",
-            own,
-            taken["pymavlink"],
-            "pymavlink, blocking loop",
-            unit="µs",
-            aim=1 / 1.5,
-        )
-    ]
-    if "mavsdk" in taken:
+def _rows(durations_us: dict[str, list[float]]) -> list[Row]:
+    own = durations_us["aerokit"]
+    peer = durations_us["pymavlink"]
+    name = "pymavlink, blocking loop"
+    table = [faster_is_better("command_rtt_pymavlink", own, peer, name, unit="µs", aim=1 / 1.5)]
+    if "mavsdk" in durations_us:
+        peer = durations_us["mavsdk"]
         name = "MAVSDK asyncio, action.set_relay"
-        found.append(faster_is_better("command_rtt_mavsdk", own, taken["mavsdk"], name, unit="µs", aim=1 / 0.6))
-    return found
+        table.append(faster_is_better("command_rtt_mavsdk", own, peer, name, unit="µs", aim=1 / 0.6))
+    return table
 
 
 async def _in_turns(blocks: dict[str, Block], rounds: int, trips: int) -> dict[str, list[float]]:
-    """Return the durations. Turns are short, so that other load on the machine affects all libraries equally."""
+    """Return the durations of all round trips. Short turns make other load affect all libraries equally."""
     for block in blocks.values():
-        await block(TRIPS_BEFORE)
-    taken: dict[str, list[float]] = {name: [] for name in blocks}
+        await block(WARM_UP_TRIPS)
+    durations_us: dict[str, list[float]] = {name: [] for name in blocks}
     order = list(blocks)
     for _ in range(rounds):
         for name in order:
-            taken[name] += await blocks[name](trips)
+            durations_us[name] += await blocks[name](trips)
         order.append(order.pop(0))
-    return taken
+    return durations_us
 
 
 # ----------------------------------------------------------------------------------------- the three
@@ -106,18 +100,19 @@ async def _aerokit(port: int) -> AsyncIterator[Block]:
 def _pymavlink(port: int) -> Iterator[Block]:
     master: Any = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=254)
     master.wait_heartbeat(timeout=10)
-    send, clock = master.mav.command_long_send, time.perf_counter
+    send = master.mav.command_long_send
+    clock = time.perf_counter
 
     async def block(trips: int) -> list[float]:
-        taken = []
+        durations_us = []
         for _ in range(trips):
-            started = clock()
-            send(1, 1, COMMAND, 0, 1, 1, 0, 0, 0, 0, 0)
+            started_at = clock()
+            send(1, 1, COMMAND, 0, 1, 1, 0, 0, 0, 0, 0)  # system, component, command, confirmation, param1 to param7
             ack = master.recv_match(type="COMMAND_ACK", blocking=True)
             while ack.command != COMMAND:
                 ack = master.recv_match(type="COMMAND_ACK", blocking=True)
-            taken.append((clock() - started) * 1e6)
-        return taken
+            durations_us.append((clock() - started_at) * 1e6)
+        return durations_us
 
     yield block
     master.close()
@@ -140,12 +135,13 @@ async def _mavsdk(port: int) -> AsyncIterator[Block]:
 
 
 async def _timed(trip: Callable[[], Awaitable[object]], trips: int) -> list[float]:
-    taken, clock = [], time.perf_counter
+    clock = time.perf_counter
+    durations_us = []
     for _ in range(trips):
-        started = clock()
+        started_at = clock()
         await trip()
-        taken.append((clock() - started) * 1e6)
-    return taken
+        durations_us.append((clock() - started_at) * 1e6)
+    return durations_us
 
 
 def _has_mavsdk() -> bool:
@@ -177,7 +173,8 @@ def _free_ports(count: int) -> list[int]:
     try:
         for sock in sockets:
             sock.bind(("127.0.0.1", 0))
-        return [sock.getsockname()[1] for sock in sockets]
+        addresses = [sock.getsockname() for sock in sockets]
+        return [port for _, port in addresses]
     finally:
         for sock in sockets:
             sock.close()

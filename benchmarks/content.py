@@ -15,6 +15,7 @@ __all__ = [
     "Item",
     "Sizes",
     "file_content",
+    "items_with_home",
     "mission_items",
 ]
 
@@ -24,7 +25,8 @@ UPLOAD_PATH = "/APM/upload.bin"
 # Seconds after which a transfer counts as failed.
 LIMIT_S = 120.0
 
-WAYPOINT, GLOBAL_RELATIVE_ALT = 16, 3
+WAYPOINT = 16
+GLOBAL_RELATIVE_ALT = 3
 
 Item = tuple[int, int, float, float, float, float, int, int, float]
 """A mission item: command, frame, param1 to param4, latitude and longitude in 1e-7 degrees, altitude."""
@@ -49,6 +51,12 @@ def mission_items(count: int) -> list[Item]:
          -353632610 + 1000 * n, 1491652299 + 700 * n, 20.0 + n % 50)
         for n in range(count)
     ]  # fmt: skip
+
+
+def items_with_home(count: int) -> list[Item]:
+    """Create an item for home, which ArduPilot expects as item 0, and then ``count`` waypoints."""
+    (home,) = mission_items(1)
+    return [home, *mission_items(count)]
 
 
 def as_numbers(item: Any) -> Item:

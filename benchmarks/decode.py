@@ -26,20 +26,32 @@ from aerokit.mavlink.frame import MAGIC_V2, x25
 
 ROOT = Path(__file__).resolve().parent.parent
 _FOLDERS = {"": ROOT.parent / "shared" / "traces", "_short": ROOT / "tests" / "recordings"}
-RECORDINGS = {
-    f"{name.rpartition('-')[2]}{suffix}": folder / f"{name}.tlog"
-    for suffix, folder in _FOLDERS.items()
-    for name in ("ardupilot-copter", "ardupilot-plane", "ardupilot-rover", "px4-quad")
-    if (folder / f"{name}.tlog").exists()
-}
+
+
+def _recordings() -> dict[str, Path]:
+    recordings = {}
+    for suffix, folder in _FOLDERS.items():
+        for file_name in ("ardupilot-copter", "ardupilot-plane", "ardupilot-rover", "px4-quad"):
+            path = folder / f"{file_name}.tlog"
+            if path.exists():
+                _, _, vehicle = file_name.rpartition("-")
+                recordings[f"{vehicle}{suffix}"] = path
+    return recordings
+
+
+RECORDINGS = _recordings()
 """Recordings by name: the complete flights if they are available, and the short ones in the repository. Frames of PX4
 are signed, with or without a key.
 """
 _HEADER = Struct("<BBBxBHI").unpack_from
 _CHECKSUM = Struct("<H").unpack_from
-SKIP_AIM, TYPED_AIM = (50.0, 18.0) if wire_implementation == "c" else (10.0, 6.0)
-CHUNK = 1024
-PART = 1000
+_IS_COMPILED = wire_implementation == "c"
+SKIP_AIM = 50.0 if _IS_COMPILED else 10.0
+TYPED_AIM = 18.0 if _IS_COMPILED else 6.0
+# Number of bytes in a piece of a stream.
+PIECE_SIZE = 1024
+# Number of frames that one library decodes before the next library's turn.
+PART_SIZE = 1000
 
 
 def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list[Row]:
@@ -52,17 +64,19 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
     ``decode_floor_typed`` does the same for ``decode_typed``, with an unpacked payload.
     """
     table: list[Row] = []
-    for which, name in enumerate(recordings):
+    for name in recordings:
         frames = frames_of(RECORDINGS[name])
-        parts = [frames[begin : begin + PART] for begin in range(0, len(frames), PART)]
-        end = f"_{name}" if which else ""
+        parts = [frames[begin : begin + PART_SIZE] for begin in range(0, len(frames), PART_SIZE)]
+        is_first = name == recordings[0]
+        suffix = "" if is_first else f"_{name}"
         pieces = [(len(part), part) for part in parts]
-        skip, typed, least, unpacked, peer = _rates((_skip, _typed, _least, _unpacked, _pymavlink), pieces, rounds)
-        table.append(_row("decode_skip" + end, skip, peer, SKIP_AIM))
-        table.append(_row("decode_typed" + end, typed, peer, TYPED_AIM))
-        if which:
+        decoders = (_skip, _typed, _check_only, _check_and_unpack, _pymavlink)
+        skip, typed, checked, unpacked, peer = _rates(decoders, pieces, rounds)
+        table.append(_row("decode_skip" + suffix, skip, peer, SKIP_AIM))
+        table.append(_row("decode_typed" + suffix, typed, peer, TYPED_AIM))
+        if not is_first:
             continue
-        table.append(_row("decode_floor", skip, least, 1 / 1.5, "header and checksum alone"))
+        table.append(_row("decode_floor", skip, checked, 1 / 1.5, "header and checksum alone"))
         table.append(_row("decode_floor_typed", typed, unpacked, 1 / 1.5, "header, checksum, struct.unpack"))
         pieces = [(len(part), in_pieces(part)) for part in parts]
         skip, typed, peer = _rates((_skip, _typed, _pymavlink), pieces, rounds)
@@ -73,16 +87,18 @@ def rows(rounds: int = 7, recordings: Sequence[str] = tuple(RECORDINGS)) -> list
 
 def frames_of(path: Path) -> list[bytes]:
     """Return the frames of a recording whose messages both libraries know. Other frames cannot be compared."""
-    frames = [raw for _, raw in read_tlog(path)]
-    ids = [int.from_bytes(raw[7:10], "little") if raw[0] == MAGIC_V2 else raw[5] for raw in frames]
-    known = STANDARD.rows.keys() & ardupilotmega.mavlink_map.keys()
-    return [raw for raw, message_id in zip(frames, ids, strict=True) if message_id in known]
+    known_ids = STANDARD.rows.keys() & ardupilotmega.mavlink_map.keys()
+    return [raw for _, raw in read_tlog(path) if _message_id(raw) in known_ids]
+
+
+def _message_id(raw: bytes) -> int:
+    return int.from_bytes(raw[7:10], "little") if raw[0] == MAGIC_V2 else raw[5]
 
 
 def in_pieces(frames: list[bytes]) -> list[bytes]:
     """Split the bytes of the frames into pieces of 1 kB."""
     stream = b"".join(frames)
-    return [stream[begin : begin + CHUNK] for begin in range(0, len(stream), CHUNK)]
+    return [stream[begin : begin + PIECE_SIZE] for begin in range(0, len(stream), PIECE_SIZE)]
 
 
 def _row(
@@ -92,16 +108,17 @@ def _row(
 
 
 def _rates(
-    runs: Sequence[Callable[[list[bytes]], int]], parts: list[tuple[int, list[bytes]]], rounds: int
+    decoders: Sequence[Callable[[list[bytes]], int]], parts: list[tuple[int, list[bytes]]], rounds: int
 ) -> list[list[float]]:
-    rates: list[list[float]] = [[] for _ in runs]
+    """Return for each decoder its rates of all parts. A part has the number of its frames, and their bytes."""
+    rates: list[list[float]] = [[] for _ in decoders]
     for count, pieces in parts * rounds:
-        for run, found in zip(runs, rates, strict=True):
-            started = time.process_time()
-            seen = run(pieces)
-            found.append(count / (time.process_time() - started))
-            if seen != count:
-                raise AssertionError(f"{run.__name__} saw {seen} of {count} frames")
+        for decoder, decoder_rates in zip(decoders, rates, strict=True):
+            started_at = time.process_time()
+            decoded = decoder(pieces)
+            decoder_rates.append(count / (time.process_time() - started_at))
+            if decoded != count:
+                raise AssertionError(f"{decoder.__name__} decoded {decoded} of {count} frames")
     return rates
 
 
@@ -114,41 +131,46 @@ def _skip(chunks: list[bytes]) -> int:
 
 
 def _typed(chunks: list[bytes]) -> int:
-    framer, decode = Framer(), STANDARD.decode
-    seen = 0
+    framer = Framer()
+    decode = STANDARD.decode
+    delivered = 0
 
     def deliver(message: Message) -> None:
-        nonlocal seen
-        seen += 1
+        nonlocal delivered
+        delivered += 1
 
     for chunk in chunks:
         for frame in framer.receive(chunk):
             deliver(decode(frame))
-    return seen
+    return delivered
 
 
-def _least(chunks: list[bytes]) -> int:
-    extras, seen = STANDARD.extras, 0
+def _check_only(chunks: list[bytes]) -> int:
+    extras = STANDARD.extras
+    valid = 0
     for chunk in chunks:
         _, length, _, _, _, message_id = _HEADER(chunk)
-        upto = 10 + length
-        if x25(chunk[1:upto] + extras[message_id & 0xFFFFFF]) == _CHECKSUM(chunk, upto)[0]:
-            seen += 1
-    return seen
+        end = 10 + length
+        (checksum,) = _CHECKSUM(chunk, end)
+        if x25(chunk[1:end] + extras[message_id & 0xFFFFFF]) == checksum:
+            valid += 1
+    return valid
 
 
-def _unpacked(chunks: list[bytes]) -> int:
-    extras, seen = STANDARD.extras, 0
+def _check_and_unpack(chunks: list[bytes]) -> int:
+    extras = STANDARD.extras
+    valid = 0
     for chunk in chunks:
         _, length, _, _, _, message_id = _HEADER(chunk)
         message_id &= 0xFFFFFF
-        upto = 10 + length
-        body = chunk[1:upto]
-        if x25(body + extras[message_id]) == _CHECKSUM(chunk, upto)[0]:
+        end = 10 + length
+        body = chunk[1:end]
+        (checksum,) = _CHECKSUM(chunk, end)
+        if x25(body + extras[message_id]) == checksum:
             unpack, size = _payload(message_id)
             unpack(body.ljust(size, b"\0"), 9)
-            seen += 1
-    return seen
+            valid += 1
+    return valid
 
 
 @cache
@@ -161,10 +183,10 @@ def _payload(message_id: int) -> tuple[Callable[[bytes, int], tuple[Any, ...]], 
 def _pymavlink(chunks: list[bytes]) -> int:
     parser = ardupilotmega.MAVLink(None)
     parser.robust_parsing = True
-    seen = 0
+    parsed = 0
     for chunk in chunks:
-        seen += len(parser.parse_buffer(chunk) or ())
-    return seen
+        parsed += len(parser.parse_buffer(chunk) or ())
+    return parsed
 
 
 if __name__ == "__main__":

@@ -34,7 +34,8 @@ __all__ = ["FedLink", "rows"]
 
 AUTOPILOT = (1, 1)
 FLIGHT = next(iter(decode.RECORDINGS))
-TELEMETRY_AIM, READ_AIM = (12.0, 10.0) if wire_implementation == "c" else (2.0, 2.0)
+TELEMETRY_AIM = 12.0 if wire_implementation == "c" else 2.0
+READ_AIM = 10.0 if wire_implementation == "c" else 2.0
 
 
 def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
@@ -61,46 +62,51 @@ def rows(rounds: int = 7, recording: str = FLIGHT) -> list[Row]:
 
 
 async def _in_turns(
-    own_way: Callable[[list[bytes], list[bytes]], Awaitable[float]],
+    measure: Callable[[list[bytes], list[bytes]], Awaitable[float]],
     frames: list[bytes],
     pieces: list[bytes],
     rounds: int,
 ) -> tuple[float, float]:
-    own, peer = [], []
+    """Return the median rates of aerokit and of pymavlink."""
+    own = []
+    peer = []
     for _ in range(rounds):
-        own.append(await own_way(frames, pieces))
+        own.append(await measure(frames, pieces))
         peer.append(_pymavlink(len(frames), pieces))
     return statistics.median(own), statistics.median(peer)
 
 
 async def _async_for(frames: list[bytes], pieces: list[bytes]) -> float:
-    kinds = {STANDARD[Frame.parse(raw).message_id] for raw in frames}
-    seen, taken = 0, 0.0
+    """Return the rate at which a subscriber reads all messages by ``async for``."""
+    message_types = {STANDARD[Frame.parse(raw).message_id] for raw in frames}
+    cpu_s = 0.0
+    read_count = 0
 
     async def read(subscription: Any) -> None:
-        nonlocal seen
+        nonlocal read_count
         async for _ in subscription:
-            seen += 1
+            read_count += 1
 
     async with (
         aerokit.open_connection(FedLink("recording")) as connection,
         anyio.create_task_group() as group,
     ):
-        with connection.subscribe(*kinds, capacity=1000) as subscription:
+        with connection.subscribe(*message_types, capacity=1000) as subscription:
             group.start_soon(read, subscription)
             await anyio.lowlevel.checkpoint()
-            started = time.process_time()
+            started_at = time.process_time()
             for piece in pieces:
                 connection.bytes_received(piece, None)
                 await asyncio.sleep(0)
-            taken = time.process_time() - started
+            cpu_s = time.process_time() - started_at
             group.cancel_scope.cancel()
-            if seen != len(frames):
-                raise AssertionError(f"{seen} of {len(frames)} messages were read")
-    return seen / taken
+            if read_count != len(frames):
+                raise AssertionError(f"{read_count} of {len(frames)} messages were read")
+    return read_count / cpu_s
 
 
 async def _telemetry(frames: list[bytes], pieces: list[bytes]) -> float:
+    """Return the rate at which the telemetry of a vehicle processes frames."""
     link = FedLink("recording")
     async with aerokit.open_connection(link) as connection:
         for raw in frames:
@@ -126,10 +132,10 @@ def _pymavlink(count: int, pieces: list[bytes]) -> float:
 
 
 def _rate(count: int, pieces: list[bytes], feed: Callable[[bytes], None]) -> float:
-    started = time.process_time()
-    for raw in pieces:
-        feed(raw)
-    return count / (time.process_time() - started)
+    started_at = time.process_time()
+    for piece in pieces:
+        feed(piece)
+    return count / (time.process_time() - started_at)
 
 
 class FedLink(BaseLink):

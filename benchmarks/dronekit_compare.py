@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"the parts are {', '.join(PARTS)}")
     wanted = ["aerokit", *(options.peer or ("dronekit", "dronekit2"))]
     libraries = [library for library in LIBRARIES if library.name in wanted and installed(library)]
-    plan = Plan(1 if options.quick else options.rounds, options.quick, options.only)
+    plan = Plan(rounds=1 if options.quick else options.rounds, quick=options.quick, only=options.only)
     rows: list[Row] = []
     compile_aerokit()
     for part in options.parts or PARTS:

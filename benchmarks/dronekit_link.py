@@ -25,12 +25,14 @@ class Link:
 
     def __init__(self, delay: float, bandwidth: float) -> None:
         self.socket = socket.socket()
-        self._delay, self._bandwidth = delay, bandwidth
-        self._free_at = 0.0
-        self._leaving: deque[tuple[float, bytes]] = deque()
-        self._coming: deque[tuple[float, Any]] = deque()
-        names: Any = ardupilotmega
-        self._parser = names.MAVLink(None)
+        self._delay = delay
+        self._bandwidth = bandwidth
+        self._free_at = 0.0  # when the bandwidth allows the next byte
+        # Delayed bytes and messages, each with the time at which it is due.
+        self._outgoing: deque[tuple[float, bytes]] = deque()
+        self._incoming: deque[tuple[float, Any]] = deque()
+        dialect: Any = ardupilotmega
+        self._parser = dialect.MAVLink(None)
         self._parser.robust_parsing = True
 
     @property
@@ -51,36 +53,44 @@ class Link:
         if not self._delay and not self._bandwidth:
             self._write(data)
             return
-        begins = max(time.monotonic(), self._free_at)
-        self._free_at = begins + (len(data) / self._bandwidth if self._bandwidth else 0.0)
-        self._leaving.append((self._free_at + self._delay, data))
+        begins_at = max(time.monotonic(), self._free_at)
+        duration_s = len(data) / self._bandwidth if self._bandwidth else 0.0
+        self._free_at = begins_at + duration_s
+        self._outgoing.append((self._free_at + self._delay, data))
 
     def release_due(self) -> float:
         """Send the delayed bytes that are due. Return the time at which more bytes or messages are due."""
         now = time.monotonic()
-        while self._leaving and self._leaving[0][0] <= now:
-            self._write(self._leaving.popleft()[1])
-        return min(
-            self._leaving[0][0] if self._leaving else math.inf,
-            self._coming[0][0] if self._coming else math.inf,
-        )
+        while _next_due(self._outgoing) <= now:
+            _, data = self._outgoing.popleft()
+            self._write(data)
+        return min(_next_due(self._outgoing), _next_due(self._incoming))
 
     def read(self) -> None:
         """Read the socket. Messages are received after their delay."""
         data = self._read()
         for message in self._parser.parse_buffer(data) or ():
-            self._coming.append((time.monotonic() + self._delay, message))
+            self._incoming.append((time.monotonic() + self._delay, message))
 
     def received(self) -> Iterator[Any]:
         """Yield the pymavlink messages whose delay has passed."""
-        while self._coming and self._coming[0][0] <= time.monotonic():
-            yield self._coming.popleft()[1]
+        while _next_due(self._incoming) <= time.monotonic():
+            _, message = self._incoming.popleft()
+            yield message
 
     def _write(self, data: bytes) -> None:
         raise NotImplementedError
 
     def _read(self) -> bytes:
         raise NotImplementedError
+
+
+def _next_due(queue: deque[tuple[float, Any]]) -> float:
+    """Return the time at which the first entry of a queue is due; infinity if the queue is empty."""
+    if not queue:
+        return math.inf
+    due_at, _ = queue[0]
+    return due_at
 
 
 class UdpLink(Link):
@@ -99,7 +109,7 @@ class UdpLink(Link):
 
     def _read(self) -> bytes:
         try:
-            return self.socket.recvfrom(4096)[0]
+            return self.socket.recv(4096)
         except ConnectionError:
             return b""
 
@@ -135,7 +145,8 @@ class TcpLink(Link):
         if len(self._unsent) < MAX_UNSENT:
             self._unsent += data
         try:
-            self._unsent = self._unsent[self.socket.send(self._unsent) :]
+            sent = self.socket.send(self._unsent)
+            self._unsent = self._unsent[sent:]
         except BlockingIOError:
             return
         except ConnectionError:

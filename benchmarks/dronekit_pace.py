@@ -14,6 +14,7 @@ BURST = 10
 BURST_INTERVAL_S = 0.0055
 SPACING_US = (31, 12, 82, 15, 40, 10, 69, 22, 133, 16, 37, 9, 60, 14, 100, 25)
 
+# Number of messages that are due at the same time: one of each type.
 ROUND = 25
 
 
@@ -22,18 +23,26 @@ def bursts(rate: float, *, evenly: bool) -> Iterator[tuple[float, list[float]]]:
     if evenly:
         while True:
             yield 1 / rate, [0.0]
-    period = ROUND / rate
-    spacing = cycle(SPACING_US)
+    period_s = ROUND / rate
+    spacings_us = cycle(SPACING_US)
     sizes = [BURST] * (ROUND // BURST) + [ROUND % BURST]
-    apart = min(BURST_INTERVAL_S, period / len(sizes))
+    interval_s = min(BURST_INTERVAL_S, period_s / len(sizes))
     while True:
-        for number, size in enumerate(sizes):
-            offset, offsets = 0.0, []
-            for _ in range(size):
-                offsets.append(offset)
-                offset += next(spacing) * 1e-6
-            is_last = number == len(sizes) - 1
-            yield period - apart * number if is_last else apart, offsets
+        remaining_s = period_s
+        for size in sizes[:-1]:
+            remaining_s -= interval_s
+            yield interval_s, _offsets(size, spacings_us)
+        yield remaining_s, _offsets(sizes[-1], spacings_us)
+
+
+def _offsets(size: int, spacings_us: Iterator[int]) -> list[float]:
+    """Return the seconds from the beginning of a burst to each of its messages."""
+    offsets = []
+    offset_s = 0.0
+    for _ in range(size):
+        offsets.append(offset_s)
+        offset_s += next(spacings_us) * 1e-6
+    return offsets
 
 
 def wait_until(when: float) -> None:

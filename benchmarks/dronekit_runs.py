@@ -66,30 +66,31 @@ def run(
     """
     if vehicle is None:
         with _client(library, task) as client:
-            return _found(client, None, None)
+            return _wait_for_result(client, None, None)
     port = _free_port()
     scheme = "udpin" if vehicle.get("transport", "udp") == "udp" else "tcp"
     with _vehicle({**vehicle, "port": port}) as server:
         with _client(library, {**task, "address": f"{scheme}:127.0.0.1:{port}"}) as client:
-            found = _found(client, server, rate)
+            result = _wait_for_result(client, server, rate)
         if task["task"] == "latency":
-            _say(server, "stamps")
-            found["stamps"] = json.loads(_line(server))
-        return found
+            _write_line(server, "stamps")
+            result["stamps"] = json.loads(_read_line(server))
+        return result
 
 
-def _found(client: subprocess.Popen[str], server: subprocess.Popen[str] | None, rate: str | None) -> dict[str, Any]:
-    """Return the client's result. Meanwhile, inform the vehicle about the progress of the client."""
+def _wait_for_result(
+    client: subprocess.Popen[str], server: subprocess.Popen[str] | None, rate: str | None
+) -> dict[str, Any]:
+    """Return the client's result. Meanwhile, start the vehicle and set its rate as the client makes progress."""
     while True:
-        line = _line(client).strip()
+        line = _read_line(client).strip()
         if line == "connecting" and server is not None:
-            _say(server, "go")
-        elif line == "connected" and server is not None:
-            if rate is not None:
-                _say(server, f"rate {rate}")
+            _write_line(server, "go")
+        elif line == "connected" and server is not None and rate is not None:
+            _write_line(server, f"rate {rate}")
         elif line.startswith("{"):
-            found: dict[str, Any] = json.loads(line)
-            return found
+            result: dict[str, Any] = json.loads(line)
+            return result
 
 
 @contextmanager
@@ -102,7 +103,7 @@ def _client(library: Library, task: dict[str, Any]) -> Iterator[subprocess.Popen
 @contextmanager
 def _vehicle(options: dict[str, Any]) -> Iterator[subprocess.Popen[str]]:
     with _process([sys.executable, str(HERE / "dronekit_vehicle.py"), json.dumps(options)]) as process:
-        if _line(process).strip() != "ready":
+        if _read_line(process).strip() != "ready":
             raise RuntimeError("the scripted vehicle did not start")
         yield process
 
@@ -118,13 +119,13 @@ def _process(command: list[str]) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-def _say(process: subprocess.Popen[str], line: str) -> None:
+def _write_line(process: subprocess.Popen[str], line: str) -> None:
     assert process.stdin is not None
     process.stdin.write(f"{line}\n")
     process.stdin.flush()
 
 
-def _line(process: subprocess.Popen[str]) -> str:
+def _read_line(process: subprocess.Popen[str]) -> str:
     assert process.stdout is not None
     line = process.stdout.readline()
     if not line:
@@ -135,4 +136,5 @@ def _line(process: subprocess.Popen[str]) -> str:
 def _free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+        _, port = probe.getsockname()
+        return int(port)

@@ -15,19 +15,37 @@ if TYPE_CHECKING:
 __all__ = ["Services", "parameter_names"]
 
 REAL32 = 9
-UNCOUNTED = 65535
-BEAT_S = 0.0025
+LOOP_PERIOD_S = 0.0025
 """Period of ArduCopter's main loop (400 Hz), in which it sends parameters."""
-CAPABILITIES_WITHOUT_FTP = 64495 & ~32
+PARAM_VALUE_SIZE = 37
+"""Bytes of a PARAM_VALUE frame."""
 FTP = 32
-REQUEST_MESSAGE, REQUEST_CAPABILITIES, AUTOPILOT_VERSION = 512, 520, 148
-ACCEPTED, UNSUPPORTED = 0, 3
+CAPABILITIES_WITHOUT_FTP = 64495 & ~FTP
+# MAV_CMDs, and the id of a message.
+REQUEST_MESSAGE = 512
+REQUEST_CAPABILITIES = 520
+AUTOPILOT_VERSION = 148
+# Values of MAV_RESULT.
+ACCEPTED = 0
+UNSUPPORTED = 3
 
 FTP_HEADER = struct.Struct("<HBBBBBxI")
-TERMINATE, RESET, OPEN_RO, READ, BURST_READ, ACK, NAK = 1, 2, 4, 5, 15, 128, 129
-FAIL, END_OF_FILE, NOT_FOUND = 1, 6, 10
+# Opcodes of MAVFTP.
+TERMINATE = 1
+RESET = 2
+OPEN_RO = 4
+READ = 5
+BURST_READ = 15
+ACK = 128
+NAK = 129
+# Error codes of MAVFTP.
+FAIL = 1
+END_OF_FILE = 6
+NOT_FOUND = 10
 DATA_SIZE = 239
 PACK = "@PARAM/param.pck"
+PACKED_FLOAT = 4
+"""Type of a 32-bit float in this file."""
 GROUPS = ("ATC", "BATT", "EK3", "INS", "RC", "SERVO", "PSC", "WPNAV")
 
 
@@ -40,11 +58,13 @@ class Services:
     """Answers requests with the timing of a real vehicle."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self._vehicle, self._options = vehicle, vehicle.options
+        self._vehicle = vehicle
+        self._options = vehicle.options
         names = sorted(parameter_names(vehicle.options.parameters))
         self._parameters = [(name, 0.5 + index) for index, name in enumerate(names)]
-        self._list = 0
-        self._burst = 0
+        # Numbers of the newest list and burst. A list or burst with an older number stops.
+        self._list_number = 0
+        self._burst_number = 0
         self._file = b""
         self._answers: dict[str, Callable[[Any], None]] = {
             "PARAM_REQUEST_LIST": self._on_list,
@@ -67,24 +87,25 @@ class Services:
 
     def _on_list(self, request: Any) -> None:
         """Start the list, or restart it if it is requested again."""
-        self._list += 1
-        self._send_parameters(time.monotonic(), self._list, 0.0)
+        self._list_number += 1
+        self._send_parameters(time.monotonic(), self._list_number, 0.0)
 
-    def _send_parameters(self, when: float, number: int, sent: float) -> None:
-        """Send the parameters of one period of the main loop.
+    def _send_parameters(self, due_at: float, list_number: int, begin: float) -> None:
+        """Send the parameters of one period of the main loop, from the index ``begin``, which may have a fraction.
 
         On a slow link ArduPilot uses only 30 % of the bandwidth for parameters.
         """
-        if number != self._list:
+        if list_number != self._list_number:
             return
-        rate = self._options.list_rate
+        rate_hz = self._options.list_rate
         if self._options.bandwidth:
-            rate = min(rate, 0.3 * self._options.bandwidth / 37)
-        until = min(sent + rate * BEAT_S, len(self._parameters))
-        for index in range(int(sent), int(until)):
+            rate_hz = min(rate_hz, 0.3 * self._options.bandwidth / PARAM_VALUE_SIZE)
+        end = min(begin + rate_hz * LOOP_PERIOD_S, len(self._parameters))
+        for index in range(int(begin), int(end)):
             self._send_parameter(index)
-        if until < len(self._parameters):
-            self._vehicle.at(when + BEAT_S, lambda: self._send_parameters(when + BEAT_S, number, until))
+        if end < len(self._parameters):
+            next_due = due_at + LOOP_PERIOD_S
+            self._vehicle.at(next_due, lambda: self._send_parameters(next_due, list_number, end))
 
     def _on_read(self, request: Any) -> None:
         index = request.param_index
@@ -104,14 +125,13 @@ class Services:
     # ----------------------------------------------------------------------------- commands
 
     def _on_command(self, request: Any) -> None:
-        knows = request.command == REQUEST_CAPABILITIES or (
-            request.command == REQUEST_MESSAGE and request.param1 == AUTOPILOT_VERSION
-        )
+        requests_version = request.command == REQUEST_MESSAGE and request.param1 == AUTOPILOT_VERSION
+        is_supported = requests_version or request.command == REQUEST_CAPABILITIES
         self._send(
-            "COMMAND_ACK", command=request.command, result=ACCEPTED if knows else UNSUPPORTED, progress=0,
+            "COMMAND_ACK", command=request.command, result=ACCEPTED if is_supported else UNSUPPORTED, progress=0,
             result_param2=0, target_system=request.get_srcSystem(), target_component=request.get_srcComponent(),
         )  # fmt: skip
-        if knows:
+        if is_supported:
             capabilities = CAPABILITIES_WITHOUT_FTP | (FTP if self._options.has_ftp else 0)
             self._send("AUTOPILOT_VERSION", capabilities=capabilities, flight_sw_version=0x040600FF)
 
@@ -125,13 +145,17 @@ class Services:
         data = payload[FTP_HEADER.size : FTP_HEADER.size + size]
         reply = _Reply(self._vehicle, request, sequence + 1, session, opcode, self._options.version)
         if opcode == OPEN_RO:
-            self._open(data.split(b"\0")[0].decode(), reply)
+            path, _, _ = data.partition(b"\0")
+            self._open(path.decode(), reply)
         elif opcode == READ:
             block = self._file[offset : offset + (size or DATA_SIZE)]
-            reply.send(ACK, offset, block) if block else reply.send(NAK, offset, bytes([END_OF_FILE]))
+            if block:
+                reply.send(ACK, offset, block)
+            else:
+                reply.send(NAK, offset, bytes([END_OF_FILE]))
         elif opcode == BURST_READ:
-            self._burst += 1
-            self._send_burst(time.monotonic(), self._burst, reply, offset, size or DATA_SIZE)
+            self._burst_number += 1
+            self._send_burst(time.monotonic(), self._burst_number, reply, offset, size or DATA_SIZE)
         elif opcode in (TERMINATE, RESET):
             reply.send(ACK, 0)
         else:
@@ -146,31 +170,36 @@ class Services:
         # ArduPilot generates this file while it is read, and reports this size.
         reply.send(ACK, 0, struct.pack("<I", 1 << 20))
 
-    def _send_burst(self, when: float, number: int, reply: _Reply, offset: int, size: int) -> None:
-        if number != self._burst:
+    def _send_burst(self, due_at: float, burst_number: int, reply: _Reply, offset: int, size: int) -> None:
+        """Send one block of a burst, and schedule the next block. Stop if the client has requested another burst."""
+        if burst_number != self._burst_number:
             return
         block = self._file[offset : offset + size]
         if not block:
             reply.send(NAK, offset, bytes([END_OF_FILE]))
             return
-        reply.send(ACK, offset, block, is_last=len(block) < size)
+        is_last = len(block) < size
+        reply.send(ACK, offset, block, is_last=is_last)
         reply.sequence += 1
-        if len(block) < size:
+        if is_last:
             reply.send(NAK, offset + len(block), bytes([END_OF_FILE]))
             return
         rate = self._options.file_rate
         if self._options.bandwidth:
             rate = min(rate, self._options.bandwidth / 3)
-        when += size / rate
-        self._vehicle.at(when, lambda: self._send_burst(when, number, reply, offset + size, size))
+        next_due = due_at + size / rate
+        self._vehicle.at(next_due, lambda: self._send_burst(next_due, burst_number, reply, offset + size, size))
 
 
 class _Reply:
     """An answer to one FILE_TRANSFER_PROTOCOL."""
 
     def __init__(self, vehicle: Vehicle, request: Any, sequence: int, session: int, opcode: int, version: int) -> None:
-        self._vehicle, self._session, self._request_opcode = vehicle, session, opcode
-        self._to = request.get_srcSystem(), request.get_srcComponent()
+        self._vehicle = vehicle
+        self._session = session
+        self._request_opcode = opcode
+        self._target_system = request.get_srcSystem()
+        self._target_component = request.get_srcComponent()
         self.sequence = sequence
 
     def send(self, opcode: int, offset: int, data: bytes = b"", *, is_last: bool = False) -> None:
@@ -178,28 +207,32 @@ class _Reply:
             self.sequence & 0xFFFF, self._session, opcode, len(data), self._request_opcode, is_last, offset
         )
         payload = (header + data).ljust(FTP_HEADER.size + DATA_SIZE, b"\0")
-        system, component = self._to
         self._vehicle.send(
-            packed("FILE_TRANSFER_PROTOCOL", 2, target_network=0, target_system=system, target_component=component,
-                   payload=list(payload))
+            packed("FILE_TRANSFER_PROTOCOL", 2, target_network=0, target_system=self._target_system,
+                   target_component=self._target_component, payload=list(payload))
         )  # fmt: skip
 
 
 def _packed_parameters(parameters: list[tuple[str, float]], *, with_defaults: bool) -> bytes:
-    """Create ``param.pck``. Names omit the beginning that they share with the previous one, and padding keeps values
-    within one block. All values equal their defaults.
+    """Create ``param.pck``. A name omits the beginning that it shares with the previous name.
+
+    Padding keeps each value within one block. All values equal their defaults.
     """
-    file, last = (
-        bytearray(struct.pack("<HHH", 0x671C if with_defaults else 0x671B, *[len(parameters)] * 2)),
-        "",
-    )
+    magic = 0x671C if with_defaults else 0x671B
+    count = len(parameters)
+    file = bytearray(struct.pack("<HHH", magic, count, count))
+    previous_name = ""
     for name, value in parameters:
-        common = 0
-        while common < min(len(name), len(last), 15) and name[common] == last[common]:
-            common += 1
-        rest = name[common:].encode()
-        entry = bytes([4, (len(rest) - 1) << 4 | common]) + rest + struct.pack("<f", value)
-        beyond = (len(file) + len(entry)) % DATA_SIZE
-        file += bytes(4 - beyond if 0 < beyond < 4 else 0) + entry
-        last = name
+        shared = 0
+        while shared < min(len(name), len(previous_name), 15) and name[shared] == previous_name[shared]:
+            shared += 1
+        rest = name[shared:].encode()
+        lengths = (len(rest) - 1) << 4 | shared
+        packed_value = struct.pack("<f", value)
+        entry = bytes([PACKED_FLOAT, lengths]) + rest + packed_value
+        bytes_in_next_block = (len(file) + len(entry)) % DATA_SIZE
+        if 0 < bytes_in_next_block < len(packed_value):
+            file += bytes(len(packed_value) - bytes_in_next_block)
+        file += entry
+        previous_name = name
     return bytes(file)

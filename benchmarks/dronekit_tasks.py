@@ -6,6 +6,7 @@ import statistics
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import table
@@ -15,7 +16,7 @@ from table import Row
 
 __all__ = ["Plan", "connect_rows", "cpu_rows", "import_rows", "latency_rows", "read_rows"]
 
-MIN_NS = 1000.0
+READ_TARGET_NS = 1000.0
 """Target for the time to read an attribute."""
 # Delays of the first heartbeat. Vehicles send heartbeats each second, so the time to connect depends on their phase.
 CONNECT_PHASES_S = (0.1, 0.3, 0.5, 0.7, 0.9)
@@ -26,7 +27,7 @@ RATES = ("100", "500", "2000", "max")
 WINDOW_S = {"100": 8.0, "500": 5.0, "2000": 4.0, "max": 4.0}
 QUICK_S = 0.3
 SETTLE_S = 1.0
-BEFORE_IT_RUNS = 100.0
+RATE_WHILE_CONNECTING = 100.0
 """Messages per second while clients connect."""
 ATTRIBUTE_OF = {
     "ATTITUDE": "attitude",
@@ -61,35 +62,41 @@ class Plan:
 
 def cpu_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
     """Measure the processor time per message in microseconds. The target is a quarter of DroneKit's."""
-    cases = [
-        ("usual", transport, version, rate) for transport in ("udp", "tcp") for version in (2, 1) for rate in RATES
-    ]
-    cases += [("usual", "udp", 2, "500 evenly")]
-    cases += [(listeners, "udp", 2, rate) for listeners in ("none", "every_message") for rate in ("500", "max")]
+    cases = _cpu_cases()
     rows: list[Row] = []
     for listeners, transport, version, rate in cases[::9] if plan.quick else cases:
         case = f"dronekit_cpu_{listeners}_{transport}_v{version}_{rate.replace(' ', '_')}"
         if not plan.wants(case):
             continue
-        vehicle = {"transport": transport, "version": version, "rate": BEFORE_IT_RUNS}
+        vehicle = {"transport": transport, "version": version, "rate": RATE_WHILE_CONNECTING}
         task = {
             "task": "cpu",
             "listeners": listeners,
             "settle_s": plan.window(SETTLE_S),
-            "window_s": plan.window(WINDOW_S[rate.split()[0]]),
+            "window_s": plan.window(WINDOW_S[rate.removesuffix(" evenly")]),
         }
-
-        def measure(library: Library, _: int, vehicle: Any = vehicle, task: Any = task, rate: str = rate) -> float:
-            return _microseconds(run(library, vehicle, task, rate=rate))
-
-        values = _in_turns(libraries, plan, case, measure)
+        values = _in_turns(libraries, plan, case, partial(_measure_cpu_us, vehicle, task, rate))
         rows += _rows(libraries, case, values, unit="µs", aim=4.0)
     return rows
 
 
-def _microseconds(found: dict[str, Any]) -> float:
-    seconds: float = found["cpu_s"]
-    received: int = found["received"]
+def _cpu_cases() -> list[tuple[str, str, int, str]]:
+    """Return the cases as listeners, transport, MAVLink version and message rate."""
+    cases = []
+    for transport in ("udp", "tcp"):
+        for version in (2, 1):
+            cases += [("usual", transport, version, rate) for rate in RATES]
+    cases.append(("usual", "udp", 2, "500 evenly"))
+    for listeners in ("none", "every_message"):
+        cases += [(listeners, "udp", 2, rate) for rate in ("500", "max")]
+    return cases
+
+
+def _measure_cpu_us(vehicle: dict[str, Any], task: dict[str, Any], rate: str, library: Library, _turn: int) -> float:
+    """Return the processor time of each message in microseconds."""
+    result = run(library, vehicle, task, rate=rate)
+    seconds: float = result["cpu_s"]
+    received: int = result["received"]
     return seconds / max(received, 1) * 1e6
 
 
@@ -101,19 +108,19 @@ def read_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
     names = [name for name in READS if plan.wants(f"dronekit_read_{name}")]
     if not names:
         return []
-    taken: dict[str, Values] = {name: {library.name: [] for library in libraries} for name in names}
+    durations_ns: dict[str, Values] = {name: {library.name: [] for library in libraries} for name in names}
 
     def read(library: Library, _: int) -> float:
-        found = run(library, {"rate": 50.0}, {"task": "reads", "names": names, "settle_s": plan.window(SETTLE_S)})
-        for name, nanoseconds in found["ns"].items():
-            taken[name][library.name].append(nanoseconds)
-        return float(max(found["ns"].values()))
+        result = run(library, {"rate": 50.0}, {"task": "reads", "names": names, "settle_s": plan.window(SETTLE_S)})
+        for name, nanoseconds in result["ns"].items():
+            durations_ns[name][library.name].append(nanoseconds)
+        return float(max(result["ns"].values()))
 
     _in_turns(libraries, plan, "dronekit_reads", read)
     rows: list[Row] = []
     for name in names:
-        for row in _rows(libraries, f"dronekit_read_{name}", taken[name], unit="ns", aim=1.0):
-            rows.append({**row, "aim": round(row["peer"] / MIN_NS, 3)})
+        for row in _rows(libraries, f"dronekit_read_{name}", durations_ns[name], unit="ns", aim=1.0):
+            rows.append({**row, "aim": round(row["peer"] / READ_TARGET_NS, 3)})
     return rows
 
 
@@ -131,32 +138,35 @@ def latency_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
             case = f"dronekit_latency_v{version}_{rate.replace(' ', '_')}"
             if not plan.wants(case) or (plan.quick and (version, rate) != (2, "500")):
                 continue
-            vehicle = {"rate": BEFORE_IT_RUNS, "version": version}
+            vehicle = {"rate": RATE_WHILE_CONNECTING, "version": version}
             task = {"task": "latency", "settle_s": plan.window(SETTLE_S), "window_s": plan.window(window_s)}
             samples: Values = {library.name: [] for library in libraries}
-
-            def measure(
-                library: Library,
-                _: int,
-                vehicle: Any = vehicle,
-                task: Any = task,
-                rate: str = rate,
-                samples: Any = samples,
-            ) -> float:
-                found = _delays(run(library, vehicle, task, rate=rate))
-                samples[library.name] += found
-                return float(statistics.median(found))
-
-            _in_turns(libraries, plan, case, measure)
+            _in_turns(libraries, plan, case, partial(_measure_latency_us, vehicle, task, rate, samples))
             for share, name in ((0.5, "median"), (0.99, "p99")):
-                values = {who: [table.quantile(found, share)] for who, found in samples.items()}
+                values = {library: [table.quantile(delays, share)] for library, delays in samples.items()}
                 rows += _rows(libraries, f"{case}_{name}", values, unit="µs", aim=1.0)
     return rows
 
 
-def _delays(found: dict[str, Any]) -> list[float]:
-    sent = {(ATTRIBUTE_OF[kind], number): at for kind, number, at in found["stamps"] if kind in ATTRIBUTE_OF}
-    delays = [(at - sent[name, number]) / 1000 for at, name, number in found["calls"] if (name, number) in sent]
+def _measure_latency_us(
+    vehicle: dict[str, Any], task: dict[str, Any], rate: str, samples: Values, library: Library, _turn: int
+) -> float:
+    """Add the delays of all messages to ``samples``, and return their median."""
+    delays = _delays_us(run(library, vehicle, task, rate=rate))
+    samples[library.name] += delays
+    return float(statistics.median(delays))
+
+
+def _delays_us(result: dict[str, Any]) -> list[float]:
+    """Return the time from sending each message to the call of its listener, in microseconds."""
+    sent_at = {}  # maps attributes and round numbers to times in ns
+    for message_name, number, sent_ns in result["stamps"]:
+        if message_name in ATTRIBUTE_OF:
+            sent_at[ATTRIBUTE_OF[message_name], number] = sent_ns
+    delays = []
+    for called_ns, attribute, number in result["calls"]:
+        if (attribute, number) in sent_at:
+            delays.append((called_ns - sent_at[attribute, number]) / 1000)
     if not delays:
         raise RuntimeError("no listener was called")
     return delays
@@ -170,36 +180,30 @@ def connect_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
     The vehicle sends its first heartbeat 0.1 to 0.9 s after the call, with the same delays for all libraries.
     """
-    cases: list[tuple[str, dict[str, Any]]] = [
-        (f"{'mavftp' if has_ftp else 'list'}_{delay_ms}ms", {"has_ftp": has_ftp, "delay": delay_ms / 1000})
-        for has_ftp in (True, False)
-        for delay_ms in (0, 10)
-    ]
-    cases += [
-        (
-            f"{'mavftp' if has_ftp else 'list'}_57600_baud",
-            {"has_ftp": has_ftp, "delay": 0.02, "bandwidth": SLOW_LINK},
-        )
-        for has_ftp in (True, False)
-    ]
+    cases: list[tuple[str, dict[str, Any]]] = []
+    for method, has_ftp in (("mavftp", True), ("list", False)):
+        cases.append((f"{method}_0ms", {"has_ftp": has_ftp, "delay": 0.0}))
+        cases.append((f"{method}_10ms", {"has_ftp": has_ftp, "delay": 0.01}))
+        cases.append((f"{method}_57600_baud", {"has_ftp": has_ftp, "delay": 0.02, "bandwidth": SLOW_LINK}))
     rows: list[Row] = []
     for name, options in cases[::2] if plan.quick else cases:
         case = f"dronekit_connect_{name}"
         if not plan.wants(case):
             continue
         vehicle = {"parameters": 50 if plan.quick else 1350, **options}
-        slow = "bandwidth" in options
-
-        def measure(library: Library, turn: int, vehicle: Any = vehicle) -> float:
-            phase = CONNECT_PHASES_S[turn % len(CONNECT_PHASES_S)]
-            found = run(library, {**vehicle, "heartbeat_after": phase}, {"task": "connect"})
-            if found["parameters"] != vehicle["parameters"]:
-                raise RuntimeError(f"{library.name} has {found['parameters']} parameters")
-            return float(found["seconds"])
-
-        values = _in_turns(libraries, Plan(1, plan.quick) if slow else plan, case, measure)
-        rows += _rows(libraries, case, values, unit="s", aim=3.0, scale=1000)
+        is_slow = "bandwidth" in options
+        case_plan = Plan(rounds=1, quick=plan.quick) if is_slow else plan
+        values = _in_turns(libraries, case_plan, case, partial(_measure_connect_s, vehicle))
+        rows += _rows(libraries, case, values, unit="s", aim=3.0, decimals=3)
     return rows
+
+
+def _measure_connect_s(vehicle: dict[str, Any], library: Library, turn: int) -> float:
+    heartbeat_after_s = CONNECT_PHASES_S[turn % len(CONNECT_PHASES_S)]
+    result = run(library, {**vehicle, "heartbeat_after": heartbeat_after_s}, {"task": "connect"})
+    if result["parameters"] != vehicle["parameters"]:
+        raise RuntimeError(f"{library.name} has {result['parameters']} parameters")
+    return float(result["seconds"])
 
 
 def import_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
@@ -219,31 +223,32 @@ def import_rows(libraries: Sequence[Library], plan: Plan) -> list[Row]:
 
 
 def _in_turns(libraries: Sequence[Library], plan: Plan, case: str, measure: Callable[[Library, int], float]) -> Values:
+    """Return the results of ``measure(library, turn)``."""
     values: Values = {library.name: [] for library in libraries}
     order = list(libraries)
     for turn in range(plan.rounds):
         for library in order:
             values[library.name].append(measure(library, turn))
         order.append(order.pop(0))
-    medians = ", ".join(f"{name} {statistics.median(found):.4g}" for name, found in values.items())
+    medians = ", ".join(f"{name} {statistics.median(measured):.4g}" for name, measured in values.items())
     print(f"{case}: {medians}", file=sys.stderr, flush=True)
     return values
 
 
 def _rows(
-    libraries: Sequence[Library], case: str, values: Values, *, unit: str, aim: float, scale: float = 1.0
+    libraries: Sequence[Library], case: str, values: Values, *, unit: str, aim: float, decimals: int | None = None
 ) -> list[Row]:
-    """Return a row for each peer."""
+    """Return a row for each peer. ``decimals`` replaces the usual number of decimals."""
     own = statistics.median(values["aerokit"])
     rows = []
     for library in libraries:
-        if library.name != "aerokit":
-            peer = statistics.median(values[library.name])
-            found = table.row(
-                f"{case}_vs_{library.name}" if library.name != "dronekit" else case,
-                own, peer, library.title, unit=unit, ratio=peer / own, aim=aim,
-            )  # fmt: skip
-            if scale > 1:
-                found["aerokit"], found["peer"] = round(own, 3), round(peer, 3)
-            rows.append(found)
+        if library.name == "aerokit":
+            continue
+        peer = statistics.median(values[library.name])
+        name = case if library.name == "dronekit" else f"{case}_vs_{library.name}"
+        row = table.row(name, own, peer, library.title, unit=unit, ratio=peer / own, aim=aim)
+        if decimals is not None:
+            row["aerokit"] = round(own, decimals)
+            row["peer"] = round(peer, decimals)
+        rows.append(row)
     return rows

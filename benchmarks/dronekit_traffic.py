@@ -14,7 +14,7 @@ from typing import Any
 from fastcrc import crc16
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-__all__ = ["ROUNDS", "Numbering", "heartbeat", "keys_of", "packed", "rounds"]
+__all__ = ["ROUNDS", "Numbering", "heartbeat", "packed", "round_number_of", "rounds"]
 
 # The round number wraps after this many.
 ROUNDS = 1024
@@ -29,10 +29,14 @@ ONLY_IN_VERSION = {1: ("RC_CHANNELS_RAW",), 2: ("ESC_TELEMETRY_1_TO_4",)}
 ARMED_IN_GUIDED = {
     "type": 2, "autopilot": 3, "base_mode": 217, "custom_mode": 4, "system_status": 4, "mavlink_version": 3,
 }  # fmt: skip
-LATITUDE, LONGITUDE = -353632610, 1491652299
+# Degrees in 1e-7.
+LATITUDE = -353632610
+LONGITUDE = 1491652299
 # Step of the roll angle per round; exact in 32-bit floats.
 ANGLE_STEP = 2.0**-12
-FULL_MV, CURRENT_CA, LEVEL = 10000, 1500, 87
+BATTERY_MV = 10000
+BATTERY_CURRENT_CA = 1500
+BATTERY_PERCENT = 87
 
 Frame = tuple[bytes, str, int]
 """A frame without sequence number, the name of its message, and the number of its round."""
@@ -49,7 +53,7 @@ def rounds(version: int) -> list[Frame]:
     return frames
 
 
-def keys_of(name: str, value: Any) -> int | None:
+def round_number_of(name: str, value: Any) -> int | None:
     """Return the round number encoded in an attribute's value; None if it has none."""
     number: float
     if name == "attitude":
@@ -59,7 +63,7 @@ def keys_of(name: str, value: Any) -> int | None:
     elif name == "gps_0":
         number = value.eph
     elif name == "battery":
-        number = value.voltage * 1000 - FULL_MV
+        number = value.voltage * 1000 - BATTERY_MV
     else:
         return None
     return round(number)
@@ -72,14 +76,13 @@ def heartbeat(version: int) -> bytes:
 
 def packed(kind: str, version: int, **values: Any) -> bytes:
     """Create a frame of system 1, component 1. Fields that are not given get an arbitrary number."""
-    names: Any = dialect
-    message_class = getattr(names, f"MAVLink_{kind.lower()}_message")
-    lengths = dict(zip(message_class.ordered_fieldnames, message_class.array_lengths, strict=True))
-    fields = {
-        name: values.get(name, _anything(kind_of, lengths[name]))
-        for name, kind_of in zip(message_class.fieldnames, message_class.fieldtypes, strict=True)
-    }
-    mav: Any = names.MAVLink(None, srcSystem=1, srcComponent=1)
+    untyped_dialect: Any = dialect
+    message_class = getattr(untyped_dialect, f"MAVLink_{kind.lower()}_message")
+    array_lengths = dict(zip(message_class.ordered_fieldnames, message_class.array_lengths, strict=True))
+    fields = {}
+    for name, field_type in zip(message_class.fieldnames, message_class.fieldtypes, strict=True):
+        fields[name] = values.get(name, _arbitrary_value(field_type, array_lengths[name]))
+    mav: Any = untyped_dialect.MAVLink(None, srcSystem=1, srcComponent=1)
     return bytes(message_class(**fields).pack(mav, force_mavlink1=version == 1))
 
 
@@ -92,10 +95,11 @@ class Numbering:
     def numbered(self, frame: bytes) -> bytes:
         """Return the frame with the next sequence number."""
         raw = bytearray(frame)
-        is_second = raw[0] == 0xFD
-        raw[4 if is_second else 2] = self._next
+        is_v2 = raw[0] == 0xFD
+        sequence_offset = 4 if is_v2 else 2
+        raw[sequence_offset] = self._next
         self._next = (self._next + 1) & 0xFF
-        message_id = int.from_bytes(raw[7:10], "little") if is_second else raw[5]
+        message_id = int.from_bytes(raw[7:10], "little") if is_v2 else raw[5]
         checksum = crc16.mcrf4xx(bytes(raw[1:-2]) + _extra(message_id))
         raw[-2:] = checksum.to_bytes(2, "little")
         return bytes(raw)
@@ -110,11 +114,12 @@ def _extra(message_id: int) -> bytes:
     return _extras[message_id]
 
 
-def _anything(kind: str, length: int) -> Any:
-    if kind == "char":
+def _arbitrary_value(field_type: str, array_length: int) -> Any:
+    """Return a value for a field. The array length is 0 for a field that is not an array."""
+    if field_type == "char":
         return b"text"
-    number: float = 1.25 if kind in ("float", "double") else 101
-    return [number] * length if length else number
+    number: float = 1.25 if field_type in ("float", "double") else 101
+    return [number] * array_length if array_length else number
 
 
 def _values(kind: str, number: int) -> dict[str, Any]:
@@ -130,11 +135,13 @@ def _values(kind: str, number: int) -> dict[str, Any]:
         "VFR_HUD": {"heading": number % 360, "groundspeed": number / 100, "airspeed": number / 90, "alt": 20.0},
         "GPS_RAW_INT": {"fix_type": 6, "eph": number, "satellites_visible": 10, "lat": LATITUDE, "lon": LONGITUDE},
         "SYS_STATUS": {
-            "voltage_battery": FULL_MV + number, "current_battery": CURRENT_CA, "battery_remaining": LEVEL,
-            "load": number,
+            "voltage_battery": BATTERY_MV + number, "current_battery": BATTERY_CURRENT_CA,
+            "battery_remaining": BATTERY_PERCENT, "load": number,
         },
         "EKF_STATUS_REPORT": {"flags": 831},
-        "BATTERY_STATUS": {"voltages": [FULL_MV + number, *[65535] * 9], "battery_remaining": LEVEL, "id": 0},
+        "BATTERY_STATUS": {
+            "voltages": [BATTERY_MV + number, *[65535] * 9], "battery_remaining": BATTERY_PERCENT, "id": 0,
+        },
         "RC_CHANNELS": {"chancount": 16, "chan1_raw": 1500 + number % 100},
         "RC_CHANNELS_RAW": {"port": 0, "chan1_raw": 1500 + number % 100},
         "SERVO_OUTPUT_RAW": {"port": 0, "servo1_raw": 1500 + number % 100},

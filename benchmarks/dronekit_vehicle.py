@@ -37,7 +37,7 @@ STREAM_KINDS_AT_ONCE = 25
 PIECE = 1400
 """Bytes of one write on TCP at the maximum rate."""
 # Number of datagrams sent in a row before other work.
-AT_ONCE = 16
+DATAGRAMS_IN_A_ROW = 16
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Vehicle:
         self._frames = rounds(options.version)
         self._position = 0
         self._rate = options.rate
-        self._streams = 0
+        self._stream_number = 0  # a stream with an older number stops
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._order = count()
         self._lines = open(0, "rb", buffering=0)  # noqa: SIM115 - select sees nothing that a buffer has
@@ -89,9 +89,9 @@ class Vehicle:
         self.at(time.monotonic() + self.options.heartbeat_after, self._send_heartbeats)
         self.set_rate(self._rate)
         while True:
-            self._do_what_is_due()
+            self._run_due_functions()
             if self._rate == math.inf:
-                self._send_much()
+                self._send_without_pace()
             self._wait()
 
     # ------------------------------------------------------------------------- used by Services
@@ -112,20 +112,23 @@ class Vehicle:
     def set_rate(self, rate: float, *, evenly: bool = False) -> None:
         """Stream this many messages per second from now on, in bursts like ArduCopter or evenly."""
         self._rate = rate
-        self._streams += 1
+        self._stream_number += 1
         if 0 < rate < math.inf:
-            self._stream_from(time.monotonic(), self._streams, bursts(rate, evenly=evenly))
+            self._send_burst(time.monotonic(), self._stream_number, bursts(rate, evenly=evenly))
 
     # ------------------------------------------------------------------------------- inside
 
-    def _stream_from(self, when: float, stream: int, pace: Iterator[tuple[float, list[float]]]) -> None:
-        if stream == self._streams:
-            period, offsets = next(pace)
-            begin = time.monotonic()
-            for offset in offsets:
-                wait_until(begin + offset)
-                self._send_next()
-            self.at(when + period, lambda: self._stream_from(when + period, stream, pace))
+    def _send_burst(self, due_at: float, stream_number: int, pace: Iterator[tuple[float, list[float]]]) -> None:
+        """Send the next burst of a stream, and schedule the one after it."""
+        if stream_number != self._stream_number:
+            return
+        interval_s, offsets = next(pace)
+        begins_at = time.monotonic()
+        for offset in offsets:
+            wait_until(begins_at + offset)
+            self._send_next()
+        next_due = due_at + interval_s
+        self.at(next_due, lambda: self._send_burst(next_due, stream_number, pace))
 
     def _send_next(self) -> None:
         raw, kind, number = self._frames[self._position]
@@ -137,15 +140,16 @@ class Vehicle:
             self.stamps.append((kind, number, time.monotonic_ns()))
         self.link.send(numbered)
 
-    def _send_much(self) -> None:
+    def _send_without_pace(self) -> None:
         """Send as many messages as the link accepts now."""
         if not self.link.is_stream:
-            for _ in range(AT_ONCE):
+            for _ in range(DATAGRAMS_IN_A_ROW):
                 self._send_next()
         elif self.link.is_writable:
             piece = b""
             while len(piece) < PIECE:
-                piece += self._numbering.numbered(self._frames[self._position][0])
+                raw, _, _ = self._frames[self._position]
+                piece += self._numbering.numbered(raw)
                 self._position = (self._position + 1) % len(self._frames)
             self.link.send(piece)
 
@@ -154,41 +158,51 @@ class Vehicle:
             self.send(heartbeat(self.options.version))
             self.at(time.monotonic() + 1.0, self._send_heartbeats)
 
-    def _do_what_is_due(self) -> None:
+    def _next_due(self) -> float:
+        if not self._due:
+            return math.inf
+        due_at, _, _ = self._due[0]
+        return due_at
+
+    def _run_due_functions(self) -> None:
         now = time.monotonic()
-        while self._due and self._due[0][0] <= now:
-            heapq.heappop(self._due)[2]()
+        while self._next_due() <= now:
+            _, _, function = heapq.heappop(self._due)
+            function()
 
     def _wait(self) -> None:
         """Wait until a message arrives or an action is due. At the maximum rate, do not wait."""
-        until = self.link.release_due()
-        if self._due:
-            until = min(until, self._due[0][0])
-        is_flat_out = self._rate == math.inf and (not self.link.is_stream or self.link.is_writable)
-        timeout = 0.0 if is_flat_out else max(0.0, min(until - time.monotonic(), 1.0))
-        wanted: list[Any] = [self.link.socket] if self.link.wants_to_write or self._rate == math.inf else []
-        sources: list[Any] = [self.link.socket, self._lines]
-        ready, _, _ = select.select(sources, wanted, [], timeout)
+        next_due = min(self.link.release_due(), self._next_due())
+        has_maximum_rate = self._rate == math.inf
+        can_send_at_once = has_maximum_rate and (not self.link.is_stream or self.link.is_writable)
+        timeout = 0.0 if can_send_at_once else max(0.0, min(next_due - time.monotonic(), 1.0))
+        writers: list[Any] = [self.link.socket] if self.link.wants_to_write or has_maximum_rate else []
+        readers: list[Any] = [self.link.socket, self._lines]
+        ready, _, _ = select.select(readers, writers, [], timeout)
         if self.link.socket in ready:
             self.link.read()
         if self._lines in ready:
-            self._obey(self._lines.readline().decode().split())
+            self._execute(self._lines.readline().decode().split())
         for message in self.link.received():
             self._services.receive(message)
 
-    def _obey(self, words: list[str]) -> None:
+    def _execute(self, words: list[str]) -> None:
+        """Execute a command of standard input. At the end of the input, which has no words, exit."""
         if not words:
             sys.exit()
-        if words[0] == "rate":
+        command, *arguments = words
+        if command == "rate":
+            rate, *options = arguments
             self.stamps.clear()
-            self.set_rate(math.inf if words[1] == "max" else float(words[1]), evenly=words[2:] == ["evenly"])
-        if words[0] == "stamps":
+            self.set_rate(math.inf if rate == "max" else float(rate), evenly=options == ["evenly"])
+        if command == "stamps":
             print(json.dumps(self.stamps), flush=True)
 
 
 def main(arguments: list[str]) -> None:
     """Serve until the process is terminated."""
-    options: dict[str, Any] = json.loads(arguments[0])
+    (options_text,) = arguments
+    options: dict[str, Any] = json.loads(options_text)
     Vehicle(Options(**options)).run()
 
 

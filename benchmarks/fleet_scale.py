@@ -16,19 +16,19 @@ import json
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from scale import RATES, _hovering
+from scale import RATES, hovering
+from stopwatch import Stopwatch
 
 import aerokit
 from aerokit.sim import SimulatorServer
 from aerokit.transport import create_link
 
 FIRST_PORT = 14700
-LATE_S = 0.1
+MAX_DELAY_S = 0.1
 """Maximum delay of a simulation behind real time."""
 WARM_UP_S = 3.0
 
@@ -39,33 +39,42 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.serve:
         print(json.dumps(asyncio.run(_serve(options.serve, options.vehicles, options.seconds))))
         return 0
-    found = asyncio.run(_measure(options.vehicles, options.processes, options.networks, options.seconds))
-    for name, value in found.items():
+    figures = asyncio.run(_measure(options.vehicles, options.processes, options.networks, options.seconds))
+    for name, value in figures.items():
         print(f"{name}: {value}")
-    options.output.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    options.output.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     return 0
 
 
 # ----------------------------------------------------------------------------------- one simulator
 
 
-async def _serve(ports: Sequence[int], on_each: int, seconds: float) -> Mapping[str, float]:
-    """Simulate vehicles on each of these ports. Return their share of a core, and the delays of timers and time."""
-    networks = [[_hovering("copter", number) for number in range(1, on_each + 1)] for _ in ports]
+async def _serve(ports: Sequence[int], vehicles_per_network: int, seconds: float) -> Mapping[str, float]:
+    """Simulate a network of vehicles on each port.
+
+    Return the share of a core, the maximum delay of a timer, and the delay of the simulation behind real time.
+    """
+    networks = []
+    vehicles = []
+    for _ in ports:
+        network = [hovering("copter", system_id) for system_id in range(1, vehicles_per_network + 1)]
+        networks.append(network)
+        vehicles += network
     links = [create_link(f"udpout:127.0.0.1:{port}") for port in ports]
-    vehicles = [vehicle for network in networks for vehicle in network]
-    late: list[float] = []
+    timer_delays: list[float] = []
     async with SimulatorServer(vehicles, links, vehicles_on=networks) as server:
         loop = asyncio.get_running_loop()
-        wall, used, simulated = time.perf_counter(), time.process_time(), server.now
+        stopwatch = Stopwatch()
+        simulated_at_start = server.now
         end = loop.time() + seconds
         while loop.time() < end:
             due = loop.time() + 0.05
             await asyncio.sleep(0.05)
-            late.append(loop.time() - due)
-        wall, used = time.perf_counter() - wall, time.process_time() - used
-        behind = wall - (min(vehicle.now for vehicle in vehicles) - simulated)
-    return {"share": used / wall, "latest_s": max(late), "behind_s": max(0.0, behind)}
+            timer_delays.append(loop.time() - due)
+        real_s = stopwatch.real_s
+        share = stopwatch.cpu_s / real_s
+        simulated_s = min(vehicle.now for vehicle in vehicles) - simulated_at_start
+    return {"share": share, "latest_s": max(timer_delays), "behind_s": max(0.0, real_s - simulated_s)}
 
 
 # ------------------------------------------------------------------------------------- the fleet
@@ -73,54 +82,58 @@ async def _serve(ports: Sequence[int], on_each: int, seconds: float) -> Mapping[
 
 async def _measure(count: int, processes: int, networks: int, seconds: float) -> dict[str, Any]:
     """Start the simulating processes, and measure one fleet of their vehicles."""
-    on_each = count // networks
+    vehicles_per_network = count // networks
     ports = [FIRST_PORT + number for number in range(networks)]
-    lasts = WARM_UP_S + seconds + 5.0 + 0.02 * count  # opening the fleet takes longer with more vehicles
-    children = [_started(ports[number::processes], on_each, lasts) for number in range(processes)]
+    duration_s = WARM_UP_S + seconds + 5.0 + 0.02 * count  # opening the fleet takes longer with more vehicles
+    children = []
+    for number in range(processes):
+        children.append(_start_simulator(ports[number::processes], vehicles_per_network, duration_s))
     try:
-        found = await _measure_fleet(ports, on_each, seconds)
+        fleet_figures = await _measure_fleet(ports, vehicles_per_network, seconds)
         reports = [json.loads(await asyncio.to_thread(_output_of, child)) for child in children]
     finally:
         for child in children:
             child.kill()
             child.wait()
     return {
-        "vehicles": on_each * networks,
+        "vehicles": vehicles_per_network * networks,
         "processes": processes,
-        **found,
+        **fleet_figures,
         "simulators_share": [round(report["share"], 3) for report in reports],
         "simulators_behind_s": round(max(report["behind_s"] for report in reports), 3),
-        "in_real_time": all(report["behind_s"] < LATE_S for report in reports),
+        "in_real_time": all(report["behind_s"] < MAX_DELAY_S for report in reports),
     }
 
 
-def _started(ports: Sequence[int], on_each: int, seconds: float) -> subprocess.Popen[str]:
-    options = ["--vehicles", str(on_each), "--seconds", str(seconds), "--serve", *map(str, ports)]
+def _start_simulator(ports: Sequence[int], vehicles_per_network: int, seconds: float) -> subprocess.Popen[str]:
+    options = ["--vehicles", str(vehicles_per_network), "--seconds", str(seconds), "--serve", *map(str, ports)]
     return subprocess.Popen([sys.executable, __file__, *options], stdout=subprocess.PIPE, text=True)
 
 
 def _output_of(child: subprocess.Popen[str]) -> str:
-    return child.communicate()[0]
+    output, _ = child.communicate()
+    return output
 
 
-async def _measure_fleet(ports: Sequence[int], on_each: int, seconds: float) -> dict[str, Any]:
+async def _measure_fleet(ports: Sequence[int], vehicles_per_network: int, seconds: float) -> dict[str, Any]:
     addresses = {f"network{port - FIRST_PORT}": f"udpin:127.0.0.1:{port}" for port in ports}
-    started = time.perf_counter()
+    count = vehicles_per_network * len(ports)
+    opening = Stopwatch()
     async with aerokit.fleet(
-        addresses, count=on_each * len(ports), timeout=60, rates=RATES, min_distance_m=0.5, on_too_close="report"
+        addresses, count=count, timeout=60, rates=RATES, min_distance_m=0.5, on_too_close="report"
     ) as fleet:
-        opened_s = time.perf_counter() - started
+        opened_in_s = opening.real_s
         await asyncio.sleep(WARM_UP_S)
         ages: list[float] = []
-        wall, used = time.perf_counter(), time.process_time()
+        stopwatch = Stopwatch()
         for _ in range(max(1, round(2 * seconds))):
             await asyncio.sleep(0.5)
             ages += [vehicle.position.age for vehicle in fleet.vehicles.values()]
-        wall, used = time.perf_counter() - wall, time.process_time() - used
+        share = stopwatch.cpu_s / stopwatch.real_s
         states = {member.state.value for member in fleet}
     return {
-        "opened_in_s": round(opened_s, 2),
-        "client_share": round(used / wall, 3),
+        "opened_in_s": round(opened_in_s, 2),
+        "client_share": round(share, 3),
         "position_age_median_s": round(statistics.median(ages), 3),
         "position_age_worst_s": round(max(ages), 3),
         "states": sorted(states),

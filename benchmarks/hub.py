@@ -45,16 +45,16 @@ from aerokit.mavlink.messages import Heartbeat, SystemTime
 from aerokit.mavlink.tlog import read_tlog
 
 ROOT = Path(__file__).parent.parent
-# Receivers, and frames per datagram.
+# Number of receivers, and of frames in each datagram.
 LOADS = {"out_1": (1, 1), "out_4": (4, 1), "out_16": (16, 1), "dense_1": (1, 20), "dense_4": (4, 20)}
 NAMES = (*LOADS, "latency_median", "latency_p99")
 PYTHON = os.environ.get("AEROKIT_MAVPROXY_PYTHON", sys.executable)
 MAVPROXY = Path(PYTHON).parent / "mavproxy.py"
 ROUTERD = os.environ.get("AEROKIT_MAVLINK_ROUTERD", "")
-PIECE = 10
+DATAGRAMS_IN_A_ROW = 10
 SENT_HZ = 600
-WARM_UP = 600
-HEARTBEAT = FrameEncoder(1, 1).encode(Heartbeat(2, 3, 81, 0, 3))
+WARM_UP_DATAGRAMS = 600
+HEARTBEAT = FrameEncoder(1, 1).encode(Heartbeat(type=2, autopilot=3, base_mode=81, custom_mode=0, system_status=3))
 FLOOR = """
 import asyncio, select, socket, sys
 async def main():
@@ -103,23 +103,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _throughput(load: str, quick: bool) -> list[Row]:
-    count, per_datagram = LOADS[load]
-    datagrams = _datagrams(WARM_UP + (2_000 if quick else 12_000), per_datagram)
-    figures: dict[str, list[float]] = {name: [] for name in _present(is_dense=per_datagram > 1)}
+    receiver_count, per_datagram = LOADS[load]
+    measured_datagrams = 2_000 if quick else 12_000
+    datagrams = _datagrams(WARM_UP_DATAGRAMS + measured_datagrams, per_datagram)
+    figures: dict[str, list[float]] = {name: [] for name in _available(is_dense=per_datagram > 1)}
     for _ in range(1 if quick else 3):
         for name in figures:
-            with _hub(name, count) as (process, sender, receivers):
-                figures[name].append(_frames_per_second(process, sender, receivers, datagrams, per_datagram))
-            print(
-                f"{load} {name}: {figures[name][-1]:.0f} frames per CPU-second",
-                file=sys.stderr,
-                flush=True,
-            )
+            with _hub(name, receiver_count) as (process, sender, receivers):
+                rate = _frames_per_cpu_second(process, sender, receivers, datagrams, per_datagram)
+            figures[name].append(rate)
+            print(f"{load} {name}: {rate:.0f} frames per CPU-second", file=sys.stderr, flush=True)
     medians = {name: statistics.median(values) for name, values in figures.items()}
-    own, rows = medians.pop("aerokit"), []
+    own = medians.pop("aerokit")
+    rows = []
     for name, peer in medians.items():
-        what, text, aim = _PEERS[name]
-        rows.append(row(f"{load}{what}", own, peer, text, unit="frames/CPU-s", ratio=own / peer, aim=aim))
+        suffix, peer_name, aim = _PEERS[name]
+        rows.append(row(f"{load}{suffix}", own, peer, peer_name, unit="frames/CPU-s", ratio=own / peer, aim=aim))
     return rows
 
 
@@ -131,13 +130,17 @@ _PEERS = {
 }
 
 
-def _present(*, is_dense: bool) -> list[str]:
+def _available(*, is_dense: bool) -> list[str]:
     """Return the hubs to measure. MAVProxy would lose frames of dense datagrams."""
-    there = {"aerokit": True, "mavproxy": MAVPROXY.exists() and not is_dense, "routerd": bool(ROUTERD), "floor": True}
-    return [name for name, is_there in there.items() if is_there]
+    names = ["aerokit"]
+    if MAVPROXY.exists() and not is_dense:
+        names.append("mavproxy")
+    if ROUTERD:
+        names.append("routerd")
+    return [*names, "floor"]
 
 
-def _frames_per_second(
+def _frames_per_cpu_second(
     process: subprocess.Popen[bytes],
     sender: socket.socket,
     receivers: list[socket.socket],
@@ -145,14 +148,15 @@ def _frames_per_second(
     per_datagram: int,
 ) -> float:
     """Return the number of frames per second of processor time. RuntimeError if more than 0.5 % were lost."""
-    counts = [0] * len(receivers)
-    _send(datagrams[:WARM_UP], per_datagram, sender, receivers, counts)
-    before, counts = _cpu_s(process.pid), [0] * len(receivers)
-    _send(datagrams[WARM_UP:], per_datagram, sender, receivers, counts)
-    used, frames = _cpu_s(process.pid) - before, (len(datagrams) - WARM_UP) * per_datagram
-    if min(counts) < frames * 0.995:
-        raise RuntimeError(f"{frames - min(counts)} of {frames} frames were lost: {process.args!r}")
-    return frames / used
+    _send(datagrams[:WARM_UP_DATAGRAMS], per_datagram, sender, receivers)
+    measured = datagrams[WARM_UP_DATAGRAMS:]
+    cpu_before_s = _cpu_s(process.pid)
+    received = _send(measured, per_datagram, sender, receivers)
+    cpu_s = _cpu_s(process.pid) - cpu_before_s
+    frames = len(measured) * per_datagram
+    if received < frames * 0.995:
+        raise RuntimeError(f"{frames - received} of {frames} frames were lost: {process.args!r}")
+    return frames / cpu_s
 
 
 def _send(
@@ -160,46 +164,53 @@ def _send(
     per_datagram: int,
     sender: socket.socket,
     receivers: list[socket.socket],
-    counts: list[int],
-) -> None:
-    """Send datagrams in pieces, and count received frames, until all have arrived or none arrives for a second."""
-    began = time.perf_counter()
-    for sent in range(0, len(datagrams), PIECE):
-        for datagram in datagrams[sent : sent + PIECE]:
+) -> int:
+    """Send datagrams, some in a row, and wait at most a second for the last ones.
+
+    Return the number of frames of the receiver that received the fewest.
+    """
+    counts = [0] * len(receivers)
+    started_at = time.perf_counter()
+    for begin in range(0, len(datagrams), DATAGRAMS_IN_A_ROW):
+        end = begin + DATAGRAMS_IN_A_ROW
+        for datagram in datagrams[begin:end]:
             sender.send(datagram)
-        while time.perf_counter() - began < (sent + PIECE) / SENT_HZ:
-            _count(receivers, counts)
+        while time.perf_counter() - started_at < end / SENT_HZ:
+            _count_received(receivers, counts)
             time.sleep(0.001)
     for _ in range(100):
         if min(counts) >= len(datagrams) * per_datagram:
-            return
+            break
         time.sleep(0.01)
-        _count(receivers, counts)
+        _count_received(receivers, counts)
+    return min(counts)
 
 
 def _datagrams(count: int, per_datagram: int) -> list[bytes]:
-    frames = _recorded(count * per_datagram)
+    frames = _recorded_frames(count * per_datagram)
     return [b"".join(frames[begin : begin + per_datagram]) for begin in range(0, len(frames), per_datagram)]
 
 
-def _recorded(count: int) -> list[bytes]:
+def _recorded_frames(count: int) -> list[bytes]:
     """Return broadcast frames of a recorded copter. The recording is repeated with continuous sequence numbers."""
     path = ROOT / "tests" / "recordings" / "ardupilot-copter.tlog"
     targets = TargetFields(STANDARD)
     frames = [Frame.parse(raw) for _, raw in read_tlog(path) if raw[0] == MAGIC_V2 and raw[5:7] == b"\1\1"]
-    bodies = [frame.body for frame in frames if targets.target_of(frame) == (0, 0) and not frame.body[1]]
+    broadcast = [frame for frame in frames if targets.target_of(frame) == (0, 0)]
+    # The body of a frame is without its magic byte: length, flags, 1 byte, sequence number, …
+    unsigned = [frame for frame in broadcast if frame.body[1] == 0]
     numbered = []
     for number in range(count):
-        body = bodies[number % len(bodies)]
-        body = body[:3] + bytes((number & 0xFF,)) + body[4:]
-        checksum = x25(body + STANDARD.extras[int.from_bytes(body[6:9], "little")])
+        frame = unsigned[number % len(unsigned)]
+        body = frame.body[:3] + bytes((number & 0xFF,)) + frame.body[4:]
+        checksum = x25(body + STANDARD.extras[frame.message_id])
         numbered.append(bytes((MAGIC_V2,)) + body + checksum.to_bytes(2, "little"))
     return numbered
 
 
-def _count(receivers: list[socket.socket], counts: list[int]) -> None:
-    """Count frames; a datagram may contain several."""
-    for place, receiver in enumerate(receivers):
+def _count_received(receivers: list[socket.socket], counts: list[int]) -> None:
+    """Add the received frames of system 1 to the count of each receiver. A datagram may contain several frames."""
+    for index, receiver in enumerate(receivers):
         while True:
             try:
                 data = receiver.recv(65535)
@@ -207,30 +218,37 @@ def _count(receivers: list[socket.socket], counts: list[int]) -> None:
                 break
             begin = 0
             while begin < len(data):
-                counts[place] += data[begin] == 0xFD and data[begin + 5] == 1
-                begin += (data[begin + 1] + 12) if data[begin] == 0xFD else (data[begin + 1] + 8)
+                magic = data[begin]
+                payload_length = data[begin + 1]
+                if magic == MAGIC_V2 and data[begin + 5] == 1:  # the system id
+                    counts[index] += 1
+                begin += payload_length + (12 if magic == MAGIC_V2 else 8)
 
 
 # --------------------------------------------------------------------------------------------- latency
 
 
 def _latencies(quick: bool) -> list[Row]:
-    series: dict[str, list[float]] = {name: [] for name in ("aerokit", "mavproxy") if name in _present(is_dense=False)}
+    if "mavproxy" not in _available(is_dense=False):
+        return []
+    series: dict[str, list[float]] = {"aerokit": [], "mavproxy": []}
     for _ in range(1 if quick else 5):
-        for name, found in series.items():
+        for name, delays in series.items():
             with _hub(name, 4) as (_, sender, receivers):
-                found += _delays(sender, receivers[0], 100 if quick else 500)
+                first_receiver, *_ = receivers
+                delays += _delays(sender, first_receiver, 100 if quick else 500)
     rows: list[Row] = []
-    if len(series) < 2:
-        return rows
-    for what, share in (("median", 0.5), ("p99", 0.99)):
-        own, peer = (1e6 * table.quantile(delays, share) for delays in series.values())
-        rows.append(row(f"latency_{what}", own, peer, "MAVProxy --out", unit="µs", ratio=peer / own, aim=1.0))
+    for name, share in (("median", 0.5), ("p99", 0.99)):
+        own = 1e6 * table.quantile(series["aerokit"], share)
+        peer = 1e6 * table.quantile(series["mavproxy"], share)
+        rows.append(row(f"latency_{name}", own, peer, "MAVProxy --out", unit="µs", ratio=peer / own, aim=1.0))
     return rows
 
 
 def _delays(sender: socket.socket, receiver: socket.socket, count: int) -> list[float]:
-    encoder, delays = FrameEncoder(1, 1), []
+    """Return the seconds from sending each frame to its reception at one receiver."""
+    encoder = FrameEncoder(1, 1)
+    delays = []
     receiver.setblocking(True)
     receiver.settimeout(1.0)
     for number in range(1, count + 1):
@@ -250,10 +268,10 @@ def _delays(sender: socket.socket, receiver: socket.socket, count: int) -> list[
 @contextmanager
 def _hub(name: str, count: int) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket, list[socket.socket]]]:
     """Run a forwarding process. Yield it, a socket to send to it, and the sockets that it sends to."""
-    receivers = [_bound() for _ in range(count)]
-    with _bound() as probe:
-        port = probe.getsockname()[1]
-    outs = [f"127.0.0.1:{receiver.getsockname()[1]}" for receiver in receivers]
+    receivers = [_bound_socket() for _ in range(count)]
+    with _bound_socket() as probe:
+        port = _port_of(probe)
+    outs = [f"127.0.0.1:{_port_of(receiver)}" for receiver in receivers]
     with tempfile.TemporaryDirectory() as folder:
         command = _command(name, port, outs, folder)
         process = subprocess.Popen(
@@ -266,7 +284,7 @@ def _hub(name: str, count: int) -> Iterator[tuple[subprocess.Popen[bytes], socke
         try:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 sender.connect(("127.0.0.1", port))
-                _wait_until_it_works(process, sender, receivers)
+                _wait_until_forwarding(process, sender, receivers)
                 yield process, sender, receivers
         finally:
             process.send_signal(signal.SIGINT)
@@ -286,27 +304,25 @@ def _command(name: str, port: int, outs: Sequence[str], folder: str) -> list[str
     if name == "floor":
         return [sys.executable, "-c", FLOOR, str(port), *(out.rpartition(":")[2] for out in outs)]
     if name == "routerd":
-        return [ROUTERD, "-t", "0", *(part for out in outs for part in ("-e", out)), f"127.0.0.1:{port}"]
-    quiet = [
-        "--default-modules",
-        "",
-        "--streamrate",
-        "-1",
-        "--logfile",
-        os.devnull,
-        "--state-basedir",
-        folder,
-    ]
-    command = [PYTHON, str(MAVPROXY), "--daemon", "--non-interactive", "--master", master, *quiet]
-    return [*command, *(part for out in outs for part in ("--out", f"udpout:{out}"))]
+        command = [ROUTERD, "-t", "0"]
+        for out in outs:
+            command += ["-e", out]
+        return [*command, f"127.0.0.1:{port}"]
+    command = [PYTHON, str(MAVPROXY), "--daemon", "--non-interactive", "--master", master]
+    command += ["--default-modules", "", "--streamrate", "-1", "--logfile", os.devnull, "--state-basedir", folder]
+    for out in outs:
+        command += ["--out", f"udpout:{out}"]
+    return command
 
 
-def _wait_until_it_works(
+def _wait_until_forwarding(
     process: subprocess.Popen[bytes], sender: socket.socket, receivers: list[socket.socket]
 ) -> None:
-    until, silent = time.monotonic() + 30.0, set(receivers)
+    """Send heartbeats until all receivers have received one, then discard what arrives within a second."""
+    deadline = time.monotonic() + 30.0
+    silent = set(receivers)
     while silent:
-        if time.monotonic() > until or process.poll() is not None:
+        if time.monotonic() > deadline or process.poll() is not None:
             raise RuntimeError(f"no frames are forwarded by {process.args!r}")
         with suppress(ConnectionRefusedError):
             sender.send(HEARTBEAT)
@@ -326,7 +342,12 @@ def _wait_until_it_works(
             pass
 
 
-def _bound() -> socket.socket:
+def _port_of(sock: socket.socket) -> int:
+    _, port = sock.getsockname()
+    return int(port)
+
+
+def _bound_socket() -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 * 1024 * 1024)
     sock.bind(("127.0.0.1", 0))

@@ -27,18 +27,18 @@ STATEMENTS = (AEROKIT, DIALECT, AEROKIT_READY, MAVUTIL)
 
 def rows(rounds: int = 25, *, fresh_byte_code: bool = True) -> list[Row]:
     """Measure ``import``, and ``import_ready`` with all modules needed to connect, including asyncio and mavutil."""
-    taken: dict[str, list[float]] = {statement: [] for statement in STATEMENTS}
+    durations_ms: dict[str, list[float]] = {statement: [] for statement in STATEMENTS}
     with TemporaryDirectory() as folder:
-        byte_code = folder if fresh_byte_code else None
-        if byte_code:
-            for statement in STATEMENTS:
-                _import_ms(statement, byte_code)
+        byte_code_folder = folder if fresh_byte_code else None
+        if byte_code_folder:
+            for statement in STATEMENTS:  # compiles the modules
+                _import_ms(statement, byte_code_folder)
         for _ in range(rounds):
-            for statement, series in taken.items():
-                series.append(_import_ms(statement, byte_code))
+            for statement, series in durations_ms.items():
+                series.append(_import_ms(statement, byte_code_folder))
     return [
-        _row("import", taken[AEROKIT], taken[DIALECT], DIALECT, aim=1 / 1.5),
-        _row("import_ready", taken[AEROKIT_READY], taken[MAVUTIL], MAVUTIL, aim=1 / 2),
+        _row("import", durations_ms[AEROKIT], durations_ms[DIALECT], DIALECT, aim=1 / 1.5),
+        _row("import_ready", durations_ms[AEROKIT_READY], durations_ms[MAVUTIL], MAVUTIL, aim=1 / 2),
     ]
 
 
@@ -46,15 +46,15 @@ def _row(name: str, own: list[float], peer: list[float], statement: str, *, aim:
     return faster_is_better(name, own, peer, statement, unit="ms", aim=aim)
 
 
-def _import_ms(statement: str, byte_code: str | None) -> float:
-    program = f"from time import perf_counter as now; began = now(); {statement}; print(now() - began)"
+def _import_ms(statement: str, byte_code_folder: str | None) -> float:
+    program = f"from time import perf_counter as now; started = now(); {statement}; print(now() - started)"
     environment = {**os.environ, "MAVLINK20": "1"}  # makes mavutil import the dialect of MAVLink 2
-    if byte_code:
-        environment["PYTHONPYCACHEPREFIX"] = byte_code
+    if byte_code_folder:
+        environment["PYTHONPYCACHEPREFIX"] = byte_code_folder
         environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    run = [sys.executable, "-c", program]
-    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=True)
-    return float(done.stdout) * 1000
+    command = [sys.executable, "-c", program]
+    completed = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return float(completed.stdout) * 1000
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def rows(rounds: int = 5, seconds: float = 2.0) -> list[Row]:
 
 async def _measure(rounds: int, seconds: float) -> list[Row]:
     (port,) = _free_ports(1)
-    found: list[Row] = []
+    table: list[Row] = []
     with _simulator(port):
         async with aerokit.connect(f"udpin:127.0.0.1:{port}", timeout=30) as vehicle:
             await vehicle.wait_ready(timeout=30)
@@ -49,8 +49,8 @@ async def _measure(rounds: int, seconds: float) -> list[Row]:
                     own.append(_jitter_us(await _stream(vehicle, rate_hz, seconds), rate_hz))
                     bare.append(_jitter_us(await _timer(rate_hz, seconds), rate_hz))
                 name = f"jitter_{rate_hz}"
-                found.append(faster_is_better(name, own, bare, "an asyncio timer", unit="us", aim=ALLOWED_SHARE))
-    return found
+                table.append(faster_is_better(name, own, bare, "an asyncio timer", unit="us", aim=ALLOWED_SHARE))
+    return table
 
 
 async def _stream(vehicle: aerokit.Vehicle, rate_hz: float, seconds: float) -> list[float]:
@@ -71,17 +71,19 @@ async def _stream(vehicle: aerokit.Vehicle, rate_hz: float, seconds: float) -> l
 
 
 async def _timer(rate_hz: float, seconds: float) -> list[float]:
-    """Return the times at which a timer fired that does nothing else."""
-    loop, times, period = asyncio.get_running_loop(), list[float](), 1 / rate_hz
+    """Return the times at which a timer fired. Its callback only records the time."""
+    loop = asyncio.get_running_loop()
+    period_s = 1 / rate_hz
+    times: list[float] = []
     done = asyncio.Event()
 
     def fire(due: float) -> None:
         times.append(time.perf_counter())
-        if len(times) * period >= seconds:
+        if len(times) * period_s >= seconds:
             done.set()
             return
-        following = max(due + period, loop.time())
-        loop.call_at(following, fire, following)
+        next_due = max(due + period_s, loop.time())
+        loop.call_at(next_due, fire, next_due)
 
     fire(loop.time())
     await done.wait()
@@ -104,5 +106,5 @@ def _simulator(port: int) -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    for each in rows():
-        print(each)
+    for measured_row in rows():
+        print(measured_row)

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import decode
 from pymavlink import mavutil
@@ -36,72 +37,96 @@ __all__ = ["rows"]
 def rows(rounds: int = 7, recording: str = next(iter(decode.RECORDINGS))) -> list[Row]:
     """One row for each peer."""
     path = decode.RECORDINGS[recording]
-    peers: list[tuple[str, str, Callable[[Path], int], float]] = [
-        ("tlog_typed", "pymavlink mavlink_connection", _pymavlink, 12.0 if wire_implementation == "c" else 3.0)
-    ]
-    if find_spec("mavio"):
-        peers.append(
-            ("tlog_typed_mavio", "mavio deserialize", lambda path: asyncio.run(_mavio(path.read_bytes())), 1.0)
-        )
-    if find_spec("mavkit"):
-        peers.append(("tlog_typed_mavkit", "mavkit entries, without fields", _mavkit, 1.0))
-        peers.append(("tlog_typed_mavkit_json", "mavkit entries and message_json", _mavkit_json, 1.0))
+    peers = _peers()
     _aerokit(path)  # imports the messages
-    rates: list[list[float]] = [[] for _ in range(1 + len(peers))]
+    own_rates: list[float] = []
+    peer_rates: dict[str, list[float]] = {peer.row_name: [] for peer in peers}
     for _ in range(rounds):
-        for found, read in zip(rates, (_aerokit, *(peer[2] for peer in peers)), strict=True):
-            started = time.process_time()
-            seen = read(path)
-            found.append(seen / (time.process_time() - started))
-    own = rates[0]
+        own_rates.append(_rate(_aerokit, path))
+        for peer in peers:
+            peer_rates[peer.row_name].append(_rate(peer.read, path))
     return [
-        higher_is_better(name, own, peer, peer_name, unit="frames/s", aim=aim)
-        for (name, peer_name, _, aim), peer in zip(peers, rates[1:], strict=True)
+        higher_is_better(peer.row_name, own_rates, peer_rates[peer.row_name], peer.name, unit="frames/s", aim=peer.aim)
+        for peer in peers
     ]
+
+
+class _Peer(NamedTuple):
+    """Another library. ``read`` reads a file, and returns the number of messages."""
+
+    row_name: str
+    name: str
+    read: Callable[[Path], int]
+    aim: float = 1.0
+
+
+def _peers() -> list[_Peer]:
+    aim = 12.0 if wire_implementation == "c" else 3.0
+    peers = [_Peer("tlog_typed", "pymavlink mavlink_connection", _pymavlink, aim)]
+    if find_spec("mavio"):
+        peers.append(_Peer("tlog_typed_mavio", "mavio deserialize", _mavio))
+    if find_spec("mavkit"):
+        peers.append(_Peer("tlog_typed_mavkit", "mavkit entries, without fields", _mavkit))
+        peers.append(_Peer("tlog_typed_mavkit_json", "mavkit entries and message_json", _mavkit_json))
+    return peers
+
+
+def _rate(read: Callable[[Path], int], path: Path) -> float:
+    started_at = time.process_time()
+    count = read(path)
+    return count / (time.process_time() - started_at)
 
 
 def _aerokit(path: Path) -> int:
-    framer, decode_frame, seen = Framer(), STANDARD.decode, 0
-    for at, raw in read_tlog(path):
-        for frame in framer.receive(raw, at):
+    framer = Framer()
+    decode_frame = STANDARD.decode
+    count = 0
+    for unix_s, raw in read_tlog(path):
+        for frame in framer.receive(raw, unix_s):
             decode_frame(frame)
-            seen += 1
-    return seen
+            count += 1
+    return count
 
 
 def _pymavlink(path: Path) -> int:
     log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega")
-    seen = 0
+    count = 0
     while log.recv_msg() is not None:
-        seen += 1
+        count += 1
     log.close()
-    return seen
+    return count
 
 
-async def _mavio(data: bytes) -> int:
-    reader = asyncio.StreamReader()
-    reader.feed_data(data)
-    reader.feed_eof()
-    seen = 0
-    async for _ in import_module("mavio.serializer").deserialize(reader, tlog=True):
-        seen += 1
-    return seen
+def _mavio(path: Path) -> int:
+    data = path.read_bytes()
+
+    async def read() -> int:
+        reader = asyncio.StreamReader()
+        reader.feed_data(data)
+        reader.feed_eof()
+        count = 0
+        async for _ in import_module("mavio.serializer").deserialize(reader, tlog=True):
+            count += 1
+        return count
+
+    return asyncio.run(read())
 
 
-async def _entries(path: Path, use: Callable[[object], object]) -> int:
+async def _mavkit_entries(path: Path) -> list[Any]:
     log = await import_module("mavkit").TlogFile.open(str(path))
-    entries = await log.entries()
-    for entry in entries:
-        use(entry)
-    return len(entries)
+    entries: list[Any] = await log.entries()
+    return entries
 
 
 def _mavkit(path: Path) -> int:
-    return asyncio.run(_entries(path, lambda entry: entry))
+    return len(asyncio.run(_mavkit_entries(path)))
 
 
 def _mavkit_json(path: Path) -> int:
-    return asyncio.run(_entries(path, lambda entry: json.loads(entry.message_json())))  # type: ignore[attr-defined]
+    entries = asyncio.run(_mavkit_entries(path))
+    for entry in entries:
+        json.loads(entry.message_json())
+    return len(entries)
 
 
 if __name__ == "__main__":

@@ -19,9 +19,15 @@ from functools import partial
 from aerokit.mavlink import FrameEncoder, Message, messages
 
 MAGIC_V2 = 0xFD
-COMMAND_LONG, REQUEST_MESSAGE = 76, 512
+COMMAND_LONG = 76
+REQUEST_MESSAGE = 512
 HEARTBEAT_INTERVAL_S = 0.25
-SYSTEM_ID, COMPONENT_ID = 1, 1
+SYSTEM_ID = 1
+COMPONENT_ID = 1
+
+HEADER_SIZE = 10
+COMMAND_FIELDS = struct.Struct("<f24xH")
+"""The fields param1 and command of COMMAND_LONG. Param2 to param7 are between them."""
 
 Address = tuple[str, int]
 
@@ -37,15 +43,16 @@ class Peer:
 
     def __init__(self) -> None:
         self._sequence = -1
-        self._made: dict[Hashable, list[bytes]] = {}
+        self._frames: dict[Hashable, list[bytes]] = {}
 
     def next_frame(self, key: Hashable, make: Callable[[], Message]) -> bytes:
         """Return a message with the next sequence number. Its 256 frames are encoded on first use."""
         self._sequence = (self._sequence + 1) & 0xFF
-        if key not in self._made:
-            encoder, message = FrameEncoder(SYSTEM_ID, COMPONENT_ID), make()
-            self._made[key] = [encoder.encode(message) for _ in range(256)]
-        return self._made[key][self._sequence]
+        if key not in self._frames:
+            encoder = FrameEncoder(SYSTEM_ID, COMPONENT_ID)
+            message = make()
+            self._frames[key] = [encoder.encode(message) for _ in range(256)]
+        return self._frames[key][self._sequence]
 
 
 class Responder:
@@ -81,12 +88,20 @@ class Responder:
         peer = self._peers.get(address)
         if peer is None:
             return
-        (command,) = struct.unpack_from("<H", data, 10 + 28)
-        sender = (data[5], data[6])
-        ack = partial(messages.CommandAck, command, 0, 0, 0, *sender)
-        self._socket.sendto(peer.next_frame((command, *sender), ack), address)
+        param1, command = COMMAND_FIELDS.unpack_from(data, HEADER_SIZE)
+        system_id, component_id = data[5], data[6]
+        make_ack = partial(
+            messages.CommandAck,
+            command=command,
+            result=0,
+            progress=0,
+            result_param2=0,
+            target_system=system_id,
+            target_component=component_id,
+        )
+        self._socket.sendto(peer.next_frame((command, system_id, component_id), make_ack), address)
         if command == REQUEST_MESSAGE:
-            self._send_requested(int(struct.unpack_from("<f", data, 10)[0]), peer, address)
+            self._send_requested(int(param1), peer, address)
 
     def _send_requested(self, message_id: int, peer: Peer, address: Address) -> None:
         make = SENT_ON_REQUEST.get(message_id)

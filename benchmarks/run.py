@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 
 import command_rtt
@@ -52,7 +53,7 @@ MEASURES: dict[tuple[str, ...], Measure] = {
         import_time.rows(1, fresh_byte_code=False) if quick else import_time.rows()
     ),
 }
-NAMES = tuple(name for names in MEASURES for name in names)
+NAMES = tuple(chain.from_iterable(MEASURES))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -62,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wanted = options.names or NAMES
     if not set(wanted) <= set(NAMES):
         parser.error(f"the names are {', '.join(NAMES)}")
-    rows = [row for row in _measured(wanted, options.quick) if row["name"] in wanted]
+    rows = [row for row in _measure(wanted, options.quick) if row["name"] in wanted]
     print(f"wire: {wire_implementation}")
     print(table.printed(rows))
     for name in sorted(set(wanted) - {row["name"] for row in rows}):
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _measured(wanted: Sequence[str], quick: bool) -> list[Row]:
+def _measure(wanted: Sequence[str], quick: bool) -> list[Row]:
     rows: list[Row] = []
     for names, measure in MEASURES.items():
         if not set(names).isdisjoint(wanted):

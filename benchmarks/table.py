@@ -20,15 +20,17 @@ def faster_is_better(
     name: str, aerokit: Sequence[float], peer: Sequence[float], peer_name: str, *, unit: str, aim: float
 ) -> Row:
     """Create a row from two series of durations: their medians, and the ratio of the peer's to aerokit's."""
-    own, other = statistics.median(aerokit), statistics.median(peer)
-    return row(name, own, other, peer_name, unit=unit, ratio=other / own, aim=aim)
+    aerokit_median = statistics.median(aerokit)
+    peer_median = statistics.median(peer)
+    ratio = peer_median / aerokit_median
+    return row(name, aerokit_median, peer_median, peer_name, unit=unit, ratio=ratio, aim=aim)
 
 
 def higher_is_better(
     name: str, aerokit: Sequence[float], peer: Sequence[float], peer_name: str, *, unit: str, aim: float
 ) -> Row:
     """Create a row from two series of rates, measured in turns: their medians, and the median of the ratios."""
-    ratio = statistics.median(own / other for own, other in zip(aerokit, peer, strict=True))
+    ratio = statistics.median(own_rate / peer_rate for own_rate, peer_rate in zip(aerokit, peer, strict=True))
     return row(name, statistics.median(aerokit), statistics.median(peer), peer_name, unit=unit, ratio=ratio, aim=aim)
 
 
@@ -59,10 +61,12 @@ def is_missed(row: Row) -> bool:
 def printed(rows: Sequence[Row]) -> str:
     """Return the table as text."""
     lines = [HEADINGS, *(_cells(row) for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(HEADINGS))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    texts = []
+    for line in lines:
+        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]
+        texts.append("  ".join(cells).rstrip())
+    return "\n".join(texts)
 
 
 def write(rows: Sequence[Row], path: Path) -> None:

@@ -26,7 +26,7 @@ from pathlib import Path
 from aerokit.errors import LinkLost
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import Ping
-from aerokit.transport import Peer, create_link
+from aerokit.transport import Link, Peer, create_link
 
 ECHO = """
 import asyncio, sys
@@ -57,16 +57,16 @@ sys.stdin.read()
 
 
 class EchoReceiver:
-    """Counts echoes, and wakes the waiter."""
+    """Counts echoes, and sets an event for each."""
 
     def __init__(self) -> None:
-        self.heard = 0
-        self.came = asyncio.Event()
+        self.count = 0
+        self.has_received = asyncio.Event()
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """See `Receiver`."""
-        self.heard += 1
-        self.came.set()
+        self.count += 1
+        self.has_received.set()
 
     def link_lost(self, error: LinkLost) -> None:
         """See `Receiver`."""
@@ -82,59 +82,72 @@ def main(arguments: Sequence[str] | None = None) -> int:
     count = 100 if options.quick else 1000
     rows = {}
     for name in ("udp", "zenoh", "zenoh_router"):
-        rows[name] = _measured(name, count)
-        shown = ", ".join(f"{what} {value:.0f}" for what, value in rows[name].items())
-        print(f"{name:14} {shown}")
+        rows[name] = _measure(name, count)
+        figures = ", ".join(f"{figure} {value:.0f}" for figure, value in rows[name].items())
+        print(f"{name:14} {figures}")
     options.output.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
-def _measured(name: str, count: int) -> dict[str, float]:
+def _measure(name: str, count: int) -> dict[str, float]:
     port = _free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     with contextlib.ExitStack() as stack:
         if name == "udp":
             stack.enter_context(_process(ECHO, f"udpin:127.0.0.1:{port}"))
-            return asyncio.run(_ask(f"udpout:127.0.0.1:{port}", count))
+            return asyncio.run(_measure_link(f"udpout:127.0.0.1:{port}", count))
         if name == "zenoh_router":
             stack.enter_context(_process(ROUTER, endpoint))
-        how = "connect" if name == "zenoh_router" else "listen"
-        stack.enter_context(_process(ECHO, f"zenohin://bench/echo?{how}={endpoint}"))
-        return asyncio.run(_ask(f"zenoh://bench/echo?connect={endpoint}", count))
+        option = "connect" if name == "zenoh_router" else "listen"
+        stack.enter_context(_process(ECHO, f"zenohin://bench/echo?{option}={endpoint}"))
+        return asyncio.run(_measure_link(f"zenoh://bench/echo?connect={endpoint}", count))
 
 
-async def _ask(address: str, count: int) -> dict[str, float]:
-    link, ears, encoder = create_link(address), EchoReceiver(), FrameEncoder(255, 190)
-    await link.open(ears)
-    link.write(encoder.encode(Ping(0, 0, 0, 0)))  # Import everything before the first measured frame.
-    with contextlib.suppress(asyncio.TimeoutError):
-        await asyncio.wait_for(ears.came.wait(), 2)
+async def _measure_link(address: str, count: int) -> dict[str, float]:
+    """Measure ``count`` round trips one by one, and how many frames of a burst return."""
+    link = create_link(address)
+    receiver = EchoReceiver()
+    encoder = FrameEncoder(255, 190)
+    await link.open(receiver)
+    await _round_trip(link, receiver, _ping(encoder, 0), 2.0)  # import everything before the first measured frame
     round_trips: list[float] = []
-    processor = time.process_time()
+    cpu_before_s = time.process_time()
     for number in range(count):
-        frame = encoder.encode(Ping(0, number, 0, 0))
-        ears.came.clear()
-        began = time.perf_counter()
-        link.write(frame)
-        with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(ears.came.wait(), 1)
-            round_trips.append(time.perf_counter() - began)
+        duration_s = await _round_trip(link, receiver, _ping(encoder, number), 1.0)
+        if duration_s is not None:
+            round_trips.append(duration_s)
         await asyncio.sleep(0.02)
-    processor = time.process_time() - processor
-    ears.heard = 0
+    cpu_s = time.process_time() - cpu_before_s
+    receiver.count = 0
     for number in range(1000):
-        link.write(encoder.encode(Ping(0, number, 0, 0)))
+        link.write(_ping(encoder, number))
     await asyncio.sleep(1)
     link.close()
     await link.wait_closed()
-    percent = statistics.quantiles(round_trips, n=100)
+    *_, percentile_99 = statistics.quantiles(round_trips, n=100)
     return {
         "round_trip_median_us": statistics.median(round_trips) * 1e6,
-        "round_trip_p99_us": percent[98] * 1e6,
-        "processor_us": processor / count * 1e6,
+        "round_trip_p99_us": percentile_99 * 1e6,
+        "processor_us": cpu_s / count * 1e6,
         "lost": count - len(round_trips),
-        "of_1000_came_back": ears.heard,
+        "of_1000_came_back": receiver.count,
     }
+
+
+def _ping(encoder: FrameEncoder, number: int) -> bytes:
+    return encoder.encode(Ping(time_usec=0, seq=number, target_system=0, target_component=0))
+
+
+async def _round_trip(link: Link, receiver: EchoReceiver, frame: bytes, timeout_s: float) -> float | None:
+    """Send a frame, and return the seconds until its echo; None if there is no echo."""
+    receiver.has_received.clear()
+    started_at = time.perf_counter()
+    link.write(frame)
+    try:
+        await asyncio.wait_for(receiver.has_received.wait(), timeout_s)
+    except asyncio.TimeoutError:
+        return None
+    return time.perf_counter() - started_at
 
 
 @contextlib.contextmanager
@@ -154,8 +167,8 @@ def _process(program: str, argument: str) -> Iterator[None]:
 def _free_port() -> int:
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
+        _, port = sock.getsockname()
+        return int(port)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,8 @@ class VideoDevice(CameraDriver):
 
     def __init__(self, source: str, folder: Path) -> None:
         super().__init__(vendor="aerokit", model="Video device", resolution=(640, 480))
-        self._source, self._folder = source, folder
+        self._source = source
+        self._folder = folder
         folder.mkdir(exist_ok=True)
         self._format: str | None = None  # FFmpeg recognises the format of files and streams
         if source == PATTERN:

@@ -16,7 +16,8 @@ from typing import Protocol
 import aerokit
 from aerokit import StickInput
 
-DEAD_ZONE, END_BUTTON = 0.08, 1
+DEAD_ZONE = 0.08
+END_BUTTON = 1
 
 
 class Pad(Protocol):

@@ -19,8 +19,9 @@ async def fly_circle(vehicle: aerokit.Vehicle, speed_m_s: float = 4.0, seconds: 
         steps = round(seconds * 10)
         for step in range(steps):
             course = 2 * math.pi * step / steps
-            north, east = speed_m_s * math.cos(course), speed_m_s * math.sin(course)
-            stream.set(VelocitySetpoint(north, east, yaw_deg=math.degrees(course)))
+            north_m_s = speed_m_s * math.cos(course)
+            east_m_s = speed_m_s * math.sin(course)
+            stream.set(VelocitySetpoint(north_m_s, east_m_s, yaw_deg=math.degrees(course)))
             await asyncio.sleep(0.1)
 
 

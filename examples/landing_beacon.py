@@ -15,10 +15,16 @@ import aerokit
 
 
 async def detections() -> AsyncIterator[tuple[float, float, float]]:
-    """Yield degrees to the right, degrees to the tail and distance of the pad; replace this by your detector."""
+    """Yield the direction of the pad, in degrees to the right and to the tail, and its distance in metres.
+
+    Replace this by your detector.
+    """
     for number in range(100):
         angle = number / 10
-        yield 3.0 * math.cos(angle), 3.0 * math.sin(angle), max(0.2, 10.0 - number / 10)
+        right_deg = 3.0 * math.cos(angle)
+        down_deg = 3.0 * math.sin(angle)
+        distance_m = max(0.2, 10.0 - number / 10)
+        yield right_deg, down_deg, distance_m
         await asyncio.sleep(0.05)
 
 

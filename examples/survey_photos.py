@@ -16,7 +16,10 @@ from aerokit.sim import SimulatedCamera, SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
 from aerokit.vehicle.camera.capture import Capture, geotagged, write_captures
 
-HEIGHT_M, LENGTH_M, LANE_M, LANES = 20.0, 40.0, 15.0, 3
+HEIGHT_M = 20.0
+LENGTH_M = 40.0
+LANE_M = 15.0
+LANES = 3
 
 
 async def main(address: Any, folder: str = "pictures") -> None:
@@ -29,8 +32,9 @@ async def main(address: Any, folder: str = "pictures") -> None:
         await vehicle.take_off(HEIGHT_M)
         async with vehicle.camera.photo_interval(2.0):
             for lane in range(LANES):
-                for north in (0.0, LENGTH_M) if lane % 2 == 0 else (LENGTH_M, 0.0):
-                    corner = start.offset(north_m=north, east_m=lane * LANE_M)
+                flies_north = lane % 2 == 0
+                for north_m in (0.0, LENGTH_M) if flies_north else (LENGTH_M, 0.0):
+                    corner = start.offset(north_m=north_m, east_m=lane * LANE_M)
                     await vehicle.go_to(corner.replace(altitude_amsl_m=None, altitude_relative_m=HEIGHT_M))
         await vehicle.return_to_launch()
         captures = await vehicle.camera.load_captures()

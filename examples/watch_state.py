@@ -15,8 +15,9 @@ from aerokit import events, messages
 async def print_values(vehicle: aerokit.Vehicle) -> None:
     """Print the latest values once a second; an unknown value is None."""
     while True:
-        position, ground_speed = vehicle.position, vehicle.ground_speed_m_s
-        print(f"{vehicle.mode_name}, {ground_speed.latest} m/s, {position.latest}, {position.age:.2f} s old")
+        position = vehicle.position
+        speed_m_s = vehicle.ground_speed_m_s.latest
+        print(f"{vehicle.mode_name}, {speed_m_s} m/s, {position.latest}, {position.age:.2f} s old")
         await asyncio.sleep(1.0)
 
 

@@ -18,8 +18,11 @@ ABOVE_HOME = mavutil.mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
 
 
 def item(command: int, lat: float, lon: float, altitude: float) -> Command:
-    """Make a mission item with an altitude above home; the other arguments of Command are not needed here."""
-    return Command(0, 0, 0, ABOVE_HOME, command, 0, 1, 0, 0, 0, 0, lat, lon, altitude)
+    """Make a mission item with an altitude above home. Adding the item to a mission sets target and seq."""
+    return Command(
+        target_system=0, target_component=0, seq=0, frame=ABOVE_HOME, command=command, current=0, autocontinue=1,
+        param1=0, param2=0, param3=0, param4=0, x=lat, y=lon, z=altitude,
+    )  # fmt: skip
 
 
 def download(vehicle: Vehicle) -> None:

@@ -13,7 +13,7 @@ TIMEOUT_S = 5.0
 
 
 def wait_for_channels(vehicle: Vehicle, wanted: dict[str, int]) -> None:
-    """Wait until RC_CHANNELS reports these values, which are those of the receiver or overrides."""
+    """Wait until RC_CHANNELS reports these values, which come from the receiver or from overrides."""
 
     def are_as_wanted() -> bool:
         return all(vehicle.channels[number] == value for number, value in wanted.items())

@@ -42,7 +42,10 @@ def upload(vehicle: Vehicle, track: list[LocationGlobalRelative]) -> None:
     commands = vehicle.commands
     commands.clear()
     for place in track:
-        commands.add(Command(0, 0, 0, ABOVE_HOME, WAYPOINT, 0, 1, 0, 0, 0, 0, place.lat, place.lon, place.alt))
+        commands.add(Command(
+            target_system=0, target_component=0, seq=0, frame=ABOVE_HOME, command=WAYPOINT, current=0, autocontinue=1,
+            param1=0, param2=0, param3=0, param4=0, x=place.lat, y=place.lon, z=place.alt,
+        ))  # fmt: skip
     commands.upload()
 
 

@@ -14,7 +14,7 @@ POLL_S = 0.2
 MODES = ("GUIDED", "LOITER", "TAKEOFF")
 """Modes in which ArduPilot or PX4 obeys simple_goto."""
 METRES_PER_DEGREE = 111_320.0
-Position = Callable[[], LocationGlobalRelative]
+Locator = Callable[[], LocationGlobalRelative]
 
 
 def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> float:
@@ -24,15 +24,15 @@ def distance(one: LocationGlobalRelative, other: LocationGlobalRelative) -> floa
     return math.hypot(north, east)
 
 
-def walker(start: LocationGlobalRelative, speed: float) -> Position:
-    """Return the position of a walker who walks north, at ``speed`` m/s."""
+def walker(start: LocationGlobalRelative, speed: float) -> Locator:
+    """Return a function that returns the position of a walker, who walks north at ``speed`` m/s."""
     started = time.monotonic()
 
-    def where() -> LocationGlobalRelative:
+    def locate() -> LocationGlobalRelative:
         walked = speed * (time.monotonic() - started)
         return LocationGlobalRelative(start.lat + walked / METRES_PER_DEGREE, start.lon, 0)
 
-    return where
+    return locate
 
 
 def main() -> None:
@@ -53,13 +53,13 @@ def main() -> None:
     vehicle.wait_simple_takeoff(options.altitude, epsilon=0.5, timeout=60)
 
     start = vehicle.location.global_relative_frame
-    where: Position = walker(start, options.walking_speed)
+    locate: Locator = walker(start, options.walking_speed)
     if leader is not None:
         location = leader.location
-        where = lambda: location.global_relative_frame  # noqa: E731
+        locate = lambda: location.global_relative_frame  # noqa: E731
     end = time.monotonic() + options.seconds
     while time.monotonic() < end and vehicle.mode.name in MODES:  # stop when the pilot changes the mode
-        place = where()
+        place = locate()
         vehicle.simple_goto(LocationGlobalRelative(place.lat, place.lon, options.altitude))
         print(f"{distance(vehicle.location.global_relative_frame, place):.0f} m behind")
         time.sleep(POLL_S)

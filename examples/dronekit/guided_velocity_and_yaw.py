@@ -17,13 +17,11 @@ ONLY_VELOCITY = 0b110111000111
 
 def fly(vehicle: Vehicle, north: float, east: float, down: float, seconds: float) -> None:
     """Send a velocity in m/s repeatedly, because the vehicle stops when set-points stop."""
-    time_boot_ms = target_system = target_component = unused = 0
     message = vehicle.message_factory.set_position_target_local_ned_encode(
-        *(time_boot_ms, target_system, target_component, mavutil.mavlink.MAV_FRAME_LOCAL_NED, ONLY_VELOCITY),
-        *(unused, unused, unused),  # position
-        *(north, east, down),
-        *(unused, unused, unused, unused, unused),  # acceleration, yaw and yaw rate
-    )
+        time_boot_ms=0, target_system=0, target_component=0,
+        coordinate_frame=mavutil.mavlink.MAV_FRAME_LOCAL_NED, type_mask=ONLY_VELOCITY,
+        x=0, y=0, z=0, vx=north, vy=east, vz=down, afx=0, afy=0, afz=0, yaw=0, yaw_rate=0,
+    )  # fmt: skip
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         vehicle.send_mavlink(message)
@@ -33,8 +31,9 @@ def fly(vehicle: Vehicle, north: float, east: float, down: float, seconds: float
 def turn(vehicle: Vehicle, heading: float, timeout: float = 20.0) -> None:
     """Turn to a heading in degrees and wait for it."""
     message = vehicle.message_factory.command_long_encode(
-        0, 0, mavutil.mavlink.MAV_CMD_CONDITION_YAW, 0, heading, 0, 0, 0, 0, 0, 0
-    )
+        target_system=0, target_component=0, command=mavutil.mavlink.MAV_CMD_CONDITION_YAW, confirmation=0,
+        param1=heading, param2=0, param3=0, param4=0, param5=0, param6=0, param7=0,
+    )  # fmt: skip
     vehicle.send_mavlink(message)
 
     def error_deg() -> float:

@@ -87,7 +87,7 @@ async def foxglove_bridge(
         on_found: called with each new vehicle, in the event loop.
 
     Raises:
-        InvalidArgument: an argument is invalid, or no message has such a name.
+        InvalidArgument: an argument is invalid, or no message matches a name in ``messages``.
         LinkOpenError: the server cannot listen on the port.
         ConnectionClosed, LinkLost: the connection has ended.
         ModuleNotFoundError: foxglove-sdk is not installed.

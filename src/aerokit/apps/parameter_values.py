@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
-    """Raise InvalidArgument if the metadata does not allow a value; the text lists all such values.
+    """Raise InvalidArgument if the metadata does not allow a value; the text lists all these values.
 
-    Names without metadata are accepted. The text names ``force``, the option that sets such values nevertheless.
+    Names without metadata are accepted. The text also names ``force``, the option that sets the values nevertheless.
     """
     if metadata is None:
         return
     problems = [problem for name, value in values.items() if (problem := _problem(metadata, name, value))]
     if problems:
-        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets such values too")
+        raise InvalidArgument(f"{'; '.join(problems)}; nothing was set; {force} sets these values nevertheless")
 
 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:

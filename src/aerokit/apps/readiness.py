@@ -31,10 +31,10 @@ def active_failsafe(vehicle: Vehicle) -> list[str] | None:
     if not vehicle.armed.latest or vehicle.system_status.latest not in FAILSAFE_STATES:
         return None
     texts = [text for text in vehicle.telemetry.texts_since(-math.inf) if failsafe_kind(text.text)]
-    since = max((text.at for text in texts), default=0.0) - _FAILSAFE_REPORT_DURATION_S
-    return list(dict.fromkeys(text.text for text in texts if text.at >= since)) or [
-        "no text about its cause was received"
-    ]
+    if not texts:
+        return ["no text about its cause was received"]
+    begins_at = max(text.at for text in texts) - _FAILSAFE_REPORT_DURATION_S
+    return list(dict.fromkeys(text.text for text in texts if text.at >= begins_at))
 
 
 class Readiness(NamedTuple):
@@ -61,26 +61,30 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
         reasons: result of ``vehicle.why_not_armable()``; None: health flags of SYS_STATUS, mode and estimator decide.
         changes_mode: True if a mode that does not allow arming is no reason, because `Vehicle.arm` will change it.
     """
-    found = _grouped(vehicle, reasons)
+    grouped = _grouped(vehicle, reasons)
     if reasons is not None or changes_mode:  # `why_not_armable` has the mode among its reasons
-        return found
-    return found._replace(against_arming=tuple(dict.fromkeys([*_refused_mode(vehicle), *found.against_arming])))
+        return grouped
+    against_arming = dict.fromkeys([*_refused_mode(vehicle), *grouped.against_arming])
+    return grouped._replace(against_arming=tuple(against_arming))
 
 
 def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
-    missing, sensors = vehicle.missing_for_flight(), vehicle.sensors.latest
+    """Return what is missing for a flight, in its two groups, without regard to a mode that does not allow arming."""
+    missing = vehicle.missing_for_flight()
+    against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
+    sensors = vehicle.sensors.latest
     checks_pass = sensors is not None and sensors.prearm_checks_pass is True
-    against = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
-    if checks_pass and all(map(_is_about_estimates, against)):
+    if checks_pass and all(map(_is_about_estimates, against_arming)):
         # The checks pass although estimates are missing, so the mode decides: for example, ArduCopter without a
         # position arms in STABILIZE, but not in GUIDED.
-        refused = tuple(not_armable(vehicle, missing)) if reasons is None else ()
-        return Readiness(refused, tuple(text for text in dict.fromkeys([*missing, *against]) if text not in refused))
-    is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against)
-    # `against` may contain a status text that consists of a prefix and a reason from `missing`.
-    without_prefix = {vehicle.autopilot.arming_reason(text) for text in against}
-    others = tuple(text for text in missing if text not in against and text not in without_prefix)
-    return Readiness(against, others, is_known)
+        refusals = tuple(not_armable(vehicle, missing)) if reasons is None else ()
+        all_reasons = dict.fromkeys([*missing, *against_arming])
+        return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))
+    is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against_arming)
+    # `against_arming` may contain a status text that consists of a prefix and a reason from `missing`.
+    without_prefix = {vehicle.autopilot.arming_reason(text) for text in against_arming}
+    against_flight = tuple(text for text in missing if text not in against_arming and text not in without_prefix)
+    return Readiness(against_arming, against_flight, is_known)
 
 
 def _is_about_estimates(text: str) -> bool:
@@ -91,13 +95,14 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     """Return the missing conditions that prevent arming in the present mode, as `Vehicle.why_not_armable` does."""
     mode = vehicle.mode.latest
     needs_position = mode is None or mode.name not in vehicle.autopilot.modes_without_position
-    flight_only = () if needs_position else ("the estimator has no ", "no GPS receiver has ")
-    return [
-        text
-        for text in missing
-        if not text.startswith(flight_only)
-        and not (text.startswith(("estimator (", "position (", "home (")) and text.endswith(" not received)"))
-    ]
+    needed = []
+    for text in missing:
+        is_about_position = text.startswith(("the estimator has no ", "no GPS receiver has "))
+        is_about_estimates = text.startswith(("estimator (", "position (", "home ("))
+        is_unknown_estimate = is_about_estimates and text.endswith(" not received)")
+        if (needs_position or not is_about_position) and not is_unknown_estimate:
+            needed.append(text)
+    return needed
 
 
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
@@ -105,20 +110,23 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
 
     ``missing`` are the missing conditions for flight. In modes without a position, ArduPilot arms without most of them.
     """
-    autopilot, unarmable = vehicle.autopilot, unarmable_mode(vehicle)
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
+    autopilot = vehicle.autopilot
+    unarmable = unarmable_mode(vehicle)
     if unarmable is not None and unarmable["arms_in"] is None:  # `arm` cannot change to a mode that allows arming
         return [*_refused_mode(vehicle), *_needed_to_arm(vehicle, missing)]
-    sensors, estimator = vehicle.sensors.latest, vehicle.estimator.latest
+    sensors = vehicle.sensors.latest
     if sensors is not None and sensors.prearm_checks_pass is False:
         return _needed_to_arm(vehicle, missing)
     mode = vehicle.mode.latest
     arms_in = None if mode is None else mode.name
     if unarmable is not None:
         arms_in = unarmable["arms_in"]
-    needs_position = bool(autopilot.modes_without_position) and arms_in not in (None, *autopilot.modes_without_position)
-    if needs_position and estimator is not None and estimator.missing:
+    if arms_in is None or not autopilot.modes_without_position or arms_in in autopilot.modes_without_position:
+        return []
+    estimator = vehicle.estimator.latest
+    if estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which arming would change the mode"
         headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
         return [headline, *(text for text in missing if not text.endswith(" not received)"))]
@@ -131,11 +139,16 @@ def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
     ``arms_in`` is the mode to which ``arm`` would change, or None. ``unless`` is the parameter that permits arming in
     the current mode.
     """
-    autopilot, mode = vehicle.autopilot, vehicle.mode.latest
+    autopilot = vehicle.autopilot
+    mode = vehicle.mode.latest
     if mode is None or mode.name not in autopilot.unarmable_modes.union(autopilot.armable_by_option):
         return None
-    arming_mode, option = autopilot.mode_to_arm_in(), autopilot.armable_by_option.get(mode.name)
-    return {"mode": mode.name, "arms_in": None if arming_mode is None else arming_mode.name, "unless": option}
+    arming_mode = autopilot.mode_to_arm_in()
+    return {
+        "mode": mode.name,
+        "arms_in": None if arming_mode is None else arming_mode.name,
+        "unless": autopilot.armable_by_option.get(mode.name),
+    }
 
 
 def _refused_mode(vehicle: Vehicle) -> list[str]:
@@ -150,8 +163,7 @@ def _refused_mode(vehicle: Vehicle) -> list[str]:
 
 def own_flight_modes(vehicle: Vehicle) -> str:
     """Return the names of the modes in which the vehicle flies by itself, such as ``GUIDED, AUTO, RTL``."""
-    mode_for, is_vtol = vehicle.autopilot.mode_for, vehicle.is_vtol
-    modes = (mode_for(purpose, is_vtol=is_vtol) for purpose in _OWN_FLIGHT_PURPOSES)
+    modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in _OWN_FLIGHT_PURPOSES]
     return ", ".join(dict.fromkeys(mode.name for mode in modes if mode is not None))
 
 
@@ -160,12 +172,14 @@ def arms_but(vehicle: Vehicle) -> str:
     return f"arms in {vehicle.mode_name}, but cannot take off by itself or fly {own_flight_modes(vehicle)}"
 
 
-def readiness_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
+def readiness_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
     """Return the reasons as lines of text; empty if nothing is missing."""
-    lines = [f"{f'{found.prefix}: ' if place == 0 else '  '}{text}" for place, text in enumerate(found.against_arming)]
-    if found.against_flight:
+    lines = []
+    for index, text in enumerate(checks.against_arming):
+        lines.append(f"{checks.prefix}: {text}" if index == 0 else f"  {text}")
+    if checks.against_flight:
         words = "also missing for flight" if lines else arms_but(vehicle)
-        lines += [f"{words}:", *(f"  {text}" for text in found.against_flight)]
+        lines += [f"{words}:", *(f"  {text}" for text in checks.against_flight)]
     return lines
 
 
@@ -181,15 +195,17 @@ class ArmingCheckRequests:
         self._requested_at: dict[Vehicle, float] = {}
 
     def are_due(self, vehicle: Vehicle) -> bool:
-        """Return True if the caller should now call `run_arming_checks`."""
-        failing, now = _failing_checks(vehicle), vehicle.connection.now()
+        """Return True if the caller should now call `run_arming_checks`, and record that it does."""
+        failing = _failing_checks(vehicle)
         if failing is None:
             self._failing.pop(vehicle, None)
             return False
+        now = vehicle.connection.now()
         is_early = now - self._requested_at.get(vehicle, -math.inf) < MIN_CHECK_INTERVAL_S
         if failing == self._failing.get(vehicle) or is_early:
             return False
-        self._failing[vehicle], self._requested_at[vehicle] = failing, now
+        self._failing[vehicle] = failing
+        self._requested_at[vehicle] = now
         return True
 
 

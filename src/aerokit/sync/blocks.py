@@ -116,7 +116,8 @@ class TwinOf(ReadOnly, Generic[AsyncT]):
     """Blocking twin of an asynchronous object. It calls the object's methods on the loop thread."""
 
     def __init__(self, loop: LoopThread, aio: AsyncT) -> None:
-        self._loop, self._aio = loop, aio
+        self._loop = loop
+        self._aio = aio
 
     @property
     def aio(self) -> AsyncT:
@@ -288,7 +289,7 @@ class ConnectionTwin(TwinOf["Connection"], BlockingContext):
         self._context = context
 
     def vehicles(self) -> Iterator[VehicleFound]:
-        """Yield each autopilot once, until the connection ends: first those already known, then new ones.
+        """Yield each autopilot once, until the connection ends: first the known autopilots, then new ones.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
@@ -318,7 +319,8 @@ class OpenedTwin(TwinOf[T], BlockingContext):
 
     def __init__(self, loop: LoopThread, context: OpenContext[T], *, owns_loop: bool) -> None:
         super().__init__(loop, context.value)
-        self._context, self._owns_loop = context, owns_loop
+        self._context = context
+        self._owns_loop = owns_loop
 
     def close(self) -> None:
         """Close the context and end the loop thread. Idempotent."""

@@ -91,23 +91,27 @@ def opened_fleet(
     """Open a fleet on a new loop thread; if a source is a connection or vehicle, on its loop thread."""
     entries: list[Any] = []
     for source in sources:
-        entries += source.values() if isinstance(source, Mapping) else (source,)
+        if isinstance(source, Mapping):
+            entries += source.values()
+        else:
+            entries.append(source)
     loops = {entry._loop for entry in entries if isinstance(entry, (ConnectionTwin, VehicleTwin))}
     if len(loops) > 1:
         raise InvalidArgument(
             "sources: the connections run on different event loops; pass addresses, or open all vehicles on one"
             " connection"
         )
-    loop = next(iter(loops), None) or LoopThread()
+    owns_loop = not loops
+    loop = LoopThread() if owns_loop else loops.pop()
     try:
         context: OpenContext[Any] = loop.open_context(open_async(*map(_original, sources), **options))
     except BaseException:
-        if not loops:
+        if owns_loop:
             loop.close()
         raise
     for connection in context.value._context.networks.values():
         connection._use_activity_monitor(loop.activity)
-    return twin(loop, context, owns_loop=not loops)
+    return twin(loop, context, owns_loop=owns_loop)
 
 
 def _original(source: Any) -> Any:

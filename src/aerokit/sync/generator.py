@@ -35,7 +35,7 @@ from aerokit.sync.originals import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-WIDTH = 120  # the line length of `ruff format`, whose style the output follows
+WIDTH = 120  # the line length of `ruff format`; the output has its style
 
 
 def outer_name(annotation: ast.expr | None) -> str:
@@ -139,14 +139,14 @@ FILE = FILES["twins"]
 # Base classes of twins that are generic in the asynchronous class.
 GENERIC_BASES = ("TwinOf", "BlockTwin", "SelectionTwin")
 
-# For each generated file (page), the asynchronous functions that open a context, such as ``connect``.
+# Maps each generated file (page) to the asynchronous functions that open a context, such as ``connect``.
 FUNCTIONS: dict[str, tuple[str, ...]] = {
     "twins": ("aerokit.connection.opening.open_connection", "aerokit.vehicle.connect.connect"),
     "fleet_twins": ("aerokit.fleets.opening.fleet",),
     "component_twins": ("aerokit.onboard.opening.component",),
 }
 
-# For each page, (module, name) of the function that opens such a context on a loop thread.
+# Maps each page to the module and name of the function that opens these contexts on a loop thread.
 OPENERS = {
     "twins": ("aerokit.sync.blocks", "opened"),
     "fleet_twins": ("aerokit.sync.fleet_blocks", "opened_fleet"),
@@ -188,7 +188,9 @@ class Page:
 
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
         """Import the names that an expression uses; ``modules`` are the modules in which the names may be defined."""
-        for part in ast.walk(node) if node is not None else ():
+        if node is None:
+            return
+        for part in ast.walk(node):
             text = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else None
             if isinstance(part, ast.Name):
                 self._import_name(part.id, modules, at_run_time)
@@ -198,7 +200,7 @@ class Page:
 
     def _import_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
         """Add the import of one name, unless the file defines it or it is built in."""
-        if name in self._page_of_other_twins and self._page_of_other_twins[name] == "twins":
+        if self._page_of_other_twins.get(name) == "twins":
             self.at_run_time.add(("aerokit.sync.twins", name))
             return
         if name in self._twins or name in TYPE_VARIABLES or hasattr(builtins, name):
@@ -218,7 +220,9 @@ class Page:
 
         ``checked`` knows classes by their names, so classes are only imported for type checkers.
         """
-        for part in ast.walk(node) if node is not None else ():
+        if node is None:
+            return
+        for part in ast.walk(node):
             if not isinstance(part, ast.Name):
                 continue
             origin_module, origin_name = imports_of(module).get(part.id, (module, part.id))
@@ -229,15 +233,16 @@ class Page:
 
     def wrapped_in_twin(self, expression: str, returns: ast.expr | None) -> str:
         """Return the expression, wrapped in a twin if its type has one."""
-        name, optional_name = outer_name(returns), outer_name(without_none(returns))
+        optional_name = outer_name(without_none(returns))
         if optional_name in self._twins:
             return f"None if {expression} is None else {optional_name}(self._loop, {expression})"
+        name = outer_name(returns)
         return f"{name}(self._loop, {expression})" if name in self._twins else expression
 
     def render_member(self, twin: Twin, member: ClassMember) -> str:
         """Return the source of the twin of a member, and add the imports that the source needs."""
         self.import_names_in(member.returns, member.module)
-        node, name = member.node, member.name
+        node = member.node
         if node is None or not {"property", "cached_property"}.isdisjoint(decorators_of(node)):
             return self._property_twin(twin, member)
         named_arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
@@ -248,10 +253,11 @@ class Page:
         arguments = forwarded_arguments(node)
         if "contextmanager" in decorators_of(node):
             return self._render_context_manager(node, member, arguments)
-        called = f"self.aio.{name}"
-        if name not in twin.direct:
-            run = "run" if isinstance(node, ast.AsyncFunctionDef) else "call"
-            called, arguments = f"self._loop.{run}", [called, *arguments]
+        called = f"self.aio.{member.name}"
+        if member.name not in twin.direct:
+            # The loop calls the method: `self._loop.run(self.aio.arm, …)`.
+            arguments = [called, *arguments]
+            called = "self._loop.run" if isinstance(node, ast.AsyncFunctionDef) else "self._loop.call"
         if outer_name(node.returns) in self._twins:
             result = render_call(called, arguments, "            ")
             body = render_call(f"return {outer_name(node.returns)}", ["self._loop", result])
@@ -276,7 +282,8 @@ class Page:
 
     def _property_twin(self, twin: Twin, member: ClassMember) -> str:
         """Return the source of a property. A twin is cached, so that each access returns the same object."""
-        name, read = member.name, f"self.aio.{member.name}"
+        name = member.name
+        read = f"self.aio.{name}"
         if name in twin.called:
             read = f"self._loop.call(lambda: {read})"
         wrapped = self.wrapped_in_twin(read, member.returns)
@@ -299,12 +306,12 @@ TYPE_VARIABLES = {
 
 
 def generate(name: str = "twins") -> str:
-    """Return the source of one file."""
-    page, twins = Page(name), [twin for twin in TWINS if twin.page == name]
+    """Return the source of one generated file: its imports, ``__all__``, classes and functions."""
+    page = Page(name)
+    twins = [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
     functions = [_opener(page, path) for path in FUNCTIONS[name]]
-    function_names = [path.rpartition(".")[2] for path in FUNCTIONS[name]]
-    exports = sorted([*(twin.name for twin in twins), *function_names])
+    exports = [twin.name for twin in twins]
     # `_class` and `_opener` have added the imports that their code needs. The following imports are needed in any case.
     page.at_run_time |= {(f"aerokit.sync.{BASE_MODULES.get(twin.base, 'blocks')}", twin.base) for twin in twins}
     page.at_run_time |= {OPENERS[name], ("aerokit._internal.arguments", "checked")}
@@ -316,6 +323,7 @@ def generate(name: str = "twins") -> str:
     for path in FUNCTIONS[name]:
         module, _, function_name = path.rpartition(".")
         page.at_run_time.add((module, f"{function_name} as {function_name}_async"))
+        exports.append(function_name)
     page.for_types -= page.at_run_time
     # Imports in HEAD that this file does not use are left out.
     text = HEAD if variables else HEAD.replace("import TYPE_CHECKING, TypeVar", "import TYPE_CHECKING")
@@ -323,7 +331,7 @@ def generate(name: str = "twins") -> str:
         text = text.replace("from functools import cached_property\n", "")
     head = text + _import_lines(page.at_run_time, "") + "\nif TYPE_CHECKING:\n"
     head += _import_lines(page.for_types, "    ") + "\n"
-    head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in exports) + "]\n"
+    head += "__all__ = [\n" + "".join(f'    "{export}",\n' for export in sorted(exports)) + "]\n"
     head += "\n" if variables else ""
     for variable, bound in variables.items():
         head += f'{variable} = TypeVar("{variable}"{f", bound={bound}" if bound else ""})\n'

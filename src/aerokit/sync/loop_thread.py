@@ -255,7 +255,8 @@ class OpenContext(Generic[T]):
     """An asynchronous context manager that is open on a :class:`LoopThread`, in a task of its own."""
 
     def __init__(self, loop: LoopThread, context: AbstractAsyncContextManager[T]) -> None:
-        self._loop, self._task = loop, _ContextTask(context)
+        self._loop = loop
+        self._task = _ContextTask(context)
         self._call = _Call(self._task.run)
         opened = self._task.opened
         try:

@@ -66,7 +66,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def __init__(self, *, deadlock_timeout_s: float = DEADLOCK_TIMEOUT_S) -> None:
         self._now = 0.0
-        self._executor_calls = self._iterations = 0
+        self._executor_calls = 0
+        self._iterations = 0
         self._deadlock_timeout_s = deadlock_timeout_s
         self._sources: list[tuple[Callable[[], float], asyncio.Handle]] = []
         super().__init__(_JumpingSelector(self))
@@ -100,11 +101,13 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     def _run_once(self) -> None:
         """Run one iteration of the loop. Without sockets, poll only rarely, to notice signals and other threads."""
         self._iterations += 1
-        ready, timers = self._ready, self._scheduled  # type: ignore[attr-defined]
+        ready = self._ready  # type: ignore[attr-defined]
+        timers = self._scheduled  # type: ignore[attr-defined]
         needs_poll = self._iterations >= _POLL_EVERY or not self._can_skip_polls
         if not needs_poll and not ready:
-            has_event = self._run_sources() or self._next_timer() != math.inf
-            needs_poll = not has_event  # Without an event, only a signal or another thread can wake the loop.
+            has_run = self._run_sources()
+            # Without an event source or timer, only a signal or another thread can wake the loop.
+            needs_poll = not has_run and self._next_timer() == math.inf
         cancelled_count = self._timer_cancelled_count  # type: ignore[attr-defined]
         has_mostly_cancelled_timers = _MANY_TIMERS < len(timers) < 2 * cancelled_count
         if needs_poll or has_mostly_cancelled_timers:  # asyncio's own iteration polls, and discards cancelled timers.
@@ -147,15 +150,18 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
         Stop when a callback is ready or the selector must be polled.
         """
-        sources, ready = self._sources, self._ready  # type: ignore[attr-defined]
-        can_skip_polls, has_run = self._can_skip_polls, False
+        sources = self._sources
+        ready = self._ready  # type: ignore[attr-defined]
+        can_skip_polls = self._can_skip_polls
+        has_run = False
         while sources and not ready:
             earliest_due = math.inf
             _, earliest_handle = sources[0]
             for next_due, handle in sources:
                 due = next_due()
                 if due < earliest_due:
-                    earliest_due, earliest_handle = due, handle
+                    earliest_due = due
+                    earliest_handle = handle
             # If a timer is due earlier or at the same instant, stop here: the iteration that runs the timer also runs
             # the event sources of its instant.
             if earliest_due + self._clock_resolution >= self._next_timer():
@@ -170,7 +176,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def _schedule_sources_before_timer(self) -> None:
         """If a timer is due, schedule the event sources of the same instant, so that they run before the timer."""
-        timers, end = self._scheduled, self._now + self._clock_resolution  # type: ignore[attr-defined]
+        timers = self._scheduled  # type: ignore[attr-defined]
+        end = self._now + self._clock_resolution
         if timers and timers[0]._when < end:
             self._ready.extend(handle for next_due, handle in self._sources if next_due() < end)  # type: ignore[attr-defined]
 

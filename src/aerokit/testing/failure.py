@@ -25,7 +25,9 @@ def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], tes
     recordings. Their names begin with the name of the test.
     """
     flights = _flatten(opened)
-    lines = [line for flight in flights for line in _describe(flight)]
+    lines: list[str] = []
+    for flight in flights:
+        lines += _describe(flight)
     if directory is not None:
         lines.append(_picture(flights, test, Path(directory)))
         lines += _recordings(flights, test, Path(directory))
@@ -47,7 +49,7 @@ def _describe(flight: Flight | ServedFlight) -> list[str]:
 
 
 def _describe_flight(flight: Flight | ServedFlight) -> list[str]:
-    track, texts = flight.track, flight.journal.texts
+    track = flight.track
     if not track:  # The track has no points.
         return [f"{track.name}: not switched on"]
     lines = [
@@ -55,7 +57,7 @@ def _describe_flight(flight: Flight | ServedFlight) -> list[str]:
         f" up to {track.max_altitude_m:.1f} m high and {track.max_distance_m:.1f} m away",
         f"  ended {track.end}",
     ]
-    return [*lines, *_text_lines(texts)]
+    return [*lines, *_text_lines(flight.journal.texts)]
 
 
 def _text_lines(texts: Sequence[SentText]) -> list[str]:

@@ -86,9 +86,13 @@ class FaultyPath:
     def __init__(self, model: FaultModel, seed: object = 0, air: Air | None = None) -> None:
         self.model = model
         """Faults of this direction. The model may be replaced at any time."""
-        self.frames = self.lost = self.overflowed = 0
+        self.frames = 0
         self.bytes: int = 0
-        self.duplicated = self.reordered = self.corrupted = 0
+        self.lost = 0
+        self.overflowed = 0
+        self.duplicated = 0
+        self.reordered = 0
+        self.corrupted = 0
         self._chance = random.Random(repr(seed)).random
         self._bits = random.Random(repr((seed, "bits")))
         self._air = Air() if air is None else air
@@ -112,7 +116,8 @@ class FaultyPath:
         """Return the arrivals of one frame: none if it is lost, two if it is duplicated."""
         # Draw five random numbers for every frame, even for a lost frame. A change of one share then does not change
         # which frames the other faults affect.
-        model, chance = self.model, self._chance
+        model = self.model
+        chance = self._chance
         is_lost = chance() < model.loss
         is_duplicated = chance() < model.duplication
         is_reordered = chance() < model.reordering
@@ -134,7 +139,8 @@ class FaultyPath:
             self.reordered += 1
             due += model.overtaken_s
         else:  # Jitter alone must not change the order.
-            due = self._latest_due = max(due, self._latest_due)
+            due = max(due, self._latest_due)
+            self._latest_due = due
         if is_duplicated:
             self.duplicated += 1
             return [(due, frame), (due, frame)]
@@ -142,7 +148,8 @@ class FaultyPath:
 
     def _transmit(self, size: int, now: float) -> float | None:
         """Return the time at which the last byte of a frame is sent; None if the queue is full."""
-        model, air = self.model, self._air
+        model = self.model
+        air = self._air
         begin = max(now, air.busy_until)
         if math.isinf(model.bandwidth):  # Sending takes no time.
             return begin
@@ -162,17 +169,18 @@ class FaultyPath:
         damaged = bytearray(frame)
         for _ in range(self._bits.randint(1, 8) if damaged else 0):
             bit = self._bits.randrange(len(damaged) * 8)
-            damaged[bit // 8] ^= 1 << bit % 8
+            damaged[bit // 8] ^= 1 << (bit % 8)
         return bytes(damaged)
 
 
 def split_frames(data: bytes) -> Sequence[bytes]:
-    """Split a write or datagram into MAVLink frames. Bytes that are no complete frame form one piece.
+    """Split a write or datagram into MAVLink frames. If no complete frame begins at a byte, the rest is one piece.
 
     Only the lengths of frames are checked, not their checksums.
     """
     pieces: list[bytes] = []
-    begin, size = 0, len(data)
+    size = len(data)
+    begin = 0
     while begin < size:
         end_of_frame = _end_of_frame(data, begin)
         # If no complete frame begins here, the piece extends to the end of the data.

@@ -52,7 +52,10 @@ class StalledQueue:
         on_drop: Callable[[int], object],
         on_stall: Callable[[bool], object],
     ) -> None:
-        self._system_limit, self._carry, self._on_drop, self._on_stall = system_bytes, carry, on_drop, on_stall
+        self._system_limit = system_bytes
+        self._carry = carry
+        self._on_drop = on_drop
+        self._on_stall = on_stall
         # Bytes that the simulated operating system has accepted, and sends after the stall.
         self._accepted: list[tuple[bytes, Peer]] = []
         self._outboxes: dict[Peer, Outbox] = {}
@@ -68,7 +71,8 @@ class StalledQueue:
         """See `Link.write`."""
         outbox = self._outboxes.get(peer)
         if outbox is None:
-            outbox = self._outboxes[peer] = self._new_outbox(peer)
+            outbox = self._new_outbox(peer)
+            self._outboxes[peer] = outbox
         outbox.write(data)
 
     def discard(self) -> None:
@@ -178,7 +182,8 @@ class FaultyLink(Link):
     @property
     def unsent_bytes(self) -> int:
         """See `Link.unsent_bytes`. Bytes in transit do not count."""
-        return self.link.unsent_bytes + (0 if self._stalled_queue is None else self._stalled_queue.unsent_bytes)
+        queued_bytes = 0 if self._stalled_queue is None else self._stalled_queue.unsent_bytes
+        return self.link.unsent_bytes + queued_bytes
 
     def discard_unsent(self) -> None:
         """See `Link.discard_unsent`."""
@@ -218,7 +223,8 @@ class FaultyLink(Link):
         except BaseException:  # Also after a cancellation, the link can be opened again.
             self._incoming_path.close()
             self._in_flight.clear()
-            self._incoming_path = self._in_flight = None
+            self._incoming_path = None
+            self._in_flight = None
             raise
 
     def write(self, data: bytes, peer: Peer = None) -> None:
@@ -263,11 +269,12 @@ class FaultyLink(Link):
         if self._incoming_path is not None:
             self._incoming_path.close()
         in_flight = self._in_flight
-        if in_flight is None or in_flight.loop.is_closed() or not in_flight:  # Nothing is, or can be, in transit.
+        if in_flight is None or in_flight.loop.is_closed() or in_flight.is_empty:  # Nothing can be delivered any more.
             self.link.close()
             return
         self._drained.clear()
-        in_flight.put(min(in_flight.latest_due, in_flight.loop.time() + LINGER_S), self._close_link)
+        latest_close = in_flight.loop.time() + LINGER_S
+        in_flight.put(min(in_flight.latest_due, latest_close), self._close_link)
 
     async def wait_closed(self) -> None:
         """See `Link.wait_closed`."""
@@ -279,7 +286,8 @@ class FaultyLink(Link):
 
     def _on_stalled(self, is_stalled: bool) -> None:
         """Report to the receiver that the link stalls or is drained."""
-        now, stalled_at = asyncio.get_running_loop().time(), self._stalled_at
+        now = asyncio.get_running_loop().time()
+        stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
             return
@@ -306,7 +314,9 @@ class _IncomingPath:
     """The receiver of the wrapped link. It applies the faults of the incoming direction."""
 
     def __init__(self, path: FaultyPath, receiver: Receiver, on_lost: Callable[[], None]) -> None:
-        self._path, self._receiver, self._on_lost = path, receiver, on_lost
+        self._path = path
+        self._receiver = receiver
+        self._on_lost = on_lost
         self.keeps_peers = keeps_peers(receiver)
         self._in_flight = _DeliveryQueue(asyncio.get_running_loop())
         self._is_closed = False
@@ -366,8 +376,9 @@ class _DeliveryQueue:
         # The due time of `_timer`. It is stored, because TimerHandle.when() of uvloop fails after this time.
         self._timer_at = 0.0
 
-    def __bool__(self) -> bool:
-        return bool(self._waiting)
+    @property
+    def is_empty(self) -> bool:
+        return not self._waiting
 
     def put(self, due: float, action: Callable[[], None]) -> None:
         """Queue an action. Run it at once if it is due and the queue is empty: a link without faults adds no delay."""

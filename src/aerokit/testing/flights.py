@@ -104,7 +104,8 @@ class SimulatedFleet(Sequence[Flight]):
         options.setdefault("boot_time_s", _BOOT_TIME_S)
         self._vehicles = _side_by_side(kinds, spacing_m, **options)
         self._scheduler = FlightScheduler(self._vehicles)
-        self._connect, self._latency_s = connect, latency_s
+        self._connect = connect
+        self._latency_s = latency_s
         self.recording: FlightRecording | None = FlightRecording() if record else None
         """Recording of the link; None without ``record=True``."""
         self._server: SimulatorServer | None = None
@@ -146,11 +147,11 @@ class SimulatedFleet(Sequence[Flight]):
 
     def _closest_approach(self) -> tuple[float, float, str]:
         """Return the minimum distance of any two vehicles in metres, its time, and the names of these vehicles."""
-        approaches = [
-            (*min_distance_m(first.track, second.track), f"{first.track.name} and {second.track.name}")
-            for first, second in combinations(self, 2)
-        ]
-        return min(approaches, default=(math.inf, 0.0, ""))
+        closest = (math.inf, 0.0, "")
+        for first, second in combinations(self, 2):
+            distance_m, time_s = min_distance_m(first.track, second.track)
+            closest = min(closest, (distance_m, time_s, f"{first.track.name} and {second.track.name}"))
+        return closest
 
     @property
     def link(self) -> Link:
@@ -205,7 +206,8 @@ class SimulatedFleet(Sequence[Flight]):
             self._refresh()
         finally:
             self._scheduler.refresh_with(None)
-            self._server = self._link = None
+            self._server = None
+            self._link = None
             for flight in self._flights:
                 flight._vehicle = None
 

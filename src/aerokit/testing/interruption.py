@@ -26,7 +26,9 @@ class Interruption:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._is_allowed = self._is_sent = self._is_delivered = False
+        self._is_allowed = False
+        self._is_sent = False
+        self._is_delivered = False
         self._previous_handler: Any = signal.default_int_handler
 
     @contextlib.contextmanager
@@ -82,9 +84,8 @@ def _is_sigint_available() -> bool:
     background jobs of a script.
     """
     handler = signal.getsignal(signal.SIGINT)
-    return handler in (signal.default_int_handler, signal.SIG_IGN) or isinstance(
-        getattr(handler, "__self__", None), Interruption
-    )
+    is_of_interruption = isinstance(getattr(handler, "__self__", None), Interruption)
+    return is_of_interruption or handler in (signal.default_int_handler, signal.SIG_IGN)
 
 
 def _is_in_context_code(frame: FrameType | None) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import import_module
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,12 +21,18 @@ __all__ = ["check_picture", "draw_svg", "save_picture"]
 
 _COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
 _GREY = "#dddddd"
-_WIDTH, _MAP_HEIGHT, _PROFILE_HEIGHT, _MARGIN = 800, 520, 160, 60
+# Sizes and distances are in pixels.
+_WIDTH = 800
+_MAP_HEIGHT = 520
+_PROFILE_HEIGHT = 160
+_MARGIN = 60
 _HEIGHT = _MAP_HEIGHT + _PROFILE_HEIGHT
 _FONT_SIZE = 12
 _MAX_NAMES = 8
 _FAILED = "#e00000"
-_LABEL_HEIGHT, _LABEL_WIDTH, _MAX_LABELS = 13, 60, 40
+_LABEL_HEIGHT = 13
+_LABEL_WIDTH = 60
+_MAX_LABELS = 40
 _CORNERS = 90  # Corners of the polygon that draws a circle.
 
 
@@ -152,7 +159,9 @@ def _shapes(tracks: Sequence[Drawable]) -> list[_Shape]:
     return _map(drawn) + _profile(drawn) + _legend(drawn) if drawn else []
 
 
-_MAX_X_TICKS, _MAX_Y_TICKS, _MAX_Y_TICKS_OF_LOW_CHART = 6, 5, 3
+_MAX_X_TICKS = 6
+_MAX_Y_TICKS = 5
+_MAX_Y_TICKS_OF_LOW_CHART = 3
 _LOW_CHART = 200  # A chart of up to this many pixels is low.
 
 
@@ -160,8 +169,12 @@ class _Axes:
     """Maps the values of two axes to positions in a rectangle of the picture, with a margin."""
 
     def __init__(self, xs: Sequence[float], ys: Sequence[float], top: float, height: float, *, square: bool) -> None:
-        self.left, self.top, self.width, self.height = _MARGIN, top, _WIDTH - 2 * _MARGIN, height
-        self.x_range, self.y_range = _with_margin(xs), _with_margin(ys)
+        self.left = _MARGIN
+        self.top = top
+        self.width = _WIDTH - 2 * _MARGIN
+        self.height = height
+        self.x_range = _with_margin(xs)
+        self.y_range = _with_margin(ys)
         if square:
             scale = max(_span(self.x_range) / self.width, _span(self.y_range) / self.height)
             self.x_range = _widened(self.x_range, scale * self.width)
@@ -176,7 +189,8 @@ class _Axes:
 
     def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
         shapes: list[_Shape] = []
-        bottom, right = self.top + self.height, self.left + self.width
+        bottom = self.top + self.height
+        right = self.left + self.width
         for value in _ticks(self.x_range, _MAX_X_TICKS):
             x, _ = self.place(value, 0.0)
             shapes.append(_GridLine((x, self.top), (x, bottom)))
@@ -192,17 +206,21 @@ class _Axes:
 
 def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
     """Draw the tracks from above, relative to the first home: east to the right, north upwards."""
-    paths = [[(east, north) for north, east, _ in track.local(tracks[0].home)] for track in tracks]
-    outlines = [outline for track in tracks for outline in _outlines(track, tracks[0].home)]
-    all_places = [place for path in paths + outlines for place in path]
-    easts, norths = zip(*all_places, strict=True)
+    origin = tracks[0].home
+    paths = []
+    outlines = []
+    for track in tracks:
+        paths.append([(east, north) for north, east, _ in track.local(origin)])
+        outlines += _outlines(track, origin)
+    easts, norths = zip(*chain(*paths, *outlines), strict=True)
     axes = _Axes(easts, norths, top=30, height=_MAP_HEIGHT - 60, square=True)
     shapes = axes.grid("m", "m")
     shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, is_dashed=True) for outline in outlines]
     labels = _Labels()
     for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
         places = [axes.place(east, north) for east, north in path]
-        shapes += [_Line(places, colour), _Dot(*places[0], colour)]
+        start_x, start_y = places[0]
+        shapes += [_Line(places, colour), _Dot(start_x, start_y, colour)]
         shapes += labels.modes(track, places, colour)
         shapes += _failed_point(track, places)
     return shapes
@@ -213,7 +231,8 @@ def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float
     failure = track.failure
     if failure is None:
         return []
-    offset_of, outlines = metres_from(origin), []
+    offset_of = metres_from(origin)
+    outlines = []
     if failure.circle is not None:
         centre, radius = failure.circle
         north, east = offset_of(centre)
@@ -281,8 +300,7 @@ def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
     paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((altitude for altitude in limits if altitude is not None), None)
-    all_points = [point for path in paths for point in path]
-    times, heights = zip(*all_points, strict=True)
+    times, heights = zip(*chain(*paths), strict=True)
     shown_heights = heights if limit is None else (*heights, limit)  # The chart also shows the line of the limit.
     axes = _Axes(times, shown_heights, top=_MAP_HEIGHT, height=_PROFILE_HEIGHT - 40, square=False)
     shapes = axes.grid("s", "m up")
@@ -296,7 +314,8 @@ def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
         if len(tracks) == 1:  # The labels of several tracks would overlap.
             shapes += labels.modes(track, places, colour)
         if track.failure is not None:
-            shapes.append(_Dot(*places[_index_of(track, track.failure.point)], _FAILED))
+            failed_x, failed_y = places[_index_of(track, track.failure.point)]
+            shapes.append(_Dot(failed_x, failed_y, _FAILED))
     return shapes
 
 
@@ -312,7 +331,8 @@ def _colours(count: int) -> list[str]:
 
 
 def _with_margin(values: Sequence[float]) -> tuple[float, float]:
-    low, high = min(values), max(values)
+    low = min(values)
+    high = max(values)
     return _widened((low, high), max(1.1 * (high - low), 2.0))
 
 

@@ -165,9 +165,10 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return the kinds and options of the test's marker ``simulated``."""
     marker = request.node.get_closest_marker(_MARKER)
-    kinds, options = (marker.args, dict(marker.kwargs)) if marker else ((), {})
+    options = {} if marker is None else dict(marker.kwargs)
     options.setdefault("record", request.config.getoption(_PICTURES_OPTION) is not None)
-    return kinds or ("copter",), options
+    has_kinds = marker is not None and marker.args
+    return marker.args if has_kinds else ("copter",), options
 
 
 def _flight_fixtures(item: pytest.Item) -> list[Any]:
@@ -273,7 +274,8 @@ def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] 
 @contextlib.contextmanager
 def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Iterator[None]:
     """Within the block, ``item`` runs ``test`` instead of its own function."""
-    original, item.obj = item.obj, test
+    original = item.obj
+    item.obj = test
     try:
         yield
     finally:

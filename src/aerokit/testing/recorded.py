@@ -62,9 +62,11 @@ class RecordedParameters(ParameterProtocolServer):
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
         """Return the latest PARAM_VALUE that was written or played or, before that, the first recorded one."""
-        position, recorded = self._vehicle.position_s, self._recorded[name]
-        _, first_value = recorded[0]
-        latest = next((value for time, value in reversed(recorded) if time <= position), first_value)
+        recorded = self._recorded[name]
+        _, latest = recorded[0]
+        for time, value in recorded:
+            if time <= self._vehicle.position_s:
+                latest = value
         written = self._written.get(name, latest.param_value)
         return m.ParamValue(name, written, latest.param_type, len(self.names), index)
 
@@ -74,14 +76,15 @@ class RecordedParameters(ParameterProtocolServer):
         self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        name, index = request.param_id, request.param_index
-        name_and_index = self.requested(name, index)
+        name_and_index = self.requested(request.param_id, request.param_index)
+        is_by_name = request.param_index < 0
         if name_and_index is not None:
-            self.send(*name_and_index, channel)
-        elif index < 0 and name == HASH_NAME and self._has_hash:
-            self.send(name, UNKNOWN_INDEX, channel)
+            name, index = name_and_index
+            self.send(name, index, channel)
+        elif is_by_name and request.param_id == HASH_NAME and self._has_hash:
+            self.send(HASH_NAME, UNKNOWN_INDEX, channel)
         else:
-            self._refuse(request, index, channel)
+            self._refuse(request, request.param_index, channel)
 
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
         name = request.param_id
@@ -121,10 +124,10 @@ class RecordedMissions(MissionServer):
         """
         if mission_type in self._written:
             return self._written[mission_type]
-        position_s, items = self._vehicle.position_s, None
+        items = None
         for plan in self._vehicle.recording.plans:  # The plans are in the order of their times.
             is_first = items is None
-            if plan.mission_type == mission_type and (is_first or plan.since <= position_s):
+            if plan.mission_type == mission_type and (is_first or plan.since <= self._vehicle.position_s):
                 items = plan.items
         return items
 
@@ -143,7 +146,8 @@ class RecordedMissions(MissionServer):
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         recorded = (self.items(request.mission_type) or ())[request.seq]
-        return _item_message(recorded, request.seq, sender_of(request), isinstance(request, m.MissionRequest))
+        wants_float = isinstance(request, m.MissionRequest)
+        return _item_message(recorded, request.seq, sender_of(request), as_float=wants_float)
 
     def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
         self._received[message.seq :] = [message]
@@ -160,7 +164,8 @@ class RecordedMissions(MissionServer):
         self._drop(upload)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        kind, result = request.mission_type, int(MavMissionResult.UNSUPPORTED)
+        kind = request.mission_type
+        result = int(MavMissionResult.UNSUPPORTED)
         if kind in self._vehicle.recording.clears:
             result = self._recorded_result("clear", self._vehicle.recording.clears[kind], kind)
         if result == MavMissionResult.ACCEPTED:
@@ -177,17 +182,31 @@ class RecordedMissions(MissionServer):
         return results[min(number, len(results) - 1)]
 
 
-def _item_message(item: AnyItem, seq: int, client: tuple[int, int], as_float: bool) -> AnyItem:
+def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, as_float: bool) -> AnyItem:
     """Convert a recorded item to the message that the client requests: MISSION_ITEM or MISSION_ITEM_INT."""
     scale = 1.0 if item.frame == MavFrame.MISSION else 1e7  # In MAV_FRAME_MISSION, x and y are not in degrees.
     is_float = isinstance(item, m.MissionItem)
     if as_float:
         place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
         return item_message_float(item_from(item), place, seq, client, item.mission_type, item.current)
-    x, y = (round(item.x * scale), round(item.y * scale)) if is_float else (int(item.x), int(item.y))
-    header = (*client, seq, item.frame, item.command, item.current, item.autocontinue)
-    params = (item.param1, item.param2, item.param3, item.param4)
-    return m.MissionItemInt(*header, *params, x, y, item.z, item.mission_type)
+    client_system, client_component = client
+    return m.MissionItemInt(
+        target_system=client_system,
+        target_component=client_component,
+        seq=seq,
+        frame=item.frame,
+        command=item.command,
+        current=item.current,
+        autocontinue=item.autocontinue,
+        param1=item.param1,
+        param2=item.param2,
+        param3=item.param3,
+        param4=item.param4,
+        x=round(item.x * scale) if is_float else int(item.x),
+        y=round(item.y * scale) if is_float else int(item.y),
+        z=item.z,
+        mission_type=item.mission_type,
+    )
 
 
 _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
@@ -231,7 +250,8 @@ class RecordedVehicle(SimulatedVehicle):
             seed=seed,
             components=components,
         )
-        self._start, self._repeat = start_s, repeat
+        self._start_s = start_s
+        self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
         self._answered_counts: dict[int, int] = {}
@@ -250,7 +270,7 @@ class RecordedVehicle(SimulatedVehicle):
     @property
     def position_s(self) -> float:
         """Current position in the recording, in seconds."""
-        return min(self._start + self.now - self._began_at, self.recording.duration_s)
+        return min(self._start_s + self.now - self._began_at, self.recording.duration_s)
 
     @property
     def has_ended(self) -> bool:
@@ -261,7 +281,7 @@ class RecordedVehicle(SimulatedVehicle):
         stream = self.recording.stream
         self._began_at = self.now
         # The tolerance includes messages that were recorded at exactly the start time.
-        self._next = bisect_right([time for time, _ in stream], self._start - 1e-9)
+        self._next = bisect_right([time for time, _ in stream], self._start_s - 1e-9)
         self._schedule_next()
 
     def start_channel(self, channel: Channel) -> None:
@@ -277,9 +297,9 @@ class RecordedVehicle(SimulatedVehicle):
         stream = self.recording.stream
         if self._next < len(stream):
             time, _ = stream[self._next]
-            self.call_at(self._began_at + time - self._start, self._play)
+            self.call_at(self._began_at + time - self._start_s, self._play)
         else:
-            self.call_at(self._began_at + self.recording.duration_s - self._start, self._end)
+            self.call_at(self._began_at + self.recording.duration_s - self._start_s, self._end)
 
     def _play(self) -> None:
         """Send the next frame, and the frames after it that have the same time."""
@@ -294,7 +314,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._schedule_next()
 
     def _end(self) -> None:
-        if self._repeat and self.recording.duration_s > self._start:
+        if self._repeat and self.recording.duration_s > self._start_s:
             self.boot()
         else:
             self._is_on = False
@@ -307,7 +327,15 @@ class RecordedVehicle(SimulatedVehicle):
         for delay, ack in answer.acks:
             # The recorded acknowledgement is addressed to the recorded client. Address it to the sender of `command`
             # instead.
-            readdressed = m.CommandAck(ack.command, ack.result, ack.progress, ack.result_param2, *command.sender)
+            system_id, component_id = command.sender
+            readdressed = m.CommandAck(
+                command=ack.command,
+                result=ack.result,
+                progress=ack.progress,
+                result_param2=ack.result_param2,
+                target_system=system_id,
+                target_component=component_id,
+            )
             self.call_later(delay, partial(self.send, readdressed, command.channel))
         return None  # The acknowledgements were recorded, so no further one is sent.
 
@@ -342,7 +370,8 @@ class RecordedVehicle(SimulatedVehicle):
         """Return the latest played message with this id, or else the first recorded one, or None."""
         stream = self.recording.stream
         own = (self.system_id, self.component_id)
-        played, not_yet_played = stream[: self._next], stream[self._next :]
+        played = stream[: self._next]
+        not_yet_played = stream[self._next :]
         for _, frame in (*reversed(played), *not_yet_played):
             if frame.message_id == message_id and (frame.system_id, frame.component_id) == own:
                 return STANDARD.decode(frame)
@@ -357,9 +386,9 @@ class RecordedVehicle(SimulatedVehicle):
 
     def _on_timesync(self, message: m.Timesync, channel: Channel) -> None:
         if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
-            nanoseconds = int(self.position_s * 1e9)
-            self.send(m.Timesync(nanoseconds, message.ts1), channel)
+            self.send(m.Timesync(tc1=int(self.position_s * 1e9), ts1=message.ts1), channel)
 
     def _on_ping(self, message: m.Ping, channel: Channel) -> None:
         if message.target_system == 0:  # A PING with a target is an answer.
-            self.send(m.Ping(message.time_usec, message.seq, *sender_of(message)), channel)
+            system_id, component_id = sender_of(message)
+            self.send(m.Ping(message.time_usec, message.seq, system_id, component_id), channel)

@@ -46,8 +46,10 @@ class ServedFlight:
         """Injects faults."""
         self.recording: FlightRecording | None = recording
         """Recording of the vehicle's link; None without ``record=True``."""
-        self._portal, self._server = portal, server
-        self._scheduler, self._interruption = scheduler, interruption
+        self._portal = portal
+        self._server = server
+        self._scheduler = scheduler
+        self._interruption = interruption
         self._is_raised = False
         scheduler.refresh_with(lambda: portal.call(self._refresh))
 
@@ -95,7 +97,7 @@ class ServedFlight:
 
 @contextmanager
 def serve_flight(kind: str = "copter", **options: Any) -> Iterator[ServedFlight]:
-    """Serve a vehicle while the block runs; ``options`` are those of the vehicle and of `hosted_flight`.
+    """Serve a vehicle while the block runs; ``options`` are the options of the vehicle and of `hosted_flight`.
 
     An exception in the simulated vehicle ends the block at once, see `ServedFlight.raising_vehicle_errors`.
     """
@@ -112,7 +114,7 @@ def hosted_flight(
     record: bool = False,
     **options: Any,
 ) -> Iterator[ServedFlight]:
-    """Serve a vehicle on an address while the block runs; ``options`` are those of the vehicle.
+    """Serve a vehicle on an address while the block runs; ``options`` are the options of the vehicle.
 
     Timeouts after which the vehicle reacts to a silent client are multiplied by ``speedup``, except those in
     ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, and
@@ -124,7 +126,8 @@ def hosted_flight(
     options.setdefault("boot_time_s", 1.0)
     vehicle: Any = simulated(kind, **options)
     scale_timeouts([vehicle], speedup, leave=options.get("parameters") or ())
-    scheduler, interruption = FlightScheduler([vehicle]), Interruption()
+    scheduler = FlightScheduler([vehicle])
+    interruption = Interruption()
     recording = FlightRecording() if record else None
 
     @asynccontextmanager

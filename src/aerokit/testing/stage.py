@@ -91,8 +91,10 @@ class FlightRecording:
     def __init__(self) -> None:
         self._file = BytesIO()
         self._writer = TlogWriter(self._file)
-        self._sent_framer, self._received_framer = Framer(), Framer()
-        self._sent_framer.keep_unknown = self._received_framer.keep_unknown = True
+        self._sent_framer = Framer()
+        self._received_framer = Framer()
+        self._sent_framer.keep_unknown = True
+        self._received_framer.keep_unknown = True
 
     def attach(self, server: SimulatorServer) -> None:
         """Record the traffic of this server from now on."""

@@ -173,7 +173,7 @@ class Track(Sequence[TrackPoint]):
         """
         __tracebackhide__ = True
         distance, point = self._nearest(place)
-        self._record_failure(distance <= within_m, TrackFailure(point, (place, within_m)))
+        self._record_failure(distance <= within_m, TrackFailure(point, circle=(place, within_m)))
         assert distance <= within_m, (
             f"the vehicle did not pass within {within_m:g} m of {_text(place)}: the minimum distance was"
             f" {distance:.1f} m, {point}"
@@ -185,7 +185,7 @@ class Track(Sequence[TrackPoint]):
         centre = self.home if of is None else of
         distance, point = self._farthest(centre)
         name = "home" if of is None else _text(of)
-        self._record_failure(distance <= radius_m, TrackFailure(point, (centre, radius_m)))
+        self._record_failure(distance <= radius_m, TrackFailure(point, circle=(centre, radius_m)))
         assert distance <= radius_m, f"the vehicle left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
 
     def assert_stayed_inside(self, polygon: Sequence[Position]) -> None:
@@ -213,14 +213,15 @@ class Track(Sequence[TrackPoint]):
     def assert_landed_near(self, place: Position | None = None, *, within_m: float = 2.0) -> None:
         """Assert that the vehicle flew and landed within ``within_m`` metres of home, or of ``place`` if given."""
         __tracebackhide__ = True
-        end, target = self.end, self.home if place is None else place
+        end = self.end
+        target = self.home if place is None else place
         self._record_failure(self.max_altitude_m > _ON_GROUND_M, TrackFailure(end))
         assert self.max_altitude_m > _ON_GROUND_M, f"the vehicle never took off: the track ends {end}"
-        self._record_failure(abs(end.altitude_m) <= _ON_GROUND_M, TrackFailure(end, (target, within_m)))
+        self._record_failure(abs(end.altitude_m) <= _ON_GROUND_M, TrackFailure(end, circle=(target, within_m)))
         assert abs(end.altitude_m) <= _ON_GROUND_M, f"the vehicle is not on the ground: the track ends {end}"
         distance = target.distance_to(end.position)
         name = "home" if place is None else _text(place)
-        self._record_failure(distance <= within_m, TrackFailure(end, (target, within_m)))
+        self._record_failure(distance <= within_m, TrackFailure(end, circle=(target, within_m)))
         assert distance <= within_m, (
             f"the vehicle landed {distance:.1f} m from {name}, not within {within_m:g} m: {end}"
         )
@@ -270,8 +271,11 @@ class Track(Sequence[TrackPoint]):
         If the minimum is between two points of the track, return the later one.
         """
         self._check_not_empty()
-        offset_of, altitude = metres_from(place), place.altitude_relative_m
-        min_distance, nearest, previous_offset = math.inf, self._points[0], None
+        offset_of = metres_from(place)
+        altitude = place.altitude_relative_m
+        min_distance = math.inf
+        nearest = self._points[0]
+        previous_offset = None
         for point in self:
             up = 0.0 if altitude is None else point.altitude_m - altitude
             offset = (*offset_of(point), up)
@@ -279,7 +283,8 @@ class Track(Sequence[TrackPoint]):
             # The offsets are relative to `place`.
             distance = _distance_of_origin(offset if previous_offset is None else previous_offset, offset)
             if distance < min_distance:
-                min_distance, nearest = distance, point
+                min_distance = distance
+                nearest = point
             previous_offset = offset
         return min_distance, nearest
 
@@ -332,7 +337,8 @@ def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
 
     Return (infinity, 0) if the two vehicles never ran at the same time.
     """
-    first_home_m, second_home_m = first.home.altitude_amsl_m or 0.0, second.home.altitude_amsl_m or 0.0
+    first_home_m = first.home.altitude_amsl_m or 0.0
+    second_home_m = second.home.altitude_amsl_m or 0.0
     second_path = [
         (point.time_s, (north, east, up + second_home_m))
         for point, (north, east, up) in zip(second, second.local(first.home), strict=True)
@@ -346,9 +352,8 @@ def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
         if has_not_started or has_ended:
             continue
         first_place = (north, east, up + first_home_m)
-        second_place = _interpolated(
-            second_path[index - 1], second_path[min(index, len(second_path) - 1)], point.time_s
-        )
+        after = second_path[min(index, len(second_path) - 1)]
+        second_place = _interpolated(second_path[index - 1], after, point.time_s)
         closest = min(closest, (math.dist(first_place, second_place), point.time_s))
     return closest
 
@@ -359,7 +364,8 @@ _TimedPlace = tuple[float, tuple[float, float, float]]
 
 def _interpolated(before: _TimedPlace, after: _TimedPlace, time_s: float) -> tuple[float, float, float]:
     """Return the place at a time between the times of two recorded places."""
-    (start_s, start), (end_s, end) = before, after
+    start_s, start = before
+    end_s, end = after
     share = (time_s - start_s) / (end_s - start_s) if end_s > start_s else 0.0
     north, east, up = (from_ + share * (to - from_) for from_, to in zip(start, end, strict=True))
     return north, east, up

@@ -43,7 +43,7 @@ class TrackFailure:
 
     point: TrackPoint
     circle: tuple[Position, float] | None = None
-    """The allowed area of the assertion: its centre, and its radius in metres. None without such an area."""
+    """The allowed area of the assertion: its centre, and its radius in metres. None if the assertion has no circle."""
     polygon: Sequence[Position] | None = None
     altitude_m: float | None = None
     """Altitude above home."""
@@ -54,7 +54,8 @@ def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[flo
 
     The metres are measured on the tangent plane of the earth's ellipsoid at ``origin``.
     """
-    latitude, longitude = origin.latitude_deg, origin.longitude_deg
+    latitude = origin.latitude_deg
+    longitude = origin.longitude_deg
     # Metres per degree, from the length of a hundredth of a degree around the origin.
     per_latitude = geo.distance_m(latitude - 0.005, longitude, latitude + 0.005, longitude) * 100
     per_longitude = geo.distance_m(latitude, longitude - 0.005, latitude, longitude + 0.005) * 100

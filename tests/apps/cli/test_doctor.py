@@ -34,7 +34,12 @@ posix_only = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-termina
     [
         ([], b"", 3, "no bytes were received"),
         ([], bytes(range(200)) * 3, 3, "but no MAVLink frame: wrong baud rate, or another protocol?"),
-        ([(1, 1, HEARTBEAT)], b"", 0, "`aerokit status` shows what it lacks, to arm or only to fly by itself"),
+        (
+            [(1, 1, HEARTBEAT)],
+            b"",
+            0,
+            "`aerokit status` shows what is missing before the vehicle can arm or fly by itself",
+        ),
         ([(1, 1, HEARTBEAT)], b"console> " * 20, 1, "bytes are not MAVLink"),
         ([(254, 190, GROUND_STATION)], b"", 3, "they seem to be an echo of what this program sends"),
         (
@@ -131,7 +136,7 @@ def test_doctor_signed_frames_without_key_is_problem(capsys: pytest.CaptureFixtu
     encoder.signing = Signing(SigningKey.from_passphrase("secret"))
     code = doctor_of_senders(encoder)
     assert code == 1
-    assert "1/1 signs its frames, but no key is given" in capsys.readouterr().out
+    assert "frames from 1/1 are signed, but no key is given" in capsys.readouterr().out
 
 
 def test_doctor_wrong_signing_key_is_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -240,9 +240,7 @@ def test_fly_not_ready_prints_no_empty_list(capsys: pytest.CaptureFixture[str]) 
     [
         ("gps_lost@15", "end of the recording: in LAND, disarmed, 0.0 m above home"),
         exhaustive(pytest.param("rc_lost@25", "end of the recording: in RTL, disarmed, 0.0 m above home")),
-        exhaustive(
-            pytest.param("silent@25", "the recording ends with the vehicle armed, because it was silent for 10 s")
-        ),
+        exhaustive(pytest.param("silent@25", "the recording ends after 10 s of silence; the vehicle was armed")),
     ],
 )
 def test_failed_flight_is_recorded_to_its_end(fault: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:

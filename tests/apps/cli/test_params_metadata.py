@@ -40,7 +40,7 @@ def test_set_outside_range_is_refused(value: str, metadata: str, capsys: pytest.
     printed = capsys.readouterr()
     assert printed.out == ""
     assert value.partition("=")[0] in printed.err
-    assert "nothing was set; --force sets such values too" in printed.err
+    assert "nothing was set; --force sets these values nevertheless" in printed.err
 
 
 def test_set_outside_range_with_force_is_set(metadata: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -439,7 +439,7 @@ async def test_parameter_outside_metadata_is_not_sent(name: str, body: object, t
 async def test_parameter_outside_metadata_needs_force() -> None:
     async with open_stage(metadata=METADATA) as stage:
         refused = await set_parameter(stage, "RTL_ALT", {"value": 20})
-        assert refused.json()["detail"].endswith('nothing was set; "force": true sets such values too')
+        assert refused.json()["detail"].endswith('nothing was set; "force": true sets these values nevertheless')
         assert (await set_parameter(stage, "RTL_ALT", {"value": 30})).status_code == 200
         assert stage.flight.copter.parameters["RTL_ALT"] == 30
         assert (await set_parameter(stage, "RTL_ALT", {"value": 20, "force": True})).status_code == 200

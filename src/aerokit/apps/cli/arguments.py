@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal import geo
-from aerokit.apps.cli.completion import assignments, offer
+from aerokit.apps.cli.completion import assignments, set_completions
 from aerokit.apps.cli.completion import kinds as kind_names
 from aerokit.apps.cli.misplaced import is_address, misplaced_file
 from aerokit.apps.cli.output import suggestion
@@ -36,15 +36,16 @@ def is_address_template(address: str) -> bool:
 def expand_address(address: str, number: int, system_id: int) -> str:
     """Fill in the placeholders of an address template for one vehicle.
 
-    ``{n}`` is the number of the vehicle, from 0, and ``{id}`` is its system id. ``{5760+10n}`` computes a port from
-    such a value.
+    ``{n}`` is the number of the vehicle, from 0, and ``{id}`` is its system id. A placeholder can have a factor and a
+    summand: ``{5760+10n}`` is 5760, 5770, 5780 …
     """
 
-    def value(match: re.Match[str]) -> str:
-        start, factor, name = match.groups()
-        return str(int(start or 0) + int(factor or 1) * (number if name == "n" else system_id))
+    def expand(match: re.Match[str]) -> str:
+        summand, factor, name = match.groups(default="")
+        value = number if name == "n" else system_id
+        return str(int(summand or 0) + int(factor or 1) * value)
 
-    return _TEMPLATE_FIELD.sub(value, address)
+    return _TEMPLATE_FIELD.sub(expand, address)
 
 
 def address(text: str) -> str:
@@ -115,6 +116,8 @@ def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     if name == "rc_lost":
         at_s = max(at_s, TRANSMITTER_ON_S)
     if name in _SHARE_FAULTS:
+        if not value:
+            raise ArgumentTypeError(f"{name} needs the share of frames to lose: {name}=0.2")
         return name, number(0, 1)(value), at_s
     if name == "prearm_failures":
         if not value:
@@ -130,8 +133,8 @@ def wind(text: str) -> tuple[float, ...]:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
         values = ()
-    gusts = values[2:]  # empty, or one value
-    is_in_range = all(abs(value) <= _MAX_WIND_M_S for value in values) and all(gust >= 0 for gust in gusts)
+    has_gusts = len(values) == 3
+    is_in_range = all(abs(value) <= _MAX_WIND_M_S for value in values) and not (has_gusts and values[-1] < 0)
     if len(values) not in (2, 3) or not is_in_range:
         raise ArgumentTypeError(
             f"{text!r} is not NORTH,EAST or NORTH,EAST,GUSTS with numbers in m/s up to {_MAX_WIND_M_S:g}"
@@ -172,7 +175,7 @@ def assignment(text: str) -> tuple[str, int | float]:
     try:
         number = parse_number(value)
     except ValueError:
-        raise ArgumentTypeError(f"{text!r} is not NAME=VALUE with a finite number") from None
+        raise ArgumentTypeError(f"the value in {text!r} is not a finite number; expected NAME=VALUE") from None
     try:
         checked_value(check_name(name), number, ParameterType.REAL32)
     except InvalidArgument as error:
@@ -212,7 +215,7 @@ def log_file(text: str) -> str:
     if is_address(text):
         raise ArgumentTypeError(f"{text!r} is an address; the recording must follow the address: ADDRESS flight.tlog")
     if not text.lower().endswith(".tlog"):
-        raise ArgumentTypeError(f"{text!r} does not end in .tlog")
+        raise ArgumentTypeError(f"{text!r} is not a name for a recording, because it does not end in .tlog")
     return writable_file(text)
 
 
@@ -229,7 +232,7 @@ def add_vehicle_kind(command: argparse.ArgumentParser, kinds: str) -> None:
     kind = command.add_argument(
         "--vehicle", type=vehicle_kind, default="copter", metavar="KIND", help=f"simulated vehicle: {kinds}"
     )
-    offer(kind, kind_names)
+    set_completions(kind, kind_names)
 
 
 def add_baud(command: argparse._ActionsContainer) -> None:
@@ -259,7 +262,7 @@ def add_faults(command: argparse._ActionsContainer) -> None:
         help="fault of every simulated vehicle, from the start or after S simulated seconds (repeatable):"
         f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
     )
-    offer(faults, lambda: FAULTS)
+    set_completions(faults, lambda: FAULTS)
 
 
 def add_conditions(command: argparse._ActionsContainer) -> None:
@@ -273,7 +276,7 @@ def add_conditions(command: argparse._ActionsContainer) -> None:
         metavar="NAME=VALUE",
         help="parameter value instead of its default (repeatable): MNT1_TYPE=1 gives the copter's autopilot a gimbal",
     )
-    offer(parameters, assignments)
+    set_completions(parameters, assignments)
     command.add_argument(
         "--wind",
         type=wind,
@@ -288,9 +291,11 @@ def conditions(options: argparse.Namespace) -> dict[str, Any]:
     """Return the values of the options of `add_conditions`, as arguments of a simulated vehicle."""
     from aerokit.sim import SimulatedWind
 
-    optional = {
-        "battery_percent": options.battery,
-        "wind": None if options.wind is None else SimulatedWind(*options.wind),
-        "parameters": dict(options.parameters) or None,
-    }
-    return {name: value for name, value in optional.items() if value is not None}
+    arguments: dict[str, Any] = {}
+    if options.battery is not None:
+        arguments["battery_percent"] = options.battery
+    if options.wind is not None:
+        arguments["wind"] = SimulatedWind(*options.wind)
+    if options.parameters:
+        arguments["parameters"] = dict(options.parameters)
+    return arguments

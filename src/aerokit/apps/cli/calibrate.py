@@ -115,7 +115,8 @@ def _calibration(vehicle: Vehicle, sensor: str) -> Calibration:
 
 async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
     """Show the steps of a calibration until it ends. Ctrl-C cancels the calibration on the vehicle."""
-    scope, display = anyio.CancelScope(), Display(options)
+    display = Display(options)
+    scope = anyio.CancelScope()
     with on_interrupt(scope.cancel):
         with scope:
             async for step in calibration:
@@ -124,6 +125,7 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
                     scope.cancel()
                     await anyio.lowlevel.checkpoint()  # a cancellation takes effect here, before the next step
             return DONE
+        # The scope was cancelled, so the calibration has not ended on the vehicle.
         return await _cancel(options, calibration)
 
 
@@ -179,7 +181,8 @@ def lines_of(step: CalibrationStep) -> list[str]:
         view = "seen from behind" if step.pose in _FROM_BEHIND else "seen from the right side"
         next_poses = ", ".join(pose.value for pose in step.remaining if pose is not step.pose)
         lines = ["", f"  {step.pose.value.upper()} ({view})", *PICTURES[step.pose].strip("\n").splitlines(), _GROUND]
-        lines += [f"  then: {next_poses}"] if next_poses else []
+        if next_poses:
+            lines.append(f"  then: {next_poses}")
     return [*lines, f"  {step.instruction[:76]}"]
 
 

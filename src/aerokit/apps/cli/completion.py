@@ -37,18 +37,18 @@ async def run_completion(options: argparse.Namespace) -> int:
     return DONE
 
 
-def offer(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:
+def set_completions(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:
     """Set the values that the shell offers for an argument. argcomplete filters them by the typed characters."""
     setattr(action, "completer", lambda **_: list(values()))  # noqa: B010 - not an attribute of argparse.Action
 
 
 def addresses() -> list[str]:
     default = os.environ.get("AEROKIT_ADDRESS", "").strip()
-    return [
-        *([default] if default else []),
-        *_COMMON_ADDRESSES,
-        *(path for pattern in _DEVICE_PATTERNS for path in sorted(glob(pattern))),
-    ]
+    offered = [default] if default else []
+    offered += _COMMON_ADDRESSES
+    for pattern in _DEVICE_PATTERNS:
+        offered += sorted(glob(pattern))
+    return offered
 
 
 def assignments() -> list[str]:
@@ -65,7 +65,7 @@ def parameter_names(autopilot: str | None = None) -> list[str]:
     """Return the sorted parameter names of the simulated vehicles of "ArduPilot" or "PX4", by default of both."""
     paths: list[str] = []
     for name, paths_of_autopilot in _PARAMETER_TABLES.items():
-        if autopilot in (name, None):
+        if autopilot is None or autopilot == name:
             paths += paths_of_autopilot
     names = set()
     for path in paths:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.apps.cli.arguments import add_baud, address, number, system_id
-from aerokit.apps.cli.completion import addresses, offer
+from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.output import DONE, add_json, emit_done
 from aerokit.apps.cli.terminal import on_interrupt, waiting
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID
@@ -83,7 +83,8 @@ def key_file(path: str) -> SigningKey:
 
 def signing_of(options: argparse.Namespace) -> Signing | None:
     """Return the signing for a connection, from ``--signing-key`` or the environment; None without a key."""
-    key, text = options.signing_key, os.environ.get(SIGNING_KEY_VARIABLE, "")
+    key: SigningKey | None = options.signing_key
+    text = os.environ.get(SIGNING_KEY_VARIABLE, "")
     if key is None and not text.strip():
         return None
     from aerokit.mavlink.signing import Signing, SigningKey
@@ -97,7 +98,7 @@ def default_address() -> str:
 
 
 def add_address(
-    command: argparse._ActionsContainer, name: str = "address", *, what: str = "", default: str | None = None
+    command: argparse._ActionsContainer, name: str = "address", *, what: str = "", default_text: str | None = None
 ) -> None:
     """Add the address, as an argument or an option, and ``--baud``.
 
@@ -105,20 +106,23 @@ def add_address(
         command: the parser or group.
         name: name of the argument; with leading dashes, name of the option.
         what: text of the help before the examples.
-        default: description of the default in the help; None if the usual default address is used.
+        default_text: what the command does without an address, for the help; None if it uses the default address.
     """
     keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
-    usual_default = f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
+    if default_text is None:
+        default = default_address()
+        default_text = f"${ADDRESS_VARIABLE}, or {_DEFAULT_ADDRESS}"
+    else:
+        default = None
     argument = command.add_argument(
         name,
         type=address,
-        default=default_address() if default is None else None,
+        default=default,
         metavar="ADDRESS",
-        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 …"
-        f" (default: {default or usual_default})",
+        help=f"{what}udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … (default: {default_text})",
         **keywords,
     )
-    offer(argument, addresses)
+    set_completions(argument, addresses)
     add_baud(command)
 
 
@@ -179,7 +183,7 @@ def command_action(
     name: str,
     text: str,
     action: Callable[[Any, argparse.Namespace], Awaitable[object]],
-    target: Callable[[argparse.Namespace], AbstractAsyncContextManager[Any]] | None = None,
+    open_target: Callable[[argparse.Namespace], AbstractAsyncContextManager[Any]] | None = None,
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
     """Return a ``run`` function that performs one action and prints one line.
 
@@ -187,12 +191,13 @@ def command_action(
         name: the name of the action in the ``done`` record; may contain names of options in braces.
         text: the line that is printed without ``--json``; may also contain names of options in braces.
         action: called with the target and the options.
-        target: function that opens the target of the action; None: connect to the vehicle.
+        open_target: function that opens the target of the action; None: connect to the vehicle.
     """
 
     async def run(options: argparse.Namespace) -> int:
-        async with target(options) if target else connected(options, changes=True) as opened_target:
-            await action(opened_target, options)
+        opening = connected(options, changes=True) if open_target is None else open_target(options)
+        async with opening as target:
+            await action(target, options)
         emit_done(options, name.format(**vars(options)), text.format(**vars(options)))
         return DONE
 
@@ -238,9 +243,9 @@ async def connect_to(
         yield vehicle
 
 
-def add_link(command: argparse.ArgumentParser, *, default: str | None = None) -> None:
-    """Add the address with ``--baud``, ``--signing-key`` and ``--json``; ``default`` is as in :func:`add_address`."""
-    add_address(command, default=default)
+def add_link(command: argparse.ArgumentParser, *, default_text: str | None = None) -> None:
+    """Add the address, ``--baud``, ``--signing-key`` and ``--json``; ``default_text`` is as in :func:`add_address`."""
+    add_address(command, default_text=default_text)
     add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
     add_json(command)
 
@@ -277,8 +282,7 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
     """
     from aerokit.connection.opening import explain_no_vehicle
 
-    async with AsyncExitStack() as stack:
-        await stack.enter_async_context(waiting(options, connection.link.address, patience_s))
+    async with waiting(options, connection.link.address, patience_s):
         with anyio.move_on_after(patience_s):
             async for _ in connection.vehicles():
                 return
@@ -299,7 +303,7 @@ def _simulator_hint(connection: Connection) -> str:
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:
     """Wait for Ctrl-C or for ``seconds``. Return True after Ctrl-C.
 
-    If the connection ends, raises its error. The wait also ends when the background task ``work`` ends.
+    Raise the connection's error if the connection ends first. The wait also ends when the task ``work`` ends.
     """
     ended = asyncio.Event()
     interrupted = False

@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import add_baud, add_faults, add_vehicle_kind, address, number, system_id, writable_file
-from aerokit.apps.cli.completion import addresses, offer
+from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, connect_to, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
@@ -36,7 +36,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="vehicle to fly: udpin:0.0.0.0:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600 … (default: a simulated one)",
     )
-    offer(address_option, addresses)
+    set_completions(address_option, addresses)
     add_vehicle_kind(command, "copter or plane with ArduPilot, px4 or px4_plane (default: copter)")
     add_faults(command)
     command.add_argument(
@@ -89,7 +89,7 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
         vehicle = await stack.enter_async_context(
             connect_to(options, address, changes=is_real, record=options.record, signing=signing)
         )
-        report = FlightReport(vehicle, options, 1.0 if is_real else options.speedup)
+        report = FlightReport(vehicle, options, speedup=1.0 if is_real else options.speedup)
         async with report.running():
             flight = _SquareFlight(vehicle, report, interrupts)
             code = await flight.fly_square(options.altitude, options.side)
@@ -128,7 +128,8 @@ class _SquareFlight(SupervisedFlight):
 
     async def fly_square(self, altitude_m: float, side_m: float) -> int:
         """Fly the square and return the exit code. Lands in any case."""
-        self._altitude_m, self._side_m = altitude_m, side_m
+        self._altitude_m = altitude_m
+        self._side_m = side_m
         try:
             return await self.fly()
         except AerokitError:  # the error is already printed

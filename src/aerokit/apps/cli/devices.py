@@ -63,9 +63,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     zoom = add_action(actions, "zoom", zoom_to, "Zoom.")
     zoom.add_argument("percent", type=number(0, 100), metavar="PERCENT", help="of the zoom range, 0 to 100")
     streams = add_action(actions, "streams", _streams, "List the video streams with their addresses.")
-    erase = add_action(actions, "format", _format, "Format the storage. All pictures are deleted.")
-    erase.add_argument("--yes", action="store_true", help="do not ask")
-    for action in (info, photo, video, mode, zoom, streams, erase):
+    format_storage = add_action(actions, "format", _format, "Format the storage. All pictures are deleted.")
+    format_storage.add_argument("--yes", action="store_true", help="do not ask")
+    for action in (info, photo, video, mode, zoom, streams, format_storage):
         action.add_argument(
             "--camera",
             type=int,
@@ -112,12 +112,14 @@ async def _photo(options: argparse.Namespace) -> int:
 
 async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
     """Print a picture's data and, with ``--to``, download it. Return False if taking or downloading it failed."""
-    position, folder = capture.place, options.to
-    place = "position unknown" if position is None else f"{position.latitude_deg:.7f} {position.longitude_deg:.7f}"
-    text = f"{capture.index:>5}  {place}  {_printable_text(capture.file_url)}".rstrip()
+    position = capture.place
+    place_text = "position unknown"
+    if position is not None:
+        place_text = f"{position.latitude_deg:.7f} {position.longitude_deg:.7f}"
+    text = f"{capture.index:>5}  {place_text}  {_printable_text(capture.file_url)}".rstrip()
     record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
     emit(options, "picture", record, text)
-    if folder is None or not capture.success:
+    if options.to is None or not capture.success:
         has_failed = capture.success is False  # None: the camera has not reported the result
         return not has_failed
     name = _file_name(capture)
@@ -126,7 +128,7 @@ async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -
         emit(options, "fetched_picture", not_fetched, "       not downloaded: unsafe file name in its address")
         return False
     content = await camera.read_picture(capture)
-    target = _write_new(folder, name, content)
+    target = _write_new(options.to, name, content)
     fetched = {"index": capture.index, "file": target, "bytes": len(content)}
     emit(options, "fetched_picture", fetched, f"       {target}")
     return True
@@ -140,7 +142,7 @@ def _printable_text(text: str) -> str:
 def _file_name(capture: Capture) -> str | None:
     """Return the file name ``INDEX-NAME`` for a picture, with the last part of its address as NAME.
 
-    None if this is not a portable file name.
+    Return None if this is not a portable file name.
     """
     name = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
     is_portable = name.isprintable() and not set(name) & set('/\\:*?"<>|') and name.strip(" .") == name
@@ -150,7 +152,8 @@ def _file_name(capture: Capture) -> str | None:
 def _write_new(folder: Path, name: str, content: bytes) -> Path:
     """Write data to a new file. If a file with this name exists, a number is appended to the name."""
     stem, dot, ending = name.rpartition(".")
-    number, target = 1, folder / name
+    target = folder / name
+    number = 1
     while True:
         with suppress(FileExistsError), target.open("xb") as file:
             file.write(content)
@@ -186,8 +189,8 @@ async def _format(options: argparse.Namespace) -> int:
 def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
     actions = command.add_subparsers(required=True, metavar="ACTION", title="actions")
     info = add_action(actions, "info", _gimbal_info, "Show model, limits and attitude.")
-    run = command_action("gimbal point", "pointing at pitch {pitch:g}°, yaw {yaw:g}°", _point, _gimbal)
-    point = add_action(actions, "point", run, "Point the gimbal, and hold the direction.")
+    run_point = command_action("gimbal point", "pointing at pitch {pitch:g}°, yaw {yaw:g}°", _point, _gimbal)
+    point = add_action(actions, "point", run_point, "Point the gimbal, and hold the direction.")
     point.add_argument(
         "pitch", type=number(-360, 360), metavar="PITCH", help="degrees from the horizon: -90 is straight down"
     )
@@ -200,20 +203,22 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
         default="vehicle",
         help="yaw from north, or from the nose (default: vehicle)",
     )
-    run = command_action("gimbal look", "looking at {latitude:g} {longitude:g} {altitude:g} m", _look_at, _gimbal)
-    look = add_action(actions, "look", run, "Keep the gimbal pointed at a position.")
+    run_look = command_action("gimbal look", "looking at {latitude:g} {longitude:g} {altitude:g} m", _look_at, _gimbal)
+    look = add_action(actions, "look", run_look, "Keep the gimbal pointed at a position.")
     look.add_argument("latitude", type=number(-90, 90), metavar="LATITUDE", help="degrees")
     look.add_argument("longitude", type=number(-180, 180), metavar="LONGITUDE", help="degrees")
     look.add_argument("altitude", type=number(-500, 10_000), metavar="ALTITUDE", help="metres above home")
-    run = command_action(
+    run_neutral = command_action(
         "gimbal neutral",
         "in neutral position",
         lambda gimbal, options: gimbal.neutral(timeout=options.patience),
         _gimbal,
     )
-    neutral = add_action(actions, "neutral", run, "Turn the gimbal to its neutral position.")
-    run = command_action("gimbal release", "control returned to the pilot", lambda gimbal, _: gimbal.release(), _gimbal)
-    release = add_action(actions, "release", run, "Return control of the gimbal to the pilot.")
+    neutral = add_action(actions, "neutral", run_neutral, "Turn the gimbal to its neutral position.")
+    run_release = command_action(
+        "gimbal release", "control returned to the pilot", lambda gimbal, _: gimbal.release(), _gimbal
+    )
+    release = add_action(actions, "release", run_release, "Return control of the gimbal to the pilot.")
     for action in (info, point, look, neutral, release):
         action.add_argument(
             "--gimbal",

@@ -147,7 +147,7 @@ def check_network_port(port: int, meaning: str, *, udp: bool) -> Finding:
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_doctor)
-    add_link(command, default="default: check this computer")
+    add_link(command, default_text="check this computer")
     add_seconds(command, "listen for S seconds (default: 6)", 6.0)
 
 
@@ -189,7 +189,8 @@ async def _check_link(options: argparse.Namespace, report: Callable[[Finding], N
 
     parsed = parse_address(options.address) if isinstance(options.address, str) else None
     if parsed is not None and parsed.kind == "serial":
-        baud = await _find_baud_rate(options, parsed.device, parsed.baud or options.baud, report)
+        configured_baud = parsed.baud or options.baud
+        baud = await _find_baud_rate(options, parsed.device, configured_baud, report)
         options.address = str(LinkAddress("serial", device=parsed.device, baud=baud, options=parsed.options))
     try:
         async with opened(options) as connection:
@@ -209,30 +210,30 @@ async def _check_link(options: argparse.Namespace, report: Callable[[Finding], N
 
 
 async def _find_baud_rate(
-    options: argparse.Namespace, device: str, baud: int, report: Callable[[Finding], None]
+    options: argparse.Namespace, device: str, configured_baud: int, report: Callable[[Finding], None]
 ) -> int:
-    """Return the baud rate at which MAVLink is received; ``baud`` if it is received at none."""
+    """Return the baud rate at which MAVLink is received; ``configured_baud`` if it is received at none."""
     from aerokit.apps.cli.doctor_link import BAUD_RATES, listen_at
 
-    port = check_serial_port(device)
-    if port.level != "ok":
-        report(port)
+    port_finding = check_serial_port(device)
+    if port_finding.level != "ok":
+        report(port_finding)
     probes = []
-    for rate in dict.fromkeys((baud, *BAUD_RATES)):
+    for rate in dict.fromkeys((configured_baud, *BAUD_RATES)):
         async with waiting(options, f"{device} at {rate}", BAUD_RATE_TIMEOUT_S, "MAVLink"):
             try:
                 probe = await listen_at(device, rate, BAUD_RATE_TIMEOUT_S)
             except AerokitError:  # reported later, when the link is opened
-                return baud
+                return configured_baud
         if probe.is_mavlink:
-            report(_baud_finding(device, rate, baud))
+            report(_baud_finding(device, rate, configured_baud))
             return rate
         probes.append(probe)
         if probe.bytes == 0:
             break  # nothing was received, so the other rates would receive nothing either
     rates = ", ".join(f"{probe.baud}: {probe.bytes} bytes" for probe in probes)
     report(Finding("note", "baud rate", f"no MAVLink on {device} at any rate tried ({rates})"))
-    return baud
+    return configured_baud
 
 
 def _baud_finding(device: str, rate: int, configured: int) -> Finding:

@@ -41,6 +41,7 @@ _MIN_FRAMES_FOR_LOSS = 20
 _SERIAL_LOSS_ADVICE = (
     "check antennas and distance, whether the baud rate is too low for the traffic, and RTS/CTS flow control"
 )
+_STATUS_ADVICE = "`aerokit status` shows what is missing before the vehicle can arm or fly by itself"
 _NETWORK_LOSS_ADVICE = "check the network (Wi-Fi, radio), and whether the link is too slow for the traffic"
 
 
@@ -124,8 +125,8 @@ class LinkExamination:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._own_ids = (connection.source_system, connection.source_component)
-        # The keys are pairs of system and component id. Several `_types_and_autopilots` of a pair show that several
-        # senders use the same ids.
+        # The keys are pairs of system and component id. If a pair has several entries in `_types_and_autopilots`,
+        # several senders use these ids.
         self._versions: dict[tuple[int, int], set[int]] = {}
         self._signed: Counter[tuple[int, int]] = Counter()
         self._frames: Counter[tuple[int, int]] = Counter()
@@ -159,7 +160,7 @@ class LinkExamination:
         yield from self._ids()
         yield from self._senders()
         yield from self._signing()
-        yield from self._unknown()
+        yield from self._undecoded()
         yield from self._loss()
 
     @property
@@ -192,6 +193,7 @@ class LinkExamination:
         yield Finding("problem", "vehicle", text, advice)
 
     def _ids(self) -> Iterator[Finding]:
+        """Yield problems with system and component ids: ids with several senders, ids of programs, and system id 0."""
         ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
         for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
             yield Finding(
@@ -245,12 +247,7 @@ class LinkExamination:
                     " (PX4); ArduPilot sends version 1 until it receives version 2",
                 )
             else:
-                advice = (
-                    "`aerokit status` shows what it lacks, to arm or only to fly by itself"
-                    if is_autopilot(heartbeat)
-                    else ""
-                )
-                yield Finding("ok", "sender", text, advice)
+                yield Finding("ok", "sender", text, _STATUS_ADVICE if is_autopilot(heartbeat) else "")
 
     def _signing(self) -> Iterator[Finding]:
         signing = self._connection.signing
@@ -263,11 +260,12 @@ class LinkExamination:
             yield Finding(
                 "problem",
                 "signing",
-                f"{names} signs its frames, but no key is given: it will ignore this computer",
+                f"frames from {names} are signed, but no key is given: their senders will ignore this computer",
                 "give the key: --signing-key FILE, or the variable AEROKIT_SIGNING_KEY",
             )
 
-    def _unknown(self) -> Iterator[Finding]:
+    def _undecoded(self) -> Iterator[Finding]:
+        """Yield findings on messages of unknown dialects, and on bytes that are not MAVLink."""
         unknown_messages: Counter[int] = Counter()
         for statistics in self._connection.statistics():
             unknown_messages.update(statistics.unknown_messages)

@@ -44,7 +44,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 async def _convert(options: argparse.Namespace) -> int:
     # Without a suffix, OUT is a folder of tables.
-    module = _REQUIRED_MODULES.get(options.out.suffix.lower() or f".{options.tables}")
+    suffix = options.out.suffix.lower() or f".{options.tables}"
+    module = _REQUIRED_MODULES.get(suffix)
     if module is not None:
         import_extra(module, "convert")
     if options.log.suffix.lower() == ".ulg":
@@ -59,14 +60,12 @@ async def _convert(options: argparse.Namespace) -> int:
         result = convert(options.log, options.out, tables=options.tables, force=options.force, on_progress=on_progress)
     for note in result.notes:
         print(printable(f"aerokit: {options.log}: {note}"), file=sys.stderr)
-    emit(
-        options,
-        "conversion",
-        {**result.to_dict(), "log": options.log},
-        f"{result.target}: {_counted_noun(result.written, _WRITTEN_NOUNS.get(result.target.suffix.lower(), 'row'))}"
-        f" from {_counted_noun(result.entries, 'entry')}, {_size(result.bytes)},"
-        f" {_utc_text(result.begins_at)} to {_utc_text(result.ends_at)} UTC",
+    noun = _WRITTEN_NOUNS.get(result.target.suffix.lower(), "row")
+    text = (
+        f"{result.target}: {_counted_noun(result.written, noun)} from {_counted_noun(result.entries, 'entry')},"
+        f" {_size(result.bytes)}, {_utc_text(result.begins_at)} to {_utc_text(result.ends_at)} UTC"
     )
+    emit(options, "conversion", {**result.to_dict(), "log": options.log}, text)
     return DONE
 
 
@@ -131,9 +130,10 @@ async def _report(options: argparse.Namespace) -> int:
 
 def _report_text(report: Report) -> str:
     lines = []
-    for number, (sentences, failsafes) in enumerate(zip(report.summaries, report.failsafes, strict=True)):
+    # A report covers one log, or two logs called A and B.
+    for letter, sentences, failsafes in zip("AB", report.summaries, report.failsafes, strict=False):
         if len(report.summaries) > 1:
-            lines.append(f"{'AB'[number]}:")
+            lines.append(f"{letter}:")
         lines += sentences
         for failsafe in failsafes:
             lines.append(f"{clock(failsafe.time_s)} {failsafe.title}: {failsafe.reaction}")

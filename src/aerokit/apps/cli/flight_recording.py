@@ -43,45 +43,53 @@ async def record_to_end(
 ) -> None:
     """Stay connected to an armed vehicle until it is disarmed or silent for 10 s, or until Ctrl-C.
 
-    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion, in
-    the seconds of a simulation with this ``speedup``.
+    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion.
+    In a simulation, these are simulated seconds, which pass ``speedup`` times as fast.
     """
     if not vehicle.is_armed or not vehicle.connection.is_open:
         return
     if vehicle.heartbeat_age >= MAX_SILENCE_S:
-        print_line(f"the recording ends with the vehicle armed, because it was silent for {MAX_SILENCE_S:g} s")
+        print_line(f"the recording ends after {MAX_SILENCE_S:g} s of silence; the vehicle was armed")
         return
     print_line(
         f"still armed: the recording goes on until the vehicle disarms, lies still for {_MAX_STILL_S:g} s,"
         f" is silent for {MAX_SILENCE_S:g} s, or Ctrl-C"
     )
 
-    still = _StillNearGround(vehicle, _MAX_STILL_S / speedup)
+    stillness = _StillnessNearGround(vehicle, _MAX_STILL_S / speedup)
 
     async def wait() -> int:
         while vehicle.is_armed and vehicle.connection.is_open and vehicle.heartbeat_age < MAX_SILENCE_S:
-            if still.has_lasted():
+            stillness.update()
+            if stillness.has_lasted:
                 break
             await anyio.sleep(_POLL_INTERVAL_S)
-        return DONE
+        return DONE  # `interrupts.run` returns None after an interrupt only
 
     reason = "interrupted" if await interrupts.run(wait) is None else "end of the recording"
     print_line(f"{reason}: {vehicle.describe_now()}")
 
 
-class _StillNearGround:
+class _StillnessNearGround:
     """Detects that a vehicle has not moved for a time at the height of its home or a little above."""
 
-    def __init__(self, vehicle: Vehicle, max_still_s: float) -> None:
-        self._vehicle, self._max_still_s = vehicle, max_still_s
-        self._position, self._still_since = vehicle.position.latest, vehicle.connection.now()
+    def __init__(self, vehicle: Vehicle, min_duration_s: float) -> None:
+        self._vehicle = vehicle
+        self._min_duration_s = min_duration_s
+        self._still_at = vehicle.position.latest
+        self._still_since = vehicle.connection.now()
+        self.has_lasted: bool = False
+        """True if the vehicle had been still for the whole time at the last `update`."""
 
-    def has_lasted(self) -> bool:
-        """Return True if the vehicle has been still for the whole time. Must be called regularly."""
-        here, now = self._vehicle.position.latest, self._vehicle.connection.now()
-        if here is None:
-            return False
-        has_moved = self._position is None or here.distance_to(self._position) > _MAX_DRIFT_M
-        if has_moved or abs(here.altitude_relative_m or 0.0) > _MAX_HEIGHT_M:
-            self._position, self._still_since = here, now
-        return now - self._still_since >= self._max_still_s
+    def update(self) -> None:
+        """Compare the vehicle's position with the one at which it was still. Must be called regularly."""
+        now = self._vehicle.connection.now()
+        position = self._vehicle.position.latest
+        if position is None:
+            return
+        has_moved = self._still_at is None or position.distance_to(self._still_at) > _MAX_DRIFT_M
+        is_high = abs(position.altitude_relative_m or 0.0) > _MAX_HEIGHT_M
+        if has_moved or is_high:
+            self._still_at = position
+            self._still_since = now
+        self.has_lasted = now - self._still_since >= self._min_duration_s

@@ -10,7 +10,7 @@ import anyio
 
 from aerokit import events
 from aerokit.apps.cli.arguments import add_conditions, add_record, conditions, number, vehicle_kind
-from aerokit.apps.cli.completion import kinds, offer
+from aerokit.apps.cli.completion import kinds, set_completions
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.mission import PARTS, add_max_distance, begins_with_take_off, emit_items, read_plan, upload_parts
@@ -54,17 +54,18 @@ class PlanFlight(SupervisedFlight):
         options: argparse.Namespace,
     ) -> None:
         super().__init__(vehicle, report, interrupts, options.on_interrupt)
-        self._plan, self._options = plan, options
-        self.sent: str = _NOTHING_SENT
-        """Words for what was sent to the vehicle before arming, for the message after Ctrl-C."""
+        self._plan = plan
+        self._options = options
+        self.sent_text: str = _NOTHING_SENT
+        """Text about what was sent to the vehicle before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}")
         self._check_vehicle()
-        self.sent = "the upload was not completed, nothing was armed"
+        self.sent_text = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
-        self.sent = "the plan is on the vehicle, nothing was armed"
+        self.sent_text = "the plan is on the vehicle, nothing was armed"
         if self._options.record is not None:
             await record_parameters(vehicle, self._print)
         confirmed_mission = await self._download_mission() if self._needs_confirmation else ()
@@ -99,13 +100,14 @@ class PlanFlight(SupervisedFlight):
 
     def _check_vehicle(self) -> None:
         """Raise an error if the vehicle is armed or cannot fly the mission, or if it cannot do ``--on-interrupt``."""
-        vehicle, interrupt_action = self._vehicle, self._options.on_interrupt
+        vehicle = self._vehicle
+        interrupt_action = self._options.on_interrupt
         self._check_disarmed()
-        possible = [action for action in INTERRUPT_ACTIONS if action == "nothing" or self._has_mode_for(action)]
-        if interrupt_action not in possible:
+        possible_actions = [action for action in INTERRUPT_ACTIONS if action == "nothing" or self._has_mode_for(action)]
+        if interrupt_action not in possible_actions:
             raise NotSupported(
                 f"{vehicle.autopilot.firmware} has no mode for --on-interrupt {interrupt_action}: choose"
-                f" {' or '.join(possible)}; nothing was sent"
+                f" {' or '.join(possible_actions)}; nothing was sent"
             )
         mission = self._plan.mission
         mission.check(home_is_item_0=vehicle.autopilot.home_is_item_0)
@@ -120,7 +122,8 @@ class PlanFlight(SupervisedFlight):
         return mode_for(cast("Purpose", purpose), is_vtol=self._vehicle.is_vtol) is not None
 
     def _warnings(self) -> list[str]:
-        items, warnings = self._plan.mission.items, []
+        items = self._plan.mission.items
+        warnings = []
         first_position = next((item.position for item in items if item.position is not None), None)
         if first_position is not None:
             distance = self._vehicle.distance_to(first_position)
@@ -146,6 +149,7 @@ class PlanFlight(SupervisedFlight):
             self._report.prints_status = True
 
     async def _print_progress(self) -> None:
+        """Print each new mission item. Explain a change of the mode, after which the flight does not end at once."""
         with (
             self._vehicle.subscribe(events.MissionCurrentChanged, events.ModeChanged, capacity=100) as changes,
             suppress(AerokitError),
@@ -163,11 +167,12 @@ class PlanFlight(SupervisedFlight):
 
         Nothing is printed in the first moment, in which the end of the mission may explain the mode.
         """
-        await anyio.sleep(END_GRACE_S / 4)
+        delay_s = END_GRACE_S / 4
+        await anyio.sleep(delay_s)
         vehicle = self._vehicle
         is_unexplained = vehicle.mode_name == mode and not self._is_in_our_mode and not vehicle.mission.explains_mode
         if self._has_started and is_unexplained:
-            seconds = self._report.speedup * END_GRACE_S * 3 / 4
+            seconds = self._report.speedup * (END_GRACE_S - delay_s)
             self._print(f"waiting {seconds:.2g} s for the end of {mode} or a report that the mission has ended")
 
     def _name_of(self, index: int) -> str:
@@ -211,7 +216,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     kind = simulated.add_argument(
         "--vehicle", type=vehicle_kind, metavar="KIND", help="copter, plane, px4 … (default: the plan's vehicle type)"
     )
-    offer(kind, kinds)
+    set_completions(kind, kinds)
     simulated.add_argument(
         "--speedup", type=number(0.1, 100), default=10.0, metavar="X", help="simulation speed factor (default: 10)"
     )
@@ -231,14 +236,15 @@ async def run_fly(options: argparse.Namespace) -> int:
         if items:
             emit_items(options, part, items, "in the file")
     # `_connect_and_fly` appends its flight to `flights`, so that its state is known here after an interrupt.
-    interrupts, flights = InterruptStack(), list[PlanFlight]()
+    flights: list[PlanFlight] = []
+    interrupts = InterruptStack()
     with on_interrupt(interrupts.interrupt):
         code = await interrupts.run(lambda: _connect_and_fly(options, plan, interrupts, flights))
     if code is None:
         code = INTERRUPTED
     if code == INTERRUPTED and not any(flight.armed_by_us for flight in flights):
-        sent = flights[-1].sent if flights else _NOTHING_SENT
-        emit(options, "interrupted", {}, f"interrupted; {sent}")
+        sent_text = flights[-1].sent_text if flights else _NOTHING_SENT
+        emit(options, "interrupted", {}, f"interrupted; {sent_text}")
     return code
 
 
@@ -247,14 +253,14 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
         raise InvalidArgument(f"{options.file} has no mission items, so there is nothing to fly")
     if options.sim and options.connect is not None:
         raise InvalidArgument("--sim and --connect cannot be used together")
-    simulated = {
+    simulation_options = {
         "--vehicle": options.vehicle,
         "--parameter": options.parameters or None,
         "--wind": options.wind,
         "--battery": options.battery,
         "--fault": options.faults or None,
     }
-    for name, value in simulated.items():
+    for name, value in simulation_options.items():
         if value is not None and not options.sim:
             raise InvalidArgument(f"{name} needs --sim")
     if not (options.sim or options.yes or is_interactive()):
@@ -278,24 +284,26 @@ async def _connect_and_fly(
         vehicle = await stack.enter_async_context(
             connect_to(options, link, changes=not options.sim, signing=signing, record=options.record)
         )
-        report = FlightReport(vehicle, options, options.speedup if options.sim else 1.0)
+        report = FlightReport(vehicle, options, speedup=options.speedup if options.sim else 1.0)
+        flight = PlanFlight(vehicle, plan, report, interrupts, options)
+        flights.append(flight)
+        error: AerokitError | None = None
         async with report.running():
-            flights.append(PlanFlight(vehicle, plan, report, interrupts, options))
             try:
-                code = await flights[-1].fly()
+                code = await flight.fly()
                 # The recording of a real vehicle continues until the end of the flight. If a simulated mission ended in
                 # the air, no pilot would land the vehicle, and the recording would not end.
-                is_followed = code == DONE and not options.sim
-                if is_followed and options.record is not None and flights[-1].armed_by_us:
-                    await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
-            except AerokitError:
-                if flights[-1].armed_by_us:
-                    if options.record is not None:
-                        await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
-                    report.print_summary(options.record)
-                raise
-        if flights[-1].armed_by_us:
+                continues_recording = code == DONE and not options.sim
+            except AerokitError as flight_error:  # raised again below, after the summary
+                error = flight_error
+                code = FAILED
+                continues_recording = True
+            if continues_recording and flight.armed_by_us and options.record is not None:
+                await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
+        if flight.armed_by_us:
             report.print_summary(options.record)
+        if error is not None:
+            raise error
     return code
 
 
@@ -309,15 +317,17 @@ async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: Asyn
     kind = options.vehicle or _kind_for(plan)
     positions = [plan.mission.home, *(item.position for item in plan.mission.items)]
     start = next((position for position in positions if position is not None), None)
-    home = HOME
+    latitude_deg, longitude_deg, altitude_m = HOME
     if start is not None:
-        home = (start.latitude_deg, start.longitude_deg, start.altitude_amsl_m or HOME[2])
+        latitude_deg, longitude_deg = start.latitude_deg, start.longitude_deg
+        altitude_m = start.altitude_amsl_m or altitude_m
+    home = (latitude_deg, longitude_deg, altitude_m)
     vehicle = simulated_vehicle(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S, **conditions(options))
     scale_timeouts([vehicle], options.speedup, leave=dict(options.parameters))
     link = await stack.enter_async_context(simulated_link(vehicle, speedup=options.speedup))
     await stack.enter_async_context(faults_begin([vehicle], options))
     record = {"system_ids": [vehicle.system_id], "address": link.address, "speedup": options.speedup}
-    text = f"simulated {kind} at {home[0]:.6f}, {home[1]:.6f}, speed {options.speedup:g}x"
+    text = f"simulated {kind} at {latitude_deg:.6f}, {longitude_deg:.6f}, speed {options.speedup:g}x"
     emit(options, "simulated", record, text)
     return link
 

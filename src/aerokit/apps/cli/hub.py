@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.apps.cli.arguments import add_baud, add_record, address, number
-from aerokit.apps.cli.completion import addresses, offer
+from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, signing_of
 from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, emit, new_recording, suggestion
 from aerokit.apps.cli.terminal import on_interrupt
@@ -35,7 +35,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="tcpin:0.0.0.0:5760, udpout:10.0.0.7:14550, radio=/dev/ttyUSB0,57600 …; options refer to an endpoint by"
         " NAME, or by ADDRESS as written",
     )
-    offer(endpoints, addresses)
+    set_completions(endpoints, addresses)
     _add_names(command, "--read-only", "do not forward messages received there, heartbeats included")
     _add_names(command, "--patient", "if it cannot be opened, start without it and keep trying")
     only = f"send only these messages, at one endpoint or, without @NAME, at all: {_FILTER_EXAMPLE}"
@@ -64,7 +64,8 @@ def _add_filter(command: argparse.ArgumentParser, option: str, read: Callable[[s
 def _named_address(text: str) -> tuple[str, str]:
     """Parse ``[NAME=]ADDRESS`` into the name of an endpoint and its address."""
     match = _NAMED_ADDRESS.fullmatch(text)
-    return (match[1], address(match[2])) if match else (text, address(text))
+    name, endpoint_address = (text, text) if match is None else match.groups()
+    return name, address(endpoint_address)
 
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:
@@ -103,19 +104,15 @@ async def _hub(options: argparse.Namespace) -> int:
             if options.record is not None:
                 hub.record(options.record)
             record = {"endpoints": [endpoint.address for endpoint in hub.endpoints], "file": options.record}
-            emit(
-                options,
-                "hub",
-                record,
-                f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, {_how_long(options)}",
-            )
+            text = f"{len(endpoints)} endpoint{'s' if len(endpoints) > 1 else ''}, {_how_long(options)}"
+            emit(options, "hub", record, text)
             with anyio.move_on_after(options.seconds):
                 while not stop.is_set():
                     with anyio.move_on_after(options.every):
                         await stop.wait()
                     if not stop.is_set():
                         _emit_statistics(options, hub)
-            _emit_statistics(options, hub)
+            _emit_statistics(options, hub)  # of the whole time
     # Without --seconds, Ctrl-C is the normal end of the command.
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
 

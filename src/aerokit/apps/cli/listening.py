@@ -71,6 +71,7 @@ async def run_record(options: argparse.Namespace) -> int:
 
 
 async def _record_link(options: argparse.Namespace) -> int:
+    """Record until the end, print the number of messages, and return the exit code."""
     counts: Counter[tuple[int, int]] = Counter()
 
     def count(frame: Frame, peer: Peer) -> None:
@@ -84,9 +85,10 @@ async def _record_link(options: argparse.Namespace) -> int:
         text = f"recording {connection.link.address} to {options.file} until Ctrl-C"
         emit(options, "recording", {"address": connection.link.address, "file": options.file}, text)
         try:
-            is_interrupted = await _record(connection, options)
+            is_interrupted = await _wait_for_end(connection, options)
         except AerokitError as connection_error:  # raised again below, after the report of the counts
-            error, is_interrupted = connection_error, False
+            error = connection_error
+            is_interrupted = False
         seconds = connection.now() - started_at
     _emit_counts(options, counts, seconds)
     if error is not None:
@@ -97,8 +99,11 @@ async def _record_link(options: argparse.Namespace) -> int:
     return INTERRUPTED if is_interrupted and options.seconds is not None else DONE
 
 
-async def _record(connection: Connection, options: argparse.Namespace) -> bool:
-    """Wait for the end of the recording. Unless ``--as-is``, connect to the vehicles, which requests message rates."""
+async def _wait_for_end(connection: Connection, options: argparse.Namespace) -> bool:
+    """Wait for the end of the recording. Return True after Ctrl-C.
+
+    Without ``--as-is``, connect to the vehicles, which requests message rates.
+    """
     if options.as_is:
         return await await_end(connection, options.seconds)
     from aerokit.vehicle.connect import vehicles_on
@@ -115,7 +120,7 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
         message = STANDARD.get(message_id)
         messages[str(message_id) if message is None else message.NAME] += count
     systems = sorted({system_id for system_id, _ in counts})
-    # If no frame was received, no file was created. A file with this name then is an earlier recording.
+    # If no frame was received, no file was created. A file with this name is then an earlier recording.
     size = os.path.getsize(options.file) if counts else 0
     record = {
         "file": options.file,
@@ -128,7 +133,8 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
     sources = f" from system{'s' if len(systems) > 1 else ''} {', '.join(map(str, systems))}" if systems else ""
     details = ", ".join(f"{name} {count}" for name, count in messages.most_common(5))
     text = f"{options.file}: {sum(counts.values())} frames received{sources} in {seconds:.1f} s, {size} bytes"
-    if set(messages) == {"HEARTBEAT"} and options.as_is:
+    has_only_heartbeats = set(messages) == {"HEARTBEAT"}
+    if has_only_heartbeats and options.as_is:
         details += "; no other messages: without --as-is, position, attitude and other messages are requested"
     emit(options, "recorded", record, f"{text}\n  {details}" if details else f"{text}: nothing was received")
 
@@ -157,8 +163,7 @@ async def run_events(options: argparse.Namespace) -> int:
 async def _print_all(connection: Connection, options: argparse.Namespace) -> None:
     """Print the events of a connection until it ends, with a countdown before the first event."""
     unix_time_at_0 = connection.unix_time() - connection.now()
-    async with AsyncExitStack() as stack:
-        events = stack.enter_context(connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS))
+    with connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS) as events:
         missed = 0
         async with waiting(options, connection.link.address, _COUNTDOWN_S):
             event = await events.get()
@@ -208,13 +213,14 @@ def add_monitor_arguments(command: argparse.ArgumentParser) -> None:
 async def run_monitor(options: argparse.Namespace) -> int:
     """Show the vehicles until the user quits."""
     import_extra("textual", "monitor")
-    from aerokit.apps.monitor.app import run_monitor as run
+    from aerokit.apps.monitor.app import run_monitor as run_app
 
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise InvalidArgument("aerokit monitor needs a terminal, but stdin or stdout is redirected")
     with ExitStack() as stack:
 
         def force_exit_later(signal_number: int) -> None:
+            # Runs in the signal handler, because a blocked event loop would not run it.
             if signal_number == getattr(signal, "SIGHUP", None):
                 _detach_terminal()
             timer = threading.Timer(EXIT_TIMEOUT_S, os._exit, (INTERRUPTED,))
@@ -224,7 +230,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
 
         stack.enter_context(new_recording(options.record))
         stack.enter_context(_printing_kept_name(options.record))
-        return await run(
+        return await run_app(
             options.address,
             baud=options.baud,
             signing=signing_of(options),

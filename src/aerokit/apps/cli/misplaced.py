@@ -51,14 +51,13 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     if parser._subparsers is not None:
         return _address_before_action(parser, words) if words and is_address(words[0]) else None
     takes_connect = "--connect" in parser._option_string_actions
-    # Some commands take the address as a positional argument, without --connect.
-    if not takes_connect and any("address" in action.dest or action.dest == "endpoints" for action in parser._actions):
-        is_connect_given = any(word.partition("=")[0] == "--connect" for word in words)
-        line = shlex.join([*command, *(word.removeprefix("--connect=") for word in words if word != "--connect")])
-        return f"`{parser.prog}` takes the address without --connect: {line}" if is_connect_given else None
+    has_address_argument = any("address" in action.dest or action.dest == "endpoints" for action in parser._actions)
+    if has_address_argument and not takes_connect:
+        return _superfluous_connect(parser, words)
+    takes_vehicle_paths = command[1:2] == ["files"]
     for index, word in enumerate(words):
-        # `aerokit files` takes paths on the vehicle, which may begin with /dev.
-        is_path = word.startswith("/") and command[1] == "files"
+        # A path on the vehicle may begin with /dev, like the address of a serial port.
+        is_path = takes_vehicle_paths and word.startswith("/")
         is_option_value = index > 0 and _takes_value(parser, words[index - 1])
         if is_path or not is_address(word) or is_option_value:
             continue
@@ -72,9 +71,19 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
     return None
 
 
+def _superfluous_connect(parser: argparse.ArgumentParser, words: list[str]) -> str | None:
+    """Return the error text if --connect is given to a command with a positional address; otherwise None."""
+    if not any(word.partition("=")[0] == "--connect" for word in words):
+        return None
+    other_words = [word.removeprefix("--connect=") for word in words if word != "--connect"]
+    line = shlex.join([*parser.prog.split(), *other_words])
+    return f"`{parser.prog}` takes the address without --connect: {line}"
+
+
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
     """Return the error text if an address is before the action, as in ``aerokit params udpin:… list``."""
-    address, action, *arguments = words if len(words) > 1 else [*words, "ACTION"]
+    address, *after_address = words
+    action, *arguments = after_address or ["ACTION"]
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
     action_parser = actions.get(action) or next(iter(actions.values()))
     takes_connect = "--connect" in action_parser._option_string_actions

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.files import read_text
 from aerokit.apps.cli.arguments import number, writable_file
-from aerokit.apps.cli.completion import offer
+from aerokit.apps.cli.completion import set_completions
 from aerokit.apps.cli.connecting import add_action, command_action, connected
 from aerokit.apps.cli.output import DONE, add_force, check_not_existing, emit, suggestion
 from aerokit.apps.cli.terminal import progress_bar
@@ -54,12 +54,14 @@ def plan_warnings(plan: Plan) -> list[str]:
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard_commands = frozenset(MavCmd)
-    warnings = [
-        f"{part} item {index}: command {item.command} is not a MAV_CMD; a vehicle that does not know it refuses it"
-        for part in PARTS
-        for index, item in enumerate(getattr(plan, part).to_items())
-        if item.command not in standard_commands
-    ]
+    warnings = []
+    for part in PARTS:
+        for index, item in enumerate(getattr(plan, part).to_items()):
+            if item.command not in standard_commands:
+                warnings.append(
+                    f"{part} item {index}: command {item.command} is not a MAV_CMD; a vehicle that does not know the"
+                    " command refuses the item"
+                )
     mission = plan.mission.items
     warnings += _altitude_warnings(plan)
     may_be_arducopter = plan.vehicle_type in COPTERS and plan.firmware_type != MavAutopilot.PX4
@@ -75,9 +77,10 @@ def _altitude_warnings(plan: Plan) -> list[str]:
     warnings = []
     for index, item in enumerate(plan.mission.items):
         is_take_off = item.command in _TAKE_OFFS
-        may_be_below = item.command in _LANDINGS or not (is_take_off or item.position is not None)
-        is_below = item.z < 0.0 or (is_take_off and item.z == 0.0)
-        if item.frame in _FRAMES_RELATIVE_TO_HOME and is_below and not may_be_below:
+        # A take-off has an altitude even without a position. In other commands without a position, z is no altitude.
+        has_altitude = item.frame in _FRAMES_RELATIVE_TO_HOME and (is_take_off or item.position is not None)
+        is_too_low = item.z < 0.0 or (is_take_off and item.z == 0.0)
+        if has_altitude and is_too_low and item.command not in _LANDINGS:
             warnings.append(f"mission item {index}: {item.name} at {item.z:g} m above home")
     return warnings
 
@@ -122,19 +125,21 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
                     on_progress=on_progress,
                 )
             except InvalidArgument as error:
+                # The library's text names its argument, which is an option of the command line.
                 text = str(error).replace("a greater max_distance_m", "a greater --max-distance-m")
                 raise InvalidArgument(text.replace("plan, item", f"{part} item")) from None
         emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")
 
 
 def _place_text(item: MissionItem) -> str:
+    """Return the position of an item; for an item without a position, its parameters, unless all are 0."""
     position = item.position
     if position is not None:
         return f"{position.latitude_deg:.7f} {position.longitude_deg:.7f} {item.z:g} m"
-    numbers = (item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
-    if not any(numbers):
+    parameters = (item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
+    if not any(parameters):
         return ""
-    return " ".join("–" if math.isnan(number) else f"{number:g}" for number in numbers)
+    return " ".join("–" if math.isnan(parameter) else f"{parameter:g}" for parameter in parameters)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -194,7 +199,7 @@ def _add_parts(action: argparse.ArgumentParser) -> None:
         metavar="PART",
         help=f"{', '.join(PARTS)} (default: mission)",
     )
-    offer(parts, lambda: PARTS)
+    set_completions(parts, lambda: PARTS)
 
 
 def _part(text: str) -> str:
@@ -242,11 +247,13 @@ async def _upload(options: argparse.Namespace) -> int:
 
 async def _check(options: argparse.Namespace) -> int:
     plan = read_plan(options.file)
+    has_items = False
     for part in PARTS:
         items = getattr(plan, part).to_items()
+        has_items = has_items or bool(items)
         if items or options.json:  # because "fence: 0 items" would look as if the upload cleared the fence
             emit_items(options, part, items, "in the file")
-    if not any(getattr(plan, part).to_items() for part in PARTS) and not options.json:
+    if not has_items and not options.json:
         print(f"{options.file} has no items")
     warnings = _emit_warnings(plan, options)
     for note in _notes(plan):

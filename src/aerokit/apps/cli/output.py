@@ -142,7 +142,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _rewrite_for_commands(record: logging.LogRecord) -> bool:
-    """Rewrite warnings about a program's code: about a blocked event loop, and about a vehicle's ``async with``."""
+    """Logging filter: reword warnings about an ``async with`` block and a blocked loop, which are a program's code."""
     if str(record.msg).startswith("the async with block of vehicle %d was left: "):
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):

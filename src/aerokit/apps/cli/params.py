@@ -12,7 +12,7 @@ import anyio
 
 from aerokit.apps.cli import connecting
 from aerokit.apps.cli.arguments import assignment, writable_file
-from aerokit.apps.cli.completion import assignments, offer, parameter_names
+from aerokit.apps.cli.completion import assignments, parameter_names, set_completions
 from aerokit.apps.cli.connecting import add_action
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, exit_code, near_names, suggestion
 from aerokit.apps.cli.params_metadata import (
@@ -59,7 +59,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
     pattern = listing.add_argument(
         "pattern", nargs="?", default="*", help="part of the names, or 'BATT_*' (default: all)"
     )
-    offer(pattern, parameter_names)
+    set_completions(pattern, parameter_names)
     add_metadata(listing)
     listing.add_argument(
         "--changed",
@@ -67,7 +67,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
         help="only those that differ from their default (on PX4: from that in --metadata FILE)",
     )
     get = add_action(actions, "get", _get, "Read single parameters.")
-    offer(get.add_argument("names", nargs="+", metavar="NAME"), parameter_names)
+    set_completions(get.add_argument("names", nargs="+", metavar="NAME"), parameter_names)
     add_metadata(get)
     save = add_action(actions, "save", _save, "Save all parameters to a file.")
     save.add_argument("file", type=writable_file)
@@ -79,7 +79,7 @@ def _add_reading(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     set_ = add_action(actions, "set", _set, "Set parameters. The vehicle confirms each value.")
-    offer(set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE"), assignments)
+    set_completions(set_.add_argument("values", nargs="+", type=assignment, metavar="NAME=VALUE"), assignments)
     add_metadata(set_, checks=True)
     load = add_action(actions, "load", _load, "Set all parameters in a file that differ on the vehicle.")
     load.add_argument("file")
@@ -113,7 +113,7 @@ async def _list(options: argparse.Namespace) -> int:
 
 
 def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle) -> ParameterTable:
-    """Return the parameters that differ from their default, which is that of the metadata if the vehicle reports none.
+    """Return the parameters that differ from their default, which the vehicle or else the metadata provides.
 
     Raises:
         ValueUnknownError: no default is known; the text names the options that help.
@@ -166,21 +166,23 @@ async def _diff(options: argparse.Namespace) -> int:
 
 
 async def _set(options: argparse.Namespace) -> int:
+    values = dict(options.values)
     metadata = load_metadata_option(options)
     if not options.force:
-        check_allowed(metadata, dict(options.values))  # with a file of metadata, already before connecting
+        check_allowed(metadata, values)  # with a file of metadata, already before connecting
     async with connected(options, changes=True) as vehicle:
         if metadata is None:
             metadata = await metadata_for_check(vehicle, from_file=None, options=options)
-            check_allowed(metadata, dict(options.values))
-        results = await vehicle.parameters.set_many(dict(options.values), idle_timeout_s=options.patience)
-        known = await _names_for_hints(vehicle, results.values())
-    # Without metadata, a single line below replaces the notes on the results.
-    if not options.force and (metadata is not None or options.json):
+            check_allowed(metadata, values)
+        results = await vehicle.parameters.set_many(values, idle_timeout_s=options.patience)
+        known_names = await _names_for_hints(vehicle, results.values())
+    # Without metadata, one line at the end replaces the notes on the results. JSON always has the notes.
+    has_notes = metadata is not None or options.json
+    if has_notes and not options.force:
         results = {name: with_range_note(metadata, result, "--metadata FILE") for name, result in results.items()}
-    code = _emit_results(options, results.values(), known, metadata)
-    was_set = any(result.error is None and result.outcome != "unchanged" for result in results.values())
-    if was_set and metadata is None and not (options.force or options.json):
+    code = _emit_results(options, results.values(), known_names, metadata)
+    has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
+    if has_changed and metadata is None and not (options.force or options.json):
         print(metadata_source(vehicle))
     return code
 
@@ -217,11 +219,12 @@ def _check_file(file_values: ParameterFile, table: ParameterTable, vehicle: Vehi
     """Check that all values of a file fit the types of the vehicle's parameters.
 
     Raises:
-        InvalidArgument: a value does not have the type of its parameter. The text names all such values, and the names
+        InvalidArgument: a value does not have the type of its parameter. The text lists these values, and the names
             that the vehicle does not have, with their lines.
     """
     names_are_upper_case = vehicle.autopilot.name == "ArduPilot"
-    invalid, unknown = [], []
+    invalid = []
+    unknown = []
     for name, value in file_values.items():
         line = file_values.places[name]
         known = resolve_known(name.upper() if names_are_upper_case else name, table)

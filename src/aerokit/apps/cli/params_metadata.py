@@ -85,7 +85,7 @@ async def metadata_for_check(
 async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
     from aerokit.parameters.metadata import parse_metadata
 
-    problem = f"not read within {_READ_TIMEOUT_S:g} s"
+    problem = f"time-out after {_READ_TIMEOUT_S:g} s"  # unless another error is raised before
     with anyio.move_on_after(_READ_TIMEOUT_S):
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")
@@ -94,13 +94,16 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
             return None
         except AerokitError as error:
             problem = str(error)
-    text = f"the ranges of the values are not checked: the vehicle's metadata: {problem}; use --metadata FILE"
-    print(f"aerokit: {text}", file=sys.stderr)
+    print(
+        "aerokit: the ranges of the values are not checked, because reading the metadata from the vehicle failed:"
+        f" {problem}; use --metadata FILE",
+        file=sys.stderr,
+    )
     return None
 
 
 def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
-    """Raise InvalidArgument if the metadata does not allow a value; the text lists all such values."""
+    """Raise InvalidArgument if the metadata does not allow a value; the text lists all these values."""
     check_values(metadata, values, "--force")
 
 

@@ -92,7 +92,7 @@ async def _serve_vehicles(uvicorn: Any, serve: Any, options: argparse.Namespace,
 
 @asynccontextmanager
 async def _connection(options: argparse.Namespace) -> AsyncIterator[Connection]:
-    """Open the connection to the vehicles or, with ``--sim``, to simulated ones."""
+    """Open the connection to the vehicles or, with ``--sim``, to simulated vehicles."""
     from aerokit.connection.opening import open_connection
 
     async with AsyncExitStack() as stack:
@@ -156,7 +156,8 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
             await server.serve()
         except SystemExit:  # uvicorn exits if it cannot listen
             raise LinkOpenError(
-                f"cannot listen on {options.host}, port {options.port}: it may be in use; choose another with --port"
+                f"cannot listen on {options.host}, port {options.port}: the port may be in use;"
+                " choose another port with --port"
             ) from None
     if not server.started:
         return FAILED

@@ -97,9 +97,11 @@ def simulated_fleet(
 
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
-    if system_id + count - 1 > 255:
-        last = system_id + count - 1
-        raise InvalidArgument(f"{count} vehicles from system id {system_id} need ids up to {last}; the maximum is 255")
+    last_id = system_id + count - 1
+    if last_id > 255:
+        raise InvalidArgument(
+            f"{count} vehicles from system id {system_id} need ids up to {last_id}; the maximum is 255"
+        )
     latitude_deg, longitude_deg, altitude_m = home or HOME
     frame = LocalFrame(GlobalPoint(round(latitude_deg * 1e7), round(longitude_deg * 1e7), altitude_m))
     homes = [frame.to_global(0.0, number * spacing_m, 0.0) for number in range(count)]
@@ -120,7 +122,7 @@ def _recorded(path: str, count: int) -> SimulatedVehicle:
     from aerokit.testing.recorded import RecordedVehicle
 
     if count != 1:
-        raise InvalidArgument(f"count = {count}: the recording {path} has one vehicle only")
+        raise InvalidArgument(f"count = {count} is not allowed: the recording {path} has only one vehicle")
     return RecordedVehicle(path)
 
 
@@ -240,7 +242,7 @@ async def run_sim(options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with server, faults_begin(vehicles, options):
-            _emit(server, options)
+            _emit_addresses(server, options)
             real_duration_s = None if options.duration is None else options.duration / options.speedup
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(stop.wait(), real_duration_s)
@@ -285,10 +287,11 @@ def _begin_of(fault: tuple[str, object, float]) -> float:
 
 
 def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
-    optional: dict[str, Any] = {
-        "boot_time_s": options.boot_time,
-        "signing_key": options.signing_key,
-    }
+    arguments = conditions(options)
+    if options.boot_time is not None:
+        arguments["boot_time_s"] = options.boot_time
+    if options.signing_key is not None:
+        arguments["signing_key"] = options.signing_key
     return simulated_fleet(
         options.vehicle,
         options.count,
@@ -298,8 +301,7 @@ def _fleet(options: argparse.Namespace) -> list[SimulatedVehicle]:
         seed=options.seed,
         boot_text=True,
         components=lambda: _devices(options),
-        **conditions(options),
-        **{name: value for name, value in optional.items() if value is not None},
+        **arguments,
     )
 
 
@@ -315,7 +317,8 @@ def _tracks(vehicles: Sequence[SimulatedVehicle], picture: str | None) -> list[T
 
 def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], speedup: float) -> SimulatorServer:
     """Create the server. An address template becomes one link for each vehicle, any other address one link for all."""
-    links, vehicles_on = [], []
+    links = []
+    vehicles_on = []
     for address in addresses:
         groups = [[vehicle] for vehicle in vehicles] if is_address_template(address) else [list(vehicles)]
         for index, group in enumerate(groups):
@@ -324,7 +327,7 @@ def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], spee
     return SimulatorServer(vehicles, links, speedup=speedup, vehicles_on=vehicles_on)
 
 
-def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
+def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> None:
     """Print the addresses of the vehicles, and commands to try."""
     for address, vehicles in zip(server.addresses, server.vehicles_on, strict=True):
         record = {
@@ -333,27 +336,31 @@ def _emit(server: SimulatorServer, options: argparse.Namespace) -> None:
             "speedup": options.speedup,
         }
         # Without --json, the addresses that serve the same vehicles are printed together on one line.
-        same = [other for other, others in zip(server.addresses, server.vehicles_on, strict=True) if others == vehicles]
-        text = f"{_systems(vehicles)} on {' and '.join(same)}, speed {options.speedup:g}x"
-        emit(options, "simulated", record, text if address == same[0] else None)
+        shared = []
+        for other_address, other_vehicles in zip(server.addresses, server.vehicles_on, strict=True):
+            if other_vehicles == vehicles:
+                shared.append(other_address)
+        text = f"{_systems(vehicles)} on {' and '.join(shared)}, speed {options.speedup:g}x"
+        emit(options, "simulated", record, text if address == shared[0] else None)
     if not options.json:
-        vehicles = server.vehicles_on[0]
+        first_vehicle, *other_vehicles = server.vehicles_on[0]
         client = _client_address(server.addresses[0], options.addresses[0])
-        choice = f" --system-id {vehicles[0].system_id}" if len(vehicles) > 1 else ""
-        print(f"try: aerokit demo --connect {client}{choice}", flush=True)
+        system_option = f" --system-id {first_vehicle.system_id}" if other_vehicles else ""
+        print(f"try: aerokit demo --connect {client}{system_option}", flush=True)
         if client != _SERIAL_END:
             print(f"or:  aerokit status {client}, aerokit monitor {client}, aerokit serve {client}", flush=True)
 
 
 def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
-    first, last = vehicles[0].system_id, vehicles[-1].system_id
+    first = vehicles[0].system_id
+    last = vehicles[-1].system_id
     return f"system {first}" if first == last else f"systems {first} to {last}"
 
 
 def _client_address(address: str, argument: str) -> str:
     """Return the address with which a client on this machine connects.
 
-    ``address`` is that of the open link, ``argument`` the address or template in the command line.
+    ``address`` is the address of the open link, ``argument`` the address or template in the command line.
     """
     scheme, _, location = address.partition(":")
     if scheme == "zenohin":
@@ -368,7 +375,8 @@ def _client_address(address: str, argument: str) -> str:
 def _zenoh_options(address: str) -> str:
     """Return the query of a client's zenoh address, which connects to an endpoint of the simulator."""
     parsed = parse_address(expand_address(address, 0, 1))
-    endpoints, config = parsed.option("listen") or parsed.option("connect"), parsed.option("config")
+    endpoints = parsed.option("listen") or parsed.option("connect")
+    config = parsed.option("config")
     options = []
     if endpoints:
         options.append(f"connect={endpoints.replace('0.0.0.0', '127.0.0.1')}")

@@ -44,7 +44,7 @@ _RELEASE_TIME_S = 0.5
 _MESSAGE_TIMEOUT_S = 0.3
 
 
-def _vehicle_record(vehicle: Vehicle, found: Readiness) -> dict[str, Any]:
+def _vehicle_record(vehicle: Vehicle, checks: Readiness) -> dict[str, Any]:
     version = vehicle.version.latest
     return {
         **overview(vehicle),
@@ -53,16 +53,16 @@ def _vehicle_record(vehicle: Vehicle, found: Readiness) -> dict[str, Any]:
         "mode": vehicle.mode_name,
         "armed": vehicle.armed.latest,
         "failsafe": active_failsafe(vehicle),
-        "missing": [*found.against_arming, *found.against_flight],
-        "against_arming": list(found.against_arming),
-        **_frame_of(vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))),
+        "missing": [*checks.against_arming, *checks.against_flight],
+        "against_arming": list(checks.against_arming),
+        **_frame_fields(vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))),
     }
 
 
-def _vehicle_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
+def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
     version = vehicle.version.latest
     heartbeat = vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))
-    frame = _frame_of(heartbeat)
+    frame = _frame_fields(heartbeat)
     armed = {None: "armed or not: unknown", True: "ARMED", False: "disarmed"}[vehicle.armed.latest]
     landed = vehicle.landed_state.latest
     landed_text = "" if landed is None else f", {_in_words(getattr(landed, 'name', str(landed)))}"
@@ -75,16 +75,16 @@ def _vehicle_lines(vehicle: Vehicle, found: Readiness) -> list[str]:
         f"  position {_position(vehicle)}",
         f"  GPS      {'; '.join(map(_gps, vehicle.gps.latest or ())) or _UNKNOWN}",
         f"  battery  {'; '.join(map(_battery, vehicle.batteries.latest or ())) or _UNKNOWN}",
-        f"  link     {_link(vehicle, frame)}",
+        f"  link     {_vehicle_link_text(vehicle, frame)}",
         *_aligned("failsafe", active_failsafe(vehicle) or ()),
-        *_readiness(vehicle, found),
+        *_readiness(vehicle, checks),
     ]
 
 
-def _readiness(vehicle: Vehicle, found: Readiness) -> list[str]:
-    lines = readiness_lines(vehicle, found)
+def _readiness(vehicle: Vehicle, checks: Readiness) -> list[str]:
+    lines = readiness_lines(vehicle, checks)
     if lines and vehicle.armed.latest:  # the checks before arming do not matter in flight
-        return _aligned("missing", [*found.against_arming, *found.against_flight])
+        return _aligned("missing", [*checks.against_arming, *checks.against_flight])
     if lines:
         return _aligned("arming", [text.replace("arm() changes to", "aerokit changes to") for text in lines])
     if vehicle.armed.latest:
@@ -92,7 +92,7 @@ def _readiness(vehicle: Vehicle, found: Readiness) -> list[str]:
     return _aligned("ready", ["no reason against arming is reported"])
 
 
-def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
+def _component_record_and_text(heartbeat: Heartbeat, system_id: int, component_id: int) -> tuple[dict[str, Any], str]:
     kind = kind_of(heartbeat, component_id)
     record = {
         "system_id": system_id,
@@ -100,7 +100,7 @@ def _component_line(heartbeat: Heartbeat, system_id: int, component_id: int) -> 
         "kind": kind,
         "autopilot": _enum_name(MavAutopilot, heartbeat.autopilot),
         "vehicle_type": heartbeat.type,
-        **_frame_of(heartbeat),
+        **_frame_fields(heartbeat),
     }
     name = "ground station" if kind == "gcs" else kind.replace("_", " ")
     return record, f"system {system_id}, component {component_id}: {name}"
@@ -121,7 +121,7 @@ def _link_line(record: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _link(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
+def _vehicle_link_text(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
     received, lost = vehicle.connection.counts(vehicle.system_id)
     report = vehicle.link_quality.latest
     round_trip_s = None if report is None else report.round_trip_s
@@ -135,7 +135,7 @@ def _link(vehicle: Vehicle, frame: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _frame_of(heartbeat: Heartbeat | None) -> dict[str, Any]:
+def _frame_fields(heartbeat: Heartbeat | None) -> dict[str, Any]:
     frame = None if heartbeat is None else heartbeat.received_frame
     return {
         "mavlink_version": None if frame is None else frame.version,
@@ -157,7 +157,9 @@ def _position(vehicle: Vehicle) -> str:
     here = vehicle.position.latest
     if here is None:
         return _UNKNOWN
-    height = _UNKNOWN if here.altitude_relative_m is None else f"{round(here.altitude_relative_m, 1) + 0.0:.1f} m"
+    height = _UNKNOWN
+    if here.altitude_relative_m is not None:
+        height = f"{round(here.altitude_relative_m, 1) + 0.0:.1f} m"  # + 0.0 converts -0.0 to 0.0
     old = f" ({vehicle.position.age:.0f} s ago)" if vehicle.position.age > SILENT_AFTER_S else ""
     return f"{here.latitude_deg:.7f}, {here.longitude_deg:.7f}, height above home {height}{old}"
 
@@ -217,22 +219,23 @@ async def run_status(options: argparse.Namespace) -> int:
             raise
         started_at = connection.now()
         await anyio.sleep(options.seconds)
-        vehicles_found = dict(vehicles)  # a copy, because more vehicles may be found while reasons are requested
-        reasons = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
+        vehicles_found = dict(vehicles)  # a copy, because more vehicles may be found while messages are requested
+        all_checks = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
         _emit_link(connection, options, connection.now() - started_at)
-        for vehicle, found in zip(vehicles_found.values(), reasons, strict=True):
-            record = _vehicle_record(vehicle, found)
-            emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, found)))
+        for vehicle, checks in zip(vehicles_found.values(), all_checks, strict=True):
+            record = _vehicle_record(vehicle, checks)
+            emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, checks)))
         _emit_components(connection, options, vehicles_found)
         await anyio.sleep(_RELEASE_TIME_S)
     cannot_arm = any(
-        found.against_arming and found.is_known and not vehicle.is_armed
-        for vehicle, found in zip(vehicles_found.values(), reasons, strict=True)
+        checks.against_arming and checks.is_known and not vehicle.is_armed
+        for vehicle, checks in zip(vehicles_found.values(), all_checks, strict=True)
     )
     return FAILED if cannot_arm else DONE
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
+    """Request the states that the vehicle does not stream, then return what it lacks."""
     # `why_not_armable` requests the estimator's messages, which depend on the firmware, from disarmed vehicles only.
     needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()
     estimator_messages = [("estimator", message) for message in needed]
@@ -242,7 +245,7 @@ async def _readiness_of(vehicle: Vehicle) -> Readiness:
             try:
                 await _request(vehicle, message, cell)
             except CommandTimeout as error:
-                # A vehicle that does not answer this request would not answer the other requests either.
+                # A vehicle that does not answer one request would not answer the others either.
                 return Readiness((str(error), *vehicle.missing_for_flight()), (), is_known=False)
     return readiness(vehicle, await vehicle.why_not_armable())
 
@@ -277,5 +280,5 @@ def _emit_components(connection: Connection, options: argparse.Namespace, vehicl
         system_id, component_id = source
         if system_id in vehicles and vehicles[system_id].component_id == component_id:
             continue
-        record, text = _component_line(heartbeat, system_id, component_id)
+        record, text = _component_record_and_text(heartbeat, system_id, component_id)
         emit(options, "component", record, text)

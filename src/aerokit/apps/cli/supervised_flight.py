@@ -17,7 +17,7 @@ import anyio
 
 from aerokit import events
 from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
-from aerokit.apps.readiness import Readiness, arms_but, readiness
+from aerokit.apps.readiness import arms_but, readiness
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -68,8 +68,10 @@ class SupervisedFlight(ABC):
     _prints_reasons = True  # False if the command prints the error with its reasons when it ends
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
-        self._vehicle, self._print, self._interrupts = vehicle, report.print_line, interrupts
+        self._vehicle = vehicle
+        self._interrupts = interrupts
         self._report = report
+        self._print = report.print_line
         self._on_interrupt = on_interrupt
         self.armed_by_us: bool = False
         """True once this program has sent an arm command."""
@@ -117,7 +119,8 @@ class SupervisedFlight(ABC):
     async def _arm(self) -> None:
         """Arm the vehicle, and record this before the command is sent, because its result may remain unknown."""
         self._check_disarmed()
-        self.armed_by_us = self._may_arm_late = True
+        self.armed_by_us = True
+        self._may_arm_late = True
         self._modes_armed_in.add(self._vehicle.mode_name)
         try:
             await self._vehicle.arm()
@@ -154,7 +157,8 @@ class SupervisedFlight(ABC):
 
     async def _after_interrupt(self) -> int:
         """Disarm a vehicle on the ground. In the air, perform ``--on-interrupt`` if this program still has control."""
-        vehicle, action = self._vehicle, self._on_interrupt
+        vehicle = self._vehicle
+        action = self._on_interrupt
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
             return DONE
@@ -167,6 +171,7 @@ class SupervisedFlight(ABC):
                 self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
+            # The vehicle is still armed, so it gets the command for a flying vehicle.
         text = INTERRUPT_ACTIONS[action]
         self._print(text if action == "nothing" else f"{text}; Ctrl-C exits at once")
         if action == "return":
@@ -200,10 +205,11 @@ class SupervisedFlight(ABC):
         self._print("disarmed")
 
     def _check_control(self) -> bool:
+        """Return True if this program still has control. Otherwise, print why no command is sent."""
         if not self._is_in_our_mode:
-            mode, now = self._vehicle.mode_name, self._vehicle.describe_now()
             self._print(
-                f"no command is sent, because the vehicle itself or another party changed the mode to {mode}: {now}"
+                "no command is sent, because the vehicle itself or another party changed the mode to"
+                f" {self._vehicle.mode_name}: {self._vehicle.describe_now()}"
             )
         return self._is_in_our_mode
 
@@ -216,8 +222,7 @@ class SupervisedFlight(ABC):
         vehicle = self._vehicle
         if not self._has_started and vehicle.mode_name in self._modes_armed_in:
             return True
-        mode_for, is_vtol = vehicle.autopilot.mode_for, vehicle.is_vtol
-        modes = [mode_for(purpose, is_vtol=is_vtol) for purpose in self._our_purposes()]
+        modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 
 
@@ -228,7 +233,8 @@ class FlightReport:
     """
 
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
-        self._vehicle, self._options = vehicle, options
+        self._vehicle = vehicle
+        self._options = options
         self.speedup: float = speedup
         self._clocks = ClockComparison()
         # Seconds of this computer's clock, not of the vehicle's, which a simulation may speed up.
@@ -236,8 +242,11 @@ class FlightReport:
         self._armed_s = 0.0
         self._fast_sink_at: float | None = None  # when the vehicle last descended at IMPACT_M_S or faster
         self._impact_s: float | None = None  # seconds from arming to an impact on the ground
-        self._started_at = self._last_line_at = vehicle.connection.now()
-        self._highest_m = self._fastest_m_s = self._flown_m = 0.0
+        self._started_at = vehicle.connection.now()
+        self._last_line_at = self._started_at
+        self._highest_m = 0.0
+        self._fastest_m_s = 0.0
+        self._flown_m = 0.0
         self._previous_position: Position | None = None
         self.prints_status: bool = True
         """True if status lines are printed when there is no other output. Set it to False during questions."""
@@ -278,7 +287,7 @@ class FlightReport:
     def record_impact(self) -> None:
         """Record that the vehicle has just hit the ground, so that the summary distinguishes the time before."""
         if self._impact_s is None and self._armed_at is not None:
-            # An impact is detected only some time after it, because the vehicle must then lie still.
+            # The impact is detected only later, because the vehicle must first lie still for some time.
             impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at
             self._impact_s = self._armed_s + impact_at - self._armed_at
 
@@ -286,9 +295,10 @@ class FlightReport:
         """Print the statistics of the flight, the link and the batteries."""
         vehicle = self._vehicle
         received, lost = vehicle.connection.counts(vehicle.system_id)
-        measured = self._clocks.speed
-        is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured)
-        speed = measured if is_unknown_simulation else self.speedup
+        # The clock of a vehicle reveals a simulation that this program has not started itself.
+        measured_speed = self._clocks.speed
+        is_unknown_simulation = self.speedup == 1.0 and not is_real_time(measured_speed)
+        speed = measured_speed if is_unknown_simulation else self.speedup
         seconds = speed * (vehicle.connection.now() - self._started_at)
         self._on_armed(None, is_armed=False)  # if the vehicle is still armed, adds the time since arming
         version = vehicle.version.latest
@@ -331,7 +341,7 @@ class FlightReport:
         self._emit("flight_summary", record, "\n".join(lines))
 
     def _describe_armed(self, speed: float) -> str:
-        """Return a clause such as "armed for 47 s". Notes give the time until an impact, and that of a simulation."""
+        """Return "armed for 47 s", with notes on the time until an impact and on the speed of a simulation."""
         notes = []
         if self._impact_s is not None:
             notes.append(f"{_duration(speed * self._impact_s)} until the impact")
@@ -366,10 +376,12 @@ class FlightReport:
 
     def _is_about_mode(self, text: str) -> bool:
         """Return True for "Arm: AUTO mode not armable", after which `Vehicle.arm` changes the mode and arms there."""
-        autopilot, mode = self._vehicle.autopilot, self._vehicle.mode_name
+        autopilot = self._vehicle.autopilot
+        mode = self._vehicle.mode_name
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"
 
     async def _print_status(self) -> None:
+        """Print a status line whenever nothing else was printed for some seconds."""
         vehicle = self._vehicle
         while vehicle.connection.is_open:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)
@@ -382,12 +394,13 @@ class FlightReport:
                 seconds = self.speedup * vehicle.heartbeat_age
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
-            found = Readiness((), ()) if vehicle.is_armed else readiness(vehicle, changes_mode=True)
-            if found.against_arming:
-                yet = " yet" if found.is_known else ""
-                self.print_line(f"  {found.prefix}{yet}: {'; '.join([*found.against_arming, *found.against_flight])}")
-            elif found.against_flight:
-                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(found.against_flight)}")
+            checks = None if vehicle.is_armed else readiness(vehicle, changes_mode=True)
+            if checks is not None and checks.against_arming:
+                yet = " yet" if checks.is_known else ""
+                reasons = "; ".join([*checks.against_arming, *checks.against_flight])
+                self.print_line(f"  {checks.prefix}{yet}: {reasons}")
+            elif checks is not None and checks.against_flight:
+                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(checks.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 

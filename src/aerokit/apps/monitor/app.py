@@ -162,7 +162,9 @@ class Monitor(App[None]):
     def __init__(self, model: MonitorModel, commands: BackgroundTasks, name: str) -> None:
         super().__init__(ansi_color=True)
         self.theme = next(theme for theme in ANSI_THEMES if theme in self.available_themes)
-        self._model, self._commands, self._name = model, commands, name
+        self._model = model
+        self._commands = commands
+        self._name = name
         self._arming_checks = ArmingCheckRequests()
         self._began_at = model.connection.now()
         self._listed_ids: list[int] = []
@@ -195,7 +197,8 @@ class Monitor(App[None]):
         """Adapt the layout to the terminal: if it is wide, rates are below the state, and texts below the map."""
         base = self.screen_stack[0]
         base.set_class(event.size.height >= TALL_ROWS, "tall")
-        is_wide = event.size.width >= WIDE_SIZE[0] and event.size.height >= WIDE_SIZE[1]
+        min_columns, min_rows = WIDE_SIZE
+        is_wide = event.size.width >= min_columns and event.size.height >= min_rows
         if is_wide == self._is_wide:
             return
         self._is_wide = is_wide
@@ -272,7 +275,8 @@ class Monitor(App[None]):
             self.push_screen(MissingScreen(vehicle))
 
     async def _run_command(self, vehicle: Vehicle, method: str) -> None:
-        command, add_line = KEY_COMMANDS[method].lower(), partial(self._model.add_line, vehicle.system_id)
+        command = KEY_COMMANDS[method].lower()
+        add_line = partial(self._model.add_line, vehicle.system_id)
         add_line(f"{command}: command sent", "bold")
         try:
             await getattr(vehicle, method)()
@@ -298,10 +302,10 @@ class Monitor(App[None]):
                 options.replace_option_prompt_at_index(index, row)
 
     def _title(self) -> Text:
-        connection, count = self._model.connection, len(self._model.vehicles)
-        state = connection.link_state.latest
+        state = self._model.connection.link_state.latest
         text = Text(f"{self._name}  link ", "bold", no_wrap=True, overflow="ellipsis")
         text.append(state.value if state else UNKNOWN, LINK_STYLES[state] if state else "")
+        count = len(self._model.vehicles)
         return text.append(f"  {count} vehicle{'s' if count != 1 else ''}")
 
     def _state_content(self) -> list[tuple[str, Text]] | Text:
@@ -321,7 +325,8 @@ class Monitor(App[None]):
 
     def _show_map(self, widget: Panel) -> None:
         """Draw the map again if its size, a marker or a track has changed."""
-        model, size = self._model, widget.content_size
+        model = self._model
+        size = widget.content_size
         homes = []
         for vehicle in model.vehicles.values():  # a home is shown only together with a track
             home = vehicle.home.latest
@@ -330,15 +335,17 @@ class Monitor(App[None]):
         marks = [*((home, "H", "bold") for home in homes), *map(self._mark_of, model.tracks)]
         if not self._has_changed("map", (size, marks, [len(track) for track in model.tracks.values()])):
             return
-        points = [point for track in model.tracks.values() for point in track] + homes
+        points = list(homes)
+        for track in model.tracks.values():
+            points += track
         if not points:
             widget.show(Text("no position known", "dim"))
             return
         canvas = Canvas(size.width, size.height, points)
         for system_id, track in model.tracks.items():
             canvas.line(track, self._style_of(system_id))
-        for mark in marks:
-            canvas.mark(*mark)
+        for point, text, style in marks:
+            canvas.mark(point, text, style)
         widget.show(canvas.text())
 
     def _mark_of(self, system_id: int) -> tuple[tuple[float, float], str, str]:
@@ -360,12 +367,12 @@ class Monitor(App[None]):
         vehicle = self.selected
         if vehicle is None:
             return Text(UNKNOWN, "dim")
-        rates = [(_rate_text(hz), name) for name, hz in self._model.rates(vehicle.system_id) if hz]
-        if not rates:
+        texts = {name: _rate_text(hz) for name, hz in self._model.rates(vehicle.system_id) if hz}
+        if not texts:
             return Text(UNKNOWN, "dim")
         # Sorts by the displayed numbers, not by the exact rates, so that equal numbers stay in the order of the names.
-        rates.sort(key=lambda rate: (-float(rate[0]), rate[1]))
-        lines = "\n".join(f"{text:>5} {name}" for text, name in rates)
+        names = sorted(texts, key=lambda name: (-float(texts[name]), name))
+        lines = "\n".join(f"{texts[name]:>5} {name}" for name in names)
         return Text(lines, no_wrap=True, overflow="ellipsis")
 
 
@@ -408,19 +415,20 @@ async def run_monitor(
     async with (
         open_connection(
             address, source_system=OBSERVER_SYSTEM_ID, baud=baud, signing=signing, reconnect=isinstance(address, str)
-        ) as link,
-        vehicles_on(link) as vehicles,
+        ) as connection,
+        vehicles_on(connection) as vehicles,
     ):
-        model, commands = MonitorModel(link, vehicles), BackgroundTasks(link.fail)
-        app = Monitor(model, commands, str(link.link.address))
-        detach = link.on_end(lambda error: app.exit())
+        model = MonitorModel(connection, vehicles)
+        commands = BackgroundTasks(connection.fail)
+        app = Monitor(model, commands, str(connection.link.address))
+        detach = connection.on_end(lambda error: app.exit())
         try:
             if record is not None:
-                link.record(record)
+                connection.record(record)
             if on_start is not None:
                 on_start(app)
             await app.run_async()
-            link.raise_if_ended()
+            connection.raise_if_ended()
             return app.return_code or 0
         finally:
             detach()

@@ -85,7 +85,8 @@ class VehicleText:
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
-        vehicle, cell = self._vehicle, self.cell
+        vehicle = self._vehicle
+        cell = self.cell
         rows = [
             ("mode", Text("  ").join([cell(vehicle.mode, _name, "bold"), self._armed()])),
             ("link" if self._silent_s else "missing", self.silence() or self._missing()),
@@ -102,7 +103,8 @@ class VehicleText:
         return rows
 
     def _more_rows(self) -> list[tuple[str, Text]]:
-        vehicle, cell = self._vehicle, self.cell
+        vehicle = self._vehicle
+        cell = self.cell
         return [
             ("home", self._home()),
             ("mission", cell(vehicle.mission_current, _mission)),
@@ -114,7 +116,8 @@ class VehicleText:
 
     def row(self, *, is_selected: bool, more: bool) -> Text:
         """Return this vehicle's line in the list of vehicles."""
-        vehicle, cell = self._vehicle, self.cell
+        vehicle = self._vehicle
+        cell = self.cell
         text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
         text.append(f"{vehicle.system_id:>3} ", "bold")
         columns = [
@@ -154,11 +157,13 @@ class VehicleText:
         return Text("armed" if self._vehicle.armed.latest else "ready")
 
     def _speeds(self) -> Text:
-        ground, climb = self._vehicle.ground_speed_m_s, self._vehicle.climb_m_s
-        return Text.assemble(self.cell(ground, _speed), "  climb ", self.cell(climb, _climb))
+        ground_speed = self.cell(self._vehicle.ground_speed_m_s, _speed)
+        climb = self.cell(self._vehicle.climb_m_s, _climb)
+        return Text.assemble(ground_speed, "  climb ", climb)
 
     def _home(self) -> Text:
-        home, position = self._vehicle.home.latest, self._vehicle.position.latest
+        home = self._vehicle.home.latest
+        position = self._vehicle.position.latest
         if home is None or position is None:
             return Text(UNKNOWN, "dim")
         distance_m = position.distance_to(home.position)
@@ -166,7 +171,8 @@ class VehicleText:
         return Text(f"{number(distance_m, 0)} m away{bearing}")
 
     def _link(self) -> Text:
-        quality, state = self._vehicle.link_quality, self._link_state
+        quality = self._vehicle.link_quality
+        state = self._link_state
         text = Text() if state is None else Text(f"{state.value}  ", LINK_STYLES[state])
         text.append("loss ").append_text(self.cell(quality, lambda report: number(report.loss_percent, 1, " %")))
         text.append("  round trip ")
@@ -183,17 +189,13 @@ class VehicleText:
 
         An active failsafe comes first.
         """
-        found = readiness(self._vehicle)
+        checks = readiness(self._vehicle)
         if self._vehicle.armed.latest:
             failsafe = [f"failsafe: {text}" for text in self._failsafe or ()]
-            return [*failsafe, *found.against_arming, *found.against_flight]
-        flight_prefix = "also missing for flight" if found.against_arming else "arms, cannot fly by itself"
-        groups = ((found.prefix, found.against_arming), (flight_prefix, found.against_flight))
-        return [
-            f"{prefix}: {reason}" if place == 0 else reason
-            for prefix, reasons in groups
-            for place, reason in enumerate(reasons)
-        ]
+            return [*failsafe, *checks.against_arming, *checks.against_flight]
+        flight_prefix = "also missing for flight" if checks.against_arming else "arms, cannot fly by itself"
+        against_arming = _with_prefix(checks.prefix, checks.against_arming)
+        return against_arming + _with_prefix(flight_prefix, checks.against_flight)
 
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
         """Return the first reason that prevents a flight, and as many others as fit into ``max_lines``."""
@@ -203,9 +205,15 @@ class VehicleText:
         texts: list[str] = []
         for shown in range(len(missing), 0, -1):
             texts = _with_count(missing, shown)
-            if sum(len(textwrap.wrap(text, max(1, width), break_on_hyphens=False)) for text in texts) <= max_lines:
+            wrapped = [textwrap.wrap(text, max(1, width), break_on_hyphens=False) for text in texts]
+            if sum(map(len, wrapped)) <= max_lines:
                 break
         return Text("\n".join(texts), WARNING)
+
+
+def _with_prefix(prefix: str, reasons: Sequence[str]) -> list[str]:
+    """Return the reasons, the first of them with a prefix."""
+    return [f"{prefix}: {reason}" if index == 0 else reason for index, reason in enumerate(reasons)]
 
 
 def _with_count(reasons: Sequence[str], shown: int) -> list[str]:
@@ -276,11 +284,15 @@ class Canvas:
     """
 
     def __init__(self, columns: int, rows: int, points: Iterable[tuple[float, float]]) -> None:
-        self._columns, self._rows = max(columns, 2), max(rows - 1, 2)
-        norths, easts = zip(*(list(points) or [(0.0, 0.0)]), strict=True)
-        self._middle = (max(norths) + min(norths)) / 2, (max(easts) + min(easts)) / 2
+        self._columns = max(columns, 2)
+        self._rows = max(rows - 1, 2)
+        all_points = list(points) or [(0.0, 0.0)]
+        norths, easts = zip(*all_points, strict=True)
+        self._middle_north = (max(norths) + min(norths)) / 2
+        self._middle_east = (max(easts) + min(easts)) / 2
         # Each Braille character has two columns and four rows of dots.
-        width_dots, height_dots = 2 * (self._columns - 1), 4 * (self._rows - 1)
+        width_dots = 2 * (self._columns - 1)
+        height_dots = 4 * (self._rows - 1)
         self._metres_per_dot: float = max(
             (max(easts) - min(easts)) / width_dots,
             (max(norths) - min(norths)) / height_dots,
@@ -293,10 +305,12 @@ class Canvas:
     def line(self, points: Sequence[tuple[float, float]], style: str) -> None:
         """Draw a line through the points."""
         dots = [self._dot_at(point) for point in points]
-        for (x, y), (end_x, end_y) in zip(dots, dots[1:] or dots, strict=False):  # a single point: line to itself
+        ends = dots[1:] or dots  # a single point is a line to itself
+        for (x, y), (end_x, end_y) in zip(dots, ends, strict=False):
             steps = max(abs(end_x - x), abs(end_y - y), 1)
             for step in range(steps + 1):
-                dot_x, dot_y = x + round((end_x - x) * step / steps), y + round((end_y - y) * step / steps)
+                dot_x = x + round((end_x - x) * step / steps)
+                dot_y = y + round((end_y - y) * step / steps)
                 cell = dot_y // 4, dot_x // 2
                 self._dots[cell] = self._dots.get(cell, 0) | _BRAILLE_BITS[dot_y % 4][dot_x % 2]
                 self._styles[cell] = style
@@ -333,6 +347,7 @@ class Canvas:
 
     def _dot_at(self, point: tuple[float, float]) -> tuple[int, int]:
         """Return the column and row of the dot for a point, counted from the top left."""
-        dot_x = self._columns + round((point[1] - self._middle[1]) / self._metres_per_dot)
-        dot_y = 2 * self._rows - round((point[0] - self._middle[0]) / self._metres_per_dot)
+        north, east = point
+        dot_x = self._columns + round((east - self._middle_east) / self._metres_per_dot)
+        dot_y = 2 * self._rows - round((north - self._middle_north) / self._metres_per_dot)
         return min(max(dot_x, 0), 2 * self._columns - 1), min(max(dot_y, 0), 4 * self._rows - 1)

@@ -6,7 +6,8 @@ import math
 import re
 import time
 from collections import Counter, defaultdict, deque
-from typing import TYPE_CHECKING
+from operator import itemgetter
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
@@ -34,6 +35,13 @@ SEVERITY_STYLES = (DANGER, DANGER, DANGER, "bold red", "bold magenta", "bold", "
 """Text styles; the index is the MAV_SEVERITY, from 0 (emergency) to 7 (debug)."""
 
 
+class _CountSample(NamedTuple):
+    """A copy of the numbers of received messages, by system id and message id, and its time."""
+
+    at: float
+    counts: Counter[tuple[int, int]]
+
+
 class MonitorModel:
     """Collects the data from a connection. ``update()`` must be called a few times a second."""
 
@@ -50,8 +58,8 @@ class MonitorModel:
         self.reference: tuple[float, float] | None = None
         """Latitude and longitude of the first known position, in degrees."""
         self._counts: Counter[tuple[int, int]] = Counter()
-        # Copies of the counts, one for each second of RATE_WINDOW_S, with the time of each copy.
-        self._count_samples: deque[tuple[float, Counter[tuple[int, int]]]] = deque([(connection.now(), Counter())])
+        # One sample for each second of RATE_WINDOW_S.
+        self._count_samples: deque[_CountSample] = deque([_CountSample(connection.now(), Counter())])
         self._detach: list[Detach] = [
             connection.observe_frames(self._count_frame),
             *connection.attach([Event], self._on_event),
@@ -64,32 +72,36 @@ class MonitorModel:
     def update(self) -> None:
         """Store samples of the vehicles' positions and, once a second, of the message counts."""
         now = self.connection.now()
-        if now - self._count_samples[-1][0] >= 1.0:
-            self._count_samples.append((now, self._counts.copy()))
+        if now - self._count_samples[-1].at >= 1.0:
+            self._count_samples.append(_CountSample(now, self._counts.copy()))
             # Drop the oldest sample once the second oldest is at least as old as the window.
-            while now - self._count_samples[1][0] >= RATE_WINDOW_S:
+            while now - self._count_samples[1].at >= RATE_WINDOW_S:
                 self._count_samples.popleft()
         for system_id, vehicle in self.vehicles.items():
             position = vehicle.position.latest
             if position is not None:
-                point, track = self.metres(position.latitude_deg, position.longitude_deg), self.tracks[system_id]
+                point = self.metres(position.latitude_deg, position.longitude_deg)
+                track = self.tracks[system_id]
                 if not track or math.dist(track[-1], point) >= MIN_POINT_DISTANCE_M:
                     track.append(point)
 
     def rates(self, system_id: int) -> list[tuple[str, float]]:
         """Return names and rates in Hz of a system's messages in the last five seconds, the highest rate first."""
-        begin_s, counts_at_begin = self._count_samples[0]
-        end_s, counts_at_end = self._count_samples[-1]
-        if end_s <= begin_s:
+        first = self._count_samples[0]
+        last = self._count_samples[-1]
+        duration_s = last.at - first.at
+        if duration_s <= 0.0:
             return []
         dialect = self.connection.bus.dialect
         rates = []
-        for (sender_id, message_id), count in counts_at_end.items():
+        for (sender_id, message_id), count in last.counts.items():
             if sender_id == system_id:
                 message = dialect.get(message_id)
                 name = f"message {message_id}" if message is None else message.NAME
-                rates.append((name, (count - counts_at_begin[sender_id, message_id]) / (end_s - begin_s)))
-        return sorted(rates, key=lambda rate: (-rate[1], rate[0]))
+                received = count - first.counts[sender_id, message_id]
+                rates.append((name, received / duration_s))
+        rates.sort()  # by name, which decides between equal rates
+        return sorted(rates, key=itemgetter(1), reverse=True)
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Convert a position to metres north and east of ``reference``. The first position becomes the reference."""

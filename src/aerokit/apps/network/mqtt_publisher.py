@@ -66,6 +66,7 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
         InvalidArgument: the address is invalid. The text omits the address if it may contain a password.
     """
     allowed = schemes or tuple(PORTS)
+    scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"
 
     def error(reason: str) -> InvalidArgument:
         shown_address = f"{scheme}://…" if "@" in text else text  # without the password
@@ -74,7 +75,6 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
             f" {allowed[0]}://10.0.0.5:{PORTS[allowed[0]]}/fleet/alpha (% and @ : / ? # in a password: %25, %40 …)"
         )
 
-    scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"
     if scheme not in allowed:
         if "@" in text:
             scheme = "…"  # not shown, because it may be a part of a password
@@ -136,7 +136,8 @@ class MqttLink(BaseLink):
     async def _connect(self) -> None:
         """Open the socket in a thread, then wait until the broker accepts or refuses the connection."""
         mqtt = import_optional(self.address, "paho.mqtt.client", "paho-mqtt", "mqtt")
-        broker, loop = self._broker, asyncio.get_running_loop()
+        broker = self._broker
+        loop = asyncio.get_running_loop()
         client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, reconnect_on_failure=False)
         client.connect_timeout = CONNECT_TIMEOUT_S
         client.will_set(self._alive_topic, b"offline", retain=True)
@@ -157,7 +158,8 @@ class MqttLink(BaseLink):
         if (sock := client.socket()) is None:
             raise LinkOpenError(f"cannot open {self.address}: the broker closed the connection")
         self._client = client
-        client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
+        client.on_connect = self._on_connect
+        client.on_disconnect = self._on_disconnect
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)

@@ -65,7 +65,9 @@ class Publishing:
     def __init__(self, vehicle: Vehicle, publisher: Publisher, states: frozenset[str] = frozenset()) -> None:
         self.published = 0
         """Number of messages published so far."""
-        self._vehicle, self._publisher, self._states = vehicle, publisher, states
+        self._vehicle = vehicle
+        self._publisher = publisher
+        self._states = states
         self._has_logged_error = False
         self._sent: dict[str, tuple[float, object]] = {}  # maps states to time and value of their last message
 

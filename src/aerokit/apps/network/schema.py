@@ -107,12 +107,14 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
 
     Adds the types that the schema refers to by name to ``definitions``.
     """
-    origin, arguments = typing.get_origin(value_type), typing.get_args(value_type)
+    origin = typing.get_origin(value_type)
+    arguments = typing.get_args(value_type)
     if origin in (typing.Union, types.UnionType):
         return {"anyOf": [_schema_of(argument, definitions) for argument in arguments]}
     if origin in (tuple, list):
-        if len(arguments) == 2 and arguments[1] is ...:
-            return {"type": "array", "items": _schema_of(arguments[0], definitions)}
+        first_type, *other_types = arguments
+        if other_types == [Ellipsis]:  # any number of values of one type: tuple[float, ...]
+            return {"type": "array", "items": _schema_of(first_type, definitions)}
         items = [_schema_of(argument, definitions) for argument in arguments]
         return {"type": "array", "prefixItems": items, "minItems": len(items), "maxItems": len(items)}
     if isinstance(value_type, type) and issubclass(value_type, Snapshot):

@@ -154,6 +154,7 @@ def document(operations: Iterable[Operation], root_path: str = "") -> dict[str, 
 
 
 def _operation(operation: Operation) -> dict[str, Any]:
+    """Return the OpenAPI description of an operation."""
     is_order = operation.order is not None
     answer = {"$ref": "#/components/schemas/Order"} if is_order else {"type": "object"}
     description: dict[str, Any] = {
@@ -280,7 +281,10 @@ class HttpApi:
         settings: dict[str, Any],
         metadata: Metadata | None = None,
     ) -> None:
-        self._served, self._orders, self._access, self._settings = served, orders, access, settings
+        self._served = served
+        self._orders = orders
+        self._access = access
+        self._settings = settings
         self._metadata = metadata
         self._locks: dict[Vehicle, asyncio.Lock] = {}
         # Downloaded missions, fences and rally points, with the time of each download.
@@ -288,8 +292,9 @@ class HttpApi:
         served.listen(self._on_message)
 
     def operations(self) -> tuple[Operation, ...]:
-        path, refresh = "/api/vehicles/{system_id}", ("refresh",)
+        path = "/api/vehicles/{system_id}"
         parameter_path = f"{path}/parameters/{{name}}"
+        refresh = ("refresh",)
         get = partial(Operation, "GET")
         return (
             get("/api", "about", "Version and settings of this server", self._about, is_open=True),
@@ -327,14 +332,21 @@ class HttpApi:
             except Exception as error:
                 response = problem_response(error)
                 if response.status_code == 500:
-                    raise
+                    raise  # Starlette logs the error, and sends the response of `_server_error`
                 return response
 
         return answer
 
     def _order_operation(self, method: str, path: str, order_type: OrderType) -> Operation:
-        name, handler = order_type.name.replace("/", "_"), partial(self._run_order, order_type)
-        return Operation(method, path, name, order_type.summary, handler, order_type, query=("wait",))
+        return Operation(
+            method,
+            path,
+            name=order_type.name.replace("/", "_"),
+            summary=order_type.summary,
+            handler=partial(self._run_order, order_type),
+            order=order_type,
+            query=("wait",),
+        )
 
     async def _about(self, request: Request) -> Response:
         return json_response({"aerokit": __version__, "bits": _BITS, **self._settings})
@@ -347,10 +359,10 @@ class HttpApi:
 
     async def _vehicle(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
-        built_in = vehicle.autopilot.modes.names
-        modes = [*built_in, *(name for name in vehicle.telemetry.mode_names.values() if name not in built_in)]
+        # Some vehicles report the names of their modes, which may include others than those of the firmware.
+        names = dict.fromkeys([*vehicle.autopilot.modes.names, *vehicle.telemetry.mode_names.values()])
         unselectable = vehicle.autopilot.unselectable_modes
-        return json_response({**overview(vehicle), "modes": [name for name in modes if name not in unselectable]})
+        return json_response({**overview(vehicle), "modes": [name for name in names if name not in unselectable]})
 
     async def _texts(self, request: Request) -> Response:
         return json_response({"texts": self._served.texts(self._vehicle_of(request).system_id)})
@@ -409,7 +421,8 @@ class HttpApi:
         return json_response(checked)
 
     async def _parameters(self, request: Request) -> Response:
-        vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)
+        vehicle = self._vehicle_of(request)
+        is_refresh = self._is_refresh(request)
         async with self._lock(vehicle):
             table = await vehicle.parameters.download(refresh=is_refresh)
         metadata = self._metadata_of(vehicle)
@@ -432,6 +445,7 @@ class HttpApi:
         return json_response(self._orders.get(request.path_params["key"]).to_dict())
 
     async def _run_order(self, order_type: OrderType, request: Request) -> Response:
+        """Start an order and answer when it has ended or, with ``wait=false``, after a short time."""
         vehicle = self._vehicle_of(request)
         waits = query_flag(request, "wait", default=True)
         arguments = await read_body(request, order_type.max_body_size)
@@ -459,7 +473,7 @@ class HttpApi:
         return vehicle.parameters.metadata or self._metadata
 
     def _is_refresh(self, request: Request) -> bool:
-        # A refresh needs the token, like an order, because it uses the vehicle's link.
+        """Return the query flag ``refresh``, which requires the token, because a refresh uses the vehicle's link."""
         is_refresh = query_flag(request, "refresh", default=False)
         if is_refresh:
             self._access.check(request.headers, needs_token=True)

@@ -49,7 +49,8 @@ class ServeApp:
         self.token = token
         """Token that orders require. Reading also requires it, unless ``open_reading`` is set."""
         self._access = access
-        self._served, self._orders = served, OrderRunner(served)
+        self._served = served
+        self._orders = OrderRunner(served)
         api = HttpApi(served, self._orders, access, settings, metadata)
         stream = StateStream(served, self._orders, access)
         operations = api.operations()

@@ -19,8 +19,10 @@ SURFACE_TYPES = (MavType.GROUND_ROVER, MavType.SURFACE_BOAT, MavType.SUBMARINE)
 DISARM_DELAY_TOLERANCE_S = 1.5
 DISARM_ORDER_MAX_AGE_S = 5.0
 
-CRASH_STILL_S, CRASH_STILL_SAMPLES = 2.0, 3
-"""A crashed vehicle does not move for this many seconds, in at least this many reports of its velocity."""
+CRASH_STILL_S = 2.0
+"""A crashed vehicle does not move for this many seconds."""
+CRASH_STILL_SAMPLES = 3
+"""In these seconds, a crashed vehicle sends at least this many reports of its velocity."""
 CRASH_STILL_WITHIN_S = 3.0
 """A crashed vehicle comes to rest at most this many seconds after the impact."""
 CRASH_EVIDENCE_WITHIN_S = 10.0
@@ -61,20 +63,22 @@ class FlightWatch:
         self._vehicle = vehicle
         self._impact = ImpactDetector(vehicle.telemetry)
         self._crash: dict[str, Any] | None = None
-        self._last_sink_at, self._last_sink_m_s = -math.inf, 0.0
+        self._last_sink_at = -math.inf
+        self._last_sink_m_s = 0.0
         self._is_impact_dismissed = False
         self._impact_at: float | None = None
         self._impact_height_m: float | None = None
         self._was_sudden_stop = False
-        self._still_since, self._still_samples = math.inf, 0
-        self._moving_since = math.inf  # Since when the crashed vehicle has been moving.
+        self._still_since = math.inf
+        self._still_samples = 0
+        self._moving_since = math.inf  # since when the crashed vehicle has been moving
         self._take_off_height_m: float | None = None  # where the crashed vehicle reported a take-off
         self._armed_at: float | None = None
         self._armed_until = -math.inf
         self._was_in_air = False
         self._disarm_ordered_at = -math.inf
         self._disarming: tuple[float, float] | None = None
-        self._stops: tuple[Callable[[], None], ...] = (
+        self._detachments: tuple[Callable[[], None], ...] = (
             vehicle.velocity.observe(self._on_velocity, every_arrival=True),
             vehicle.armed.observe(self._on_armed),
             vehicle.landed_state.observe(self._on_landed),
@@ -82,14 +86,14 @@ class FlightWatch:
 
     def close(self) -> None:
         """Stop following the vehicle."""
-        for stop in self._stops:
-            stop()
+        for detach in self._detachments:
+            detach()
 
     @property
     def crash(self) -> dict[str, Any] | None:
         """The crash: ``text``, such as "hit the ground at 11.6 m/s", and ``at_unix_s``, the time of the impact.
 
-        None if there was no crash, or if the vehicle has moved, taken off or was armed again since the crash.
+        It is None if there was no crash, or if the vehicle has moved, taken off or was armed again since the crash.
         """
         return self._crash
 
@@ -103,13 +107,16 @@ class FlightWatch:
         if self._disarming is None:
             return None
         at, armed_for_s = self._disarming
-        parameter, delay_s = self.disarm_parameter, self.disarm_delay_s
+        delay_s = self.disarm_delay_s
+        is_automatic = False
+        if delay_s is not None and delay_s != 0.0:
+            is_automatic = abs(armed_for_s - delay_s) <= DISARM_DELAY_TOLERANCE_S
         return {
             "age_s": round(self._now() - at, 1),
             "armed_for_s": round(armed_for_s, 1),
-            "parameter": parameter,
+            "parameter": self.disarm_parameter,
             "delay_s": delay_s,
-            "is_automatic": bool(delay_s) and abs(armed_for_s - (delay_s or 0.0)) <= DISARM_DELAY_TOLERANCE_S,
+            "is_automatic": is_automatic,
         }
 
     @property
@@ -133,7 +140,8 @@ class FlightWatch:
         if is_armed:
             # If the vehicle was armed before this program started, the time of arming is unknown.
             self._armed_at = now if before is False else None
-            self._was_in_air, self._disarming = self._vehicle.landed_state.latest in _IN_AIR, None
+            self._was_in_air = self._vehicle.landed_state.latest in _IN_AIR
+            self._disarming = None
             self._reset()
         elif before:
             self._armed_until = now
@@ -152,34 +160,41 @@ class FlightWatch:
                 self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
+        """Detect when an impact begins or is over, and evaluate it with each new velocity."""
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
-        at, down_m_s = self._vehicle.velocity.updated_at, velocity.down_m_s
+        at = self._vehicle.velocity.updated_at
+        down_m_s = velocity.down_m_s
         had_impact = bool(self._impact.describe())
         self._impact.update()
+        has_impact = bool(self._impact.describe())
         if down_m_s >= IMPACT_M_S:
-            self._last_sink_at, self._last_sink_m_s = at, down_m_s
-        elif not self._impact.describe():
+            self._last_sink_at = at
+            self._last_sink_m_s = down_m_s
+        elif not has_impact:
             self._forget_impact()
         elif not had_impact:
             self._start_impact(at, down_m_s)
         if self._impact_at is not None:
-            self._evaluate_impact(at, velocity.ground_speed_m_s, abs(down_m_s))
+            self._evaluate_impact(at, velocity.ground_speed_m_s, vertical_speed_m_s=abs(down_m_s))
 
     def _start_impact(self, at: float, down_m_s: float) -> None:
         self._forget_impact()
-        self._impact_at, self._impact_height_m = at, height_above_home(self._vehicle.telemetry)
+        self._impact_at = at
+        self._impact_height_m = height_above_home(self._vehicle.telemetry)
         self._was_sudden_stop = self._last_sink_m_s - down_m_s >= CRASH_STOP_M_S2 * (at - self._last_sink_at)
         armed = self._vehicle.armed.latest
         self._is_impact_dismissed = not armed and at - self._armed_until > CRASH_ARMED_WITHIN_S
 
-    def _evaluate_impact(self, at: float, ground_speed_m_s: float, climb_m_s: float) -> None:
+    def _evaluate_impact(self, at: float, ground_speed_m_s: float, vertical_speed_m_s: float) -> None:
+        """Decide whether the vehicle has crashed or, after a crash, whether it flies again."""
         if self._is_impact_dismissed or self._impact_at is None:
             return
-        is_still = ground_speed_m_s < STILL_M_S and climb_m_s < CRASH_STILL_CLIMB_M_S
+        is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
         if self._crash is not None:
             self._moving_since = math.inf if is_still else min(self._moving_since, at)
-            is_moving = max(ground_speed_m_s, climb_m_s) >= MOVING_M_S or at - self._moving_since >= CRASH_STILL_S
+            is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
+            is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
             if self._vehicle.armed.latest and (is_moving or self._has_climbed):
                 self._dismiss_impact()  # the vehicle flies again
             return
@@ -187,7 +202,8 @@ class FlightWatch:
             self._still_since = min(self._still_since, at)
             self._still_samples += 1
         elif at - self._impact_at <= CRASH_STILL_WITHIN_S:  # the vehicle may still come to rest
-            self._still_since, self._still_samples = math.inf, 0
+            self._still_since = math.inf
+            self._still_samples = 0
         else:
             self._dismiss_impact()
             return
@@ -203,18 +219,18 @@ class FlightWatch:
     @property
     def _has_climbed(self) -> bool:
         """True if the vehicle has climbed since it reported, after a crash, that it took off."""
-        height_m, take_off_height_m = height_above_home(self._vehicle.telemetry), self._take_off_height_m
-        if height_m is None or take_off_height_m is None:
+        height_m = height_above_home(self._vehicle.telemetry)
+        if height_m is None or self._take_off_height_m is None:
             return False
-        return height_m - take_off_height_m >= CLIMBED_M
+        return height_m - self._take_off_height_m >= CLIMBED_M
 
     def _has_crashed(self, at: float) -> bool:
         if at - self._still_since < CRASH_STILL_S or self._still_samples < CRASH_STILL_SAMPLES:
             return False
-        vehicle, height_m = self._vehicle, height_above_home(self._vehicle.telemetry)
-        is_on_ground = is_reported_on_ground(vehicle, max_age_s=CRASH_LANDED_MAX_AGE_S)
-        if vehicle.armed.latest is False or is_on_ground:
+        is_on_ground = is_reported_on_ground(self._vehicle, max_age_s=CRASH_LANDED_MAX_AGE_S)
+        if self._vehicle.armed.latest is False or is_on_ground:
             return True
+        height_m = height_above_home(self._vehicle.telemetry)
         return self._was_sudden_stop and height_m is not None and abs(height_m) < CRASH_HEIGHT_M
 
     def _is_at_impact_height(self) -> bool:
@@ -224,12 +240,18 @@ class FlightWatch:
         return abs(height_m - self._impact_height_m) <= CRASH_STILL_HEIGHT_M
 
     def _dismiss_impact(self) -> None:
-        self._is_impact_dismissed, self._crash = True, None
+        self._is_impact_dismissed = True
+        self._crash = None
 
     def _forget_impact(self) -> None:
-        self._crash = self._impact_at = self._impact_height_m = None
-        self._still_since, self._still_samples, self._is_impact_dismissed = math.inf, 0, False
-        self._moving_since, self._take_off_height_m = math.inf, None
+        self._crash = None
+        self._impact_at = None
+        self._impact_height_m = None
+        self._is_impact_dismissed = False
+        self._still_since = math.inf
+        self._still_samples = 0
+        self._moving_since = math.inf
+        self._take_off_height_m = None
 
     def _reset(self) -> None:
         self._forget_impact()

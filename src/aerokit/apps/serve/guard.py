@@ -144,6 +144,7 @@ class SecurityMiddleware:
         await self._app(scope, receive, send_with_headers)
 
     def _check(self, headers: Headers) -> None:
+        """Raise HttpProblem if the request is for another host, or comes from a page of another site."""
         host = headers.get("host", "")
         if not self._is_own_host(host):
             raise HttpProblem(421, "WrongHost", f"host name {host[:100]!r} is not allowed; --allow-host allows it")
@@ -160,7 +161,7 @@ class SecurityMiddleware:
             if name in self._hosts:
                 return True
             ipaddress.ip_address(name)
-        except ValueError:
+        except ValueError:  # neither an allowed name nor an IP address
             return False
         return True
 
@@ -258,4 +259,7 @@ def _oldest_of_busiest_host(connections: Iterable[_HttpConnection]) -> _HttpConn
 
 
 def _host(connection: H11Protocol) -> object:
-    return connection.client and connection.client[0]
+    if connection.client is None:
+        return None
+    host, _port = connection.client
+    return host

@@ -59,12 +59,16 @@ class OrderArgument:
     is_required: bool = False
 
 
+def _parse_unchanged(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    return dict(values), dict(values)
+
+
 @dataclass(frozen=True)
 class OrderType:
     """One type of order: its arguments, and the function that runs it.
 
-    ``is_safe`` marks an order that brings the vehicle to rest. Such orders are sent even to a silent vehicle. ``parse``
-    converts the arguments to two dicts: the arguments to record, and the arguments for ``run``.
+    ``is_safe`` marks an order that brings the vehicle to rest. These orders are sent even to a silent vehicle.
+    ``parse`` converts the arguments to two dicts: the arguments to record, and the arguments for ``run``.
     """
 
     name: str
@@ -72,14 +76,14 @@ class OrderType:
     run: Callable[[Vehicle, dict[str, Any]], Awaitable[object]]
     arguments: Mapping[str, OrderArgument] = field(default_factory=dict)
     is_safe: bool = False
-    parse: Callable[[Mapping[str, Any]], tuple[dict[str, Any], dict[str, Any]]] = lambda values: (
-        dict(values),
-        dict(values),
-    )
+    parse: Callable[[Mapping[str, Any]], tuple[dict[str, Any], dict[str, Any]]] = _parse_unchanged
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Check the names of the arguments; raise InvalidArgument for wrong names. The library checks the values."""
+        """Raise InvalidArgument if an argument is unknown or missing, or if it is wrongly a bool or no bool.
+
+        The library checks the other values.
+        """
         for name in values:
             if name not in self.arguments:
                 names = ", ".join(self.arguments) or "none"
@@ -167,8 +171,9 @@ def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
         FileFormatError: the body has neither format; the text names the position of the error.
         InvalidArgument: an item of the plan cannot be sent to a vehicle.
     """
-    content, name = values["plan"], values.get("name")
+    name = values.get("name")
     name = name[:100] if isinstance(name, str) else "plan"
+    content = values["plan"]
     text = content if isinstance(content, str) else json.dumps(content)
     return name, text, parse_plan_text(text, name)
 
@@ -349,7 +354,8 @@ class OrderRunner:
         now = asyncio.get_running_loop().time()
         # The clock of the loop stands still while the computer sleeps, so the sleep is added to the age of the state.
         slept_s = 0.0 if seen_at_s is None else vehicle.connection._slept_since(seen_at_s)
-        if seen_at_s is not None and not 0 <= now - seen_at_s + slept_s <= STATE_MAX_AGE_S:
+        state_age_s = 0.0 if seen_at_s is None else now - seen_at_s + slept_s
+        if not 0 <= state_age_s <= STATE_MAX_AGE_S:
             raise HttpProblem(
                 409,
                 "Late",
@@ -370,13 +376,14 @@ class OrderRunner:
                 f"{order_type.name}: vehicle {vehicle.system_id} is silent"
                 f" (last heartbeat {vehicle.heartbeat_age:.1f} s ago); nothing was sent"
             )
-        running = [record for record in self._records.values() if record.state == "running"]
-        if sum(record.system_id == vehicle.system_id for record in running) >= MAX_RUNNING:
+        records = [record for record in self._records.values() if record.system_id == vehicle.system_id]
+        if len([record for record in records if record.state == "running"]) >= MAX_RUNNING:
             raise BusyError(
                 f"{MAX_RUNNING} orders to vehicle {vehicle.system_id} are already running; nothing was sent"
             )
 
     def _store(self, record: OrderRecord) -> None:
+        """Store an order. If there are too many, drop the oldest orders that have ended, except their keys."""
         self._records[record.key] = record
         ended_keys = [key for key, stored in self._records.items() if stored.state != "running"]
         for key in ended_keys:
@@ -400,7 +407,8 @@ class OrderRunner:
             )
             raise
         except Exception as error:
-            record.state, record.problem = "failed", problem_of(error)
+            record.state = "failed"
+            record.problem = problem_of(error)
             record.replaced_by = self._replacing(record, error)
             if record.problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
@@ -412,10 +420,13 @@ class OrderRunner:
         """Return the key of the newest order that replaced this one; None if the order ended for another reason."""
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
-        keys = list(self._records)
-        later = [self._records[key] for key in keys[keys.index(record.key) + 1 :]]
-        moving = [each for each in later if each.system_id == record.system_id and each.order not in _NOT_MOTION]
-        return moving[-1].key if moving else None
+        newest_key = None
+        is_later = False
+        for other in self._records.values():  # the oldest first
+            if is_later and other.system_id == record.system_id and other.order not in _NOT_MOTION:
+                newest_key = other.key
+            is_later = is_later or other is record
+        return newest_key
 
     def _publish(self, record: OrderRecord) -> None:
         self._served.publish({"type": "order", **record.to_dict()})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -63,7 +64,8 @@ class ServedVehicles:
         self._listeners: list[Listener] = []
         self._attached: dict[Connection, list[Detach]] = {}
         self._message_count = 0
-        self._snapshot: tuple[float, str] | None = None
+        self._snapshot = ""
+        self._snapshot_at = -math.inf
         # Errors of background tasks, such as the end of a connection, are ignored: the vehicles' states show the end.
         self._background = BackgroundTasks(lambda error: None)
         self._vehicles: Mapping[int, Vehicle] = {}
@@ -100,7 +102,7 @@ class ServedVehicles:
     def crash(self, vehicle: Vehicle) -> dict[str, Any] | None:
         """Return the impact after which a vehicle has not moved; None if there was none, or if it may have moved since.
 
-        It may have moved if it is silent, or reports no velocity.
+        A vehicle may have moved if it is silent, or reports no velocity.
         """
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
         is_observed = is_connected and vehicle.velocity.age <= VELOCITY_MAX_AGE_S
@@ -117,11 +119,12 @@ class ServedVehicles:
     def snapshot(self) -> str:
         """Return the current state of all vehicles as JSON, which is the message ``state`` of the stream."""
         now = asyncio.get_running_loop().time()
-        if self._snapshot is None or now - self._snapshot[0] > SNAPSHOT_MAX_AGE_S:
+        if now - self._snapshot_at > SNAPSHOT_MAX_AGE_S:
             vehicles = [self._state_of(vehicle) for vehicle in self.vehicles.values()]
             message = {"type": "state", "at_s": now, "vehicles": vehicles}
-            self._snapshot = now, json.dumps(message, ensure_ascii=False, allow_nan=False)
-        return self._snapshot[1]
+            self._snapshot = json.dumps(message, ensure_ascii=False, allow_nan=False)
+            self._snapshot_at = now
+        return self._snapshot
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call ``listener`` with each published message. Return a function that ends this."""
@@ -187,14 +190,19 @@ class ServedVehicles:
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
                 self._watch(vehicle)
-                position, track = vehicle.position.latest, self._tracks.setdefault(system_id, [])
+                position = vehicle.position.latest
                 if position is None or vehicle.position.age > TRACK_GAP_S:
                     silent.add(system_id)
-                elif not track or track[-1][0].distance_to(position) >= MIN_TRACK_STEP_M:
-                    if len(track) >= MAX_TRACK_POINTS:
-                        del track[1::2]
-                    track.append((position, system_id in silent))
-                    silent.discard(system_id)
+                    continue
+                track = self._tracks.setdefault(system_id, [])
+                if track:
+                    last_position, _ = track[-1]
+                    if last_position.distance_to(position) < MIN_TRACK_STEP_M:
+                        continue
+                if len(track) >= MAX_TRACK_POINTS:
+                    del track[1::2]
+                track.append((position, system_id in silent))
+                silent.discard(system_id)
             await anyio.sleep(TRACK_INTERVAL_S)
 
     async def _request_arming_checks(self) -> None:
@@ -210,8 +218,12 @@ class ServedVehicles:
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
         wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
         """
-        mission, watch, missing = vehicle.mission, self._watch(vehicle), vehicle.missing_for_flight()
+        watch = self._watch(vehicle)
+        missing = vehicle.missing_for_flight()
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
+        unread = []
+        if watch.disarm_parameter is not None and watch.disarm_delay_s is None:
+            unread.append(watch.disarm_parameter)
         return {
             **overview(vehicle),
             "missing_for_flight": missing,
@@ -222,19 +234,19 @@ class ServedVehicles:
             "disarming": watch.disarming,
             "disarm_parameter": watch.disarm_parameter,
             "disarm_delay_s": watch.disarm_delay_s,
-            "unread": [watch.disarm_parameter] if watch.disarm_parameter and watch.disarm_delay_s is None else [],
+            "unread": unread,
             "return_altitude_m": _return_altitude_m(vehicle),
             "failsafe": ground_station_failsafe(vehicle),
             "active_failsafe": active_failsafe(vehicle),
-            "mission_item": mission.current.latest,
-            "mission_items": mission.count.latest,
+            "mission_item": vehicle.mission.current.latest,
+            "mission_items": vehicle.mission.count.latest,
             "is_flying_mission": _is_flying_mission(vehicle),
             "unarmable_mode": unarmable_mode(vehicle),
         }
 
 
 async def _read_return_altitude(vehicle: Vehicle) -> None:
-    with suppress(AerokitError):  # The altitude then stays unknown.
+    with suppress(AerokitError):  # the altitude then stays unknown
         await vehicle.return_altitude()
 
 

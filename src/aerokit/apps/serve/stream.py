@@ -27,7 +27,9 @@ MAX_ANONYMOUS_SOCKETS = 16
 MAX_QUEUED_MESSAGES = 256
 """Maximum number of queued messages for each client. If a queue is full, its oldest message is dropped and counted."""
 SEND_TIMEOUT_S = 10.0
-DEFAULT_RATE_HZ, MAX_RATE_HZ, MIN_RATE_HZ = 5.0, 20.0, 0.1
+DEFAULT_RATE_HZ = 5.0
+MAX_RATE_HZ = 20.0
+MIN_RATE_HZ = 0.1
 
 
 class StateStream:
@@ -37,8 +39,11 @@ class StateStream:
     """
 
     def __init__(self, served: ServedVehicles, orders: OrderRunner, access: AccessControl) -> None:
-        self._served, self._orders, self._access = served, orders, access
-        self._open = self._anonymous = 0
+        self._served = served
+        self._orders = orders
+        self._access = access
+        self._open: set[WebSocket] = set()
+        self._anonymous: set[WebSocket] = set()
 
     async def endpoint(self, socket: WebSocket) -> None:
         try:
@@ -46,22 +51,23 @@ class StateStream:
         except HttpProblem as problem:
             await _deny(socket, problem)
             return
-        is_anonymous = not self._access.has_token(socket.headers)
-        self._open += 1
-        self._anonymous += is_anonymous
+        self._open.add(socket)
+        if not self._access.has_token(socket.headers):
+            self._anonymous.add(socket)
         try:
             is_requested = PROTOCOL in socket.scope.get("subprotocols", ())
             await socket.accept(PROTOCOL if is_requested else None)
             await self._serve(socket, 1 / rate_hz)
         finally:
-            self._open -= 1
-            self._anonymous -= is_anonymous
+            self._open.discard(socket)
+            self._anonymous.discard(socket)
 
     def _admit(self, socket: WebSocket) -> float:
+        """Return the rate of state messages that a client requests; raise HttpProblem if it is not admitted."""
         self._access.check(socket.headers)
-        if self._open >= MAX_SOCKETS:
+        if len(self._open) >= MAX_SOCKETS:
             raise HttpProblem(503, "TooManySockets", f"the maximum number of clients ({MAX_SOCKETS}) is connected")
-        if self._anonymous >= MAX_ANONYMOUS_SOCKETS and not self._access.has_token(socket.headers):
+        if len(self._anonymous) >= MAX_ANONYMOUS_SOCKETS and not self._access.has_token(socket.headers):
             raise HttpProblem(
                 503,
                 "TooManySockets",
@@ -77,6 +83,7 @@ class StateStream:
         return rate_hz
 
     async def _serve(self, socket: WebSocket, period_s: float) -> None:
+        """Send messages until the client disconnects, does not read, or sends a message itself."""
         sending = asyncio.ensure_future(self._send_messages(socket, period_s))
         receiving = asyncio.ensure_future(_receive(socket))
         tasks = {sending, receiving}
@@ -96,7 +103,10 @@ class StateStream:
             await asyncio.wait_for(socket.close(code), 1.0)
 
     async def _send_messages(self, socket: WebSocket, period_s: float) -> None:
-        loop, queue, changed = asyncio.get_running_loop(), deque[dict[str, Any]](), asyncio.Event()
+        """Send the message ``hello``, then the state at each period, and all other messages at once."""
+        loop = asyncio.get_running_loop()
+        queue: deque[dict[str, Any]] = deque()
+        changed = asyncio.Event()
         missed = 0  # number of messages that were dropped since the last message was sent
 
         def enqueue(message: dict[str, Any]) -> None:
@@ -118,7 +128,8 @@ class StateStream:
                 while queue:
                     message = dict(queue.popleft())  # a copy, because all clients get the same object
                     if missed:
-                        message["missed"], missed = missed, 0
+                        message["missed"] = missed
+                        missed = 0
                     await _send(socket, json.dumps(message, ensure_ascii=False))
                 changed.clear()
                 timer = loop.call_later(max(0.001, next_snapshot_at - loop.time()), changed.set)
