@@ -128,7 +128,7 @@ def test_abandoned_order_is_not_repeated(copter: FlightController, vehicle: dron
     with pytest.raises(dronekit.TimeoutError):
         orders[wait](timeout=0.05)
     wait_for(lambda: not vehicle._handler.calls._pending)
-    assert len(copter.commands()) == 1
+    assert len(copter.commands()) <= 1  # On a busy machine, the call may end before the order is sent.
 
 
 def test_raw_setpoint_overrules_simple_goto(
