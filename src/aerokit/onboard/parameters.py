@@ -134,8 +134,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._rows[name] = row
         if fits_param_value(row.type):
             self._small_names.append(name)
-        # Create the server with the first parameter, because a component without parameters may use PARAM_EXT for the
-        # settings of a camera.
+        # Create the server only when the first parameter is added, because a component without parameters may use
+        # PARAM_EXT for the settings of a camera.
         if self._param_ext_server is None:
             self._param_ext_server = TypedExtendedServer(self._host, _Store(self))
 

@@ -172,9 +172,10 @@ class BlockRequests:
         return block.previous_sent_at if is_too_early else None
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
-        """Return the offsets to request now, retries first, and count them as sent.
+        """Return the offsets to request now, and count them as sent. Overdue blocks come first.
 
-        ``limit`` reduces the number of requests in flight.
+        ``limit`` reduces the number of requests in flight. Up to ``burst_size`` requests are sent at once; beyond that,
+        one request every ``spacing_s`` seconds.
         """
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)

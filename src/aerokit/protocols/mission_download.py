@@ -125,9 +125,10 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _on_count(self, message: MissionCount, now: float) -> None:
         opaque_id = message.opaque_id
         if self._count is None:
-            # PX4 (window 1) repeats MISSION_COUNT by itself, so the arrival of this message does not measure PX4's
-            # round trip.
-            if self._attempt == 1 and not self._restarts and self._window > 1:
+            # PX4, whose window is 1, repeats MISSION_COUNT by itself, so its arrival does not measure the round trip.
+            may_be_repeated = self._window == 1
+            is_first_request = self._attempt == 1 and not self._restarts
+            if is_first_request and not may_be_repeated:
                 self.round_trip.add_sample(now - self._list_requested_at)
             # After a restart, the items received before stay valid only if the plan has the same id.
             if not opaque_id or opaque_id != self._opaque_id:

@@ -369,7 +369,8 @@ class _DeliveryQueue:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
-        self.latest_due = loop.time()
+        self.latest_due = loop.time()  # when the last callback is due; the present if there is none
+        # A heap of due time, number in order of insertion, and callback.
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._timer: asyncio.TimerHandle | None = None

@@ -205,7 +205,10 @@ class _Axes:
 
 
 def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
-    """Draw the tracks from above, relative to the first home: east to the right, north upwards."""
+    """Draw the tracks from above, relative to the first home: east to the right, north upwards.
+
+    The circle or polygon of a failed assertion is dashed, and a mark shows where its track failed.
+    """
     origin = tracks[0].home
     paths = []
     outlines = []

@@ -124,9 +124,9 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
                 if step.needs_confirmation and not await press_enter():
                     scope.cancel()
                     await anyio.lowlevel.checkpoint()  # a cancellation takes effect here, before the next step
-            return DONE
-        # The scope was cancelled, so the calibration has not ended on the vehicle.
-        return await _cancel(options, calibration)
+        if scope.cancelled_caught:  # The calibration has not ended on the vehicle.
+            return await _cancel(options, calibration)
+    return DONE
 
 
 async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:

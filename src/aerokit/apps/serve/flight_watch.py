@@ -63,21 +63,24 @@ class FlightWatch:
         self._vehicle = vehicle
         self._impact = ImpactDetector(vehicle.telemetry)
         self._crash: dict[str, Any] | None = None
+        # The last descent at IMPACT_M_S or faster.
         self._last_sink_at = -math.inf
         self._last_sink_m_s = 0.0
-        self._is_impact_dismissed = False
+        # The last impact; None if there was none. It is dismissed once it is certain that it was no crash.
         self._impact_at: float | None = None
         self._impact_height_m: float | None = None
         self._was_sudden_stop = False
+        self._is_impact_dismissed = False
+        # Since when the vehicle has been still after the impact, and in how many reports of its velocity.
         self._still_since = math.inf
         self._still_samples = 0
         self._moving_since = math.inf  # since when the crashed vehicle has been moving
         self._take_off_height_m: float | None = None  # where the crashed vehicle reported a take-off
-        self._armed_at: float | None = None
-        self._armed_until = -math.inf
-        self._was_in_air = False
+        self._armed_at: float | None = None  # None if the vehicle was armed before this object was created
+        self._armed_until = -math.inf  # when the vehicle was last disarmed
+        self._was_in_air = False  # since the last arming
         self._disarm_ordered_at = -math.inf
-        self._disarming: tuple[float, float] | None = None
+        self._disarming: tuple[float, float] | None = None  # when, and after how many seconds armed
         self._detachments: tuple[Callable[[], None], ...] = (
             vehicle.velocity.observe(self._on_velocity, every_arrival=True),
             vehicle.armed.observe(self._on_armed),

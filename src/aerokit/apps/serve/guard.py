@@ -110,14 +110,16 @@ class SecurityMiddleware:
     rebinding); other names must be in ``hosts``. Browsers send the Origin of the page that makes a request.
     """
 
-    def __init__(self, app: ASGIApp, hosts: Collection[str], tiles: str | None) -> None:
+    def __init__(self, app: ASGIApp, hosts: Collection[str], tile_url: str | None) -> None:
         self._app = app
+        # Public servers of map tiles refuse requests without a Referer header.
+        referrer_policy = "no-referrer" if tile_url is None else "strict-origin-when-cross-origin"
         self._hosts = {"localhost", *(host.lower() for host in hosts)}
         self._headers = {
-            "Content-Security-Policy": content_policy(tiles),
+            "Content-Security-Policy": content_policy(tile_url),
             "X-Content-Type-Options": "nosniff",
             "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer" if tiles is None else "strict-origin-when-cross-origin",
+            "Referrer-Policy": referrer_policy,
             "Cross-Origin-Opener-Policy": "same-origin",
             "Cross-Origin-Resource-Policy": "same-origin",
         }

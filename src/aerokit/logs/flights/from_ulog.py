@@ -85,7 +85,7 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
     """
     pyulog = import_module("pyulog")
     try:
-        # pyulog prints about damage to stdout, which may be for JSON.
+        # pyulog prints messages about damaged files to stdout, where the JSON of a command may go.
         with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file, redirect_stdout(sys.stderr):
             log = pyulog.ULog(file, list(_TOPICS))
     except Exception as error:  # pyulog raises arbitrary errors for other files
