@@ -186,6 +186,10 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
 
     async def _arm_in_present_mode(self, force: bool, timeout: float, max_silence_s: float | None) -> None:
+        """Send the arm command once, and wait for its effect.
+
+        After any error but a refusal, `ArmCleanup` watches whether the vehicle arms late, and disarms it.
+        """
         started, was_armed = self.connection.now(), self.telemetry.is_armed
         with self._arbiter.auxiliary_order() as order:
             try:

@@ -80,6 +80,7 @@ class FollowedTarget:
     def __init__(self, target: FollowTarget, now: Callable[[], float]) -> None:
         self._target, self._now = target, now
         self.latest: TargetState | None = None
+        # Seconds between the last two different positions.
         self._interval_s = 0.0
 
     def read(self) -> TargetState | None:
@@ -173,13 +174,20 @@ class FollowStream(SteeringStream[TargetState]):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
         unknown = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)  # replaced when the stream is entered
         super().__init__(context, self._encode_place, unknown, RATE_HZ, valid_for_s, MAX_LAG_S)
-        self._target, self._tracker = target, FollowedTarget(target, self._now)
+        self._target = target
+        self._tracker = FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
-        self._place, self._max_distance_m = place, max_distance_m
+        self._place = place
+        self._max_distance_m = max_distance_m
         self._impact = ImpactDetector(context.session.telemetry)
+        # Cancels the background task that reads the target, if there is one.
         self._reading: Cancellation | None = None
+        # Why the source of positions ended or failed, as a clause; empty while it works.
         self._end_reason = ""
-        self._bearing_deg = self._course_deg = self._own_altitude_m = 0.0
+        # Set when the block is entered: bearing from the target, course of the target, altitude of the follower.
+        self._bearing_deg = 0.0
+        self._course_deg = 0.0
+        self._own_altitude_m = 0.0
 
     @property
     def target(self) -> Position | None:
@@ -207,6 +215,7 @@ class FollowStream(SteeringStream[TargetState]):
     # ------------------------------------------------------------------------------- the block
 
     async def __aenter__(self) -> Self:
+        """Wait for the first position of the target, and then begin the stream in the mode for set-points."""
         self._raise_if_entered()
         self._context.vehicle_position.check_flying("follow")
         mode = self._stream_mode()

@@ -187,17 +187,22 @@ class Order:
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
-        # Sets of modes, by their numbers in HEARTBEAT.custom_mode.
+        # Sets of modes, by their numbers in HEARTBEAT.custom_mode. A mode outside of these sets is a takeover.
         self._own_modes = {mode.custom_mode for mode in modes}
         self._expected_modes = set(expected)
         self._modes_before = set() if mode_before is None else {mode_before.custom_mode} - self._expected_modes
         self._accepted_modes = self._modes_before | self._expected_modes
+        # The last reports of the vehicle: mode, arming and MAV_STATE. None before the first report.
         self._mode_now = None if mode_before is None else mode_before.custom_mode
         self._armed_now = armed_before
-        self._state_before, self._ends_flight = state_before, ends_flight
-        self._ends_on_mode_change, self._ends_on_disarm = ends_on_mode_change, ends_on_disarm
+        self._state_before = state_before
+        # An order that ends the flight (land, return, disarm) stays valid during a failsafe.
+        self._ends_flight = ends_flight
+        self._ends_on_mode_change = ends_on_mode_change
+        self._ends_on_disarm = ends_on_disarm
         self._is_newest = is_newest
-        self._settles_at, self._any_mode_until = settles_at, any_until
+        self._settles_at = settles_at
+        self._any_mode_until = any_until
         self._requires_mode_change = requires_mode_change
 
     @property
@@ -315,13 +320,16 @@ class SentCommand:
         self.heartbeat_at: float = -math.inf
         """Time of the last HEARTBEAT."""
         self._is_effect_reported = False
+        # Modes, by their numbers in HEARTBEAT.custom_mode: the last reported one, and those that the command leads to.
         self._mode_now = None if mode_now is None else mode_now.custom_mode
         self._modes = {mode.custom_mode for mode in modes}
         self._armed_now = armed_now
         self.arms = armed
         """True if the command arms the vehicle, False if it disarms it, None if it does neither."""
+        # True once a newer command of the program disarms what this one arms, or the reverse.
         self._is_overruled = False
-        self._is_done, self._slept_s = is_done, slept_s
+        self._is_done = is_done
+        self._slept_s = slept_s
 
     @property
     def is_confirmed(self) -> bool:

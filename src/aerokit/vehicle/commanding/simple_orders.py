@@ -191,8 +191,8 @@ class SimpleOrder(Snapshot):
                 reports[:] = [message]
                 is_reported = is_reported or effect.is_reported(message, *values)
 
-        def is_done() -> bool:
-            """Return True once the effect is reported; until then, request the message again and again."""
+        def poll_effect() -> bool:
+            """Return True once the effect is reported; until then, request the message every EFFECT_POLL_S."""
             nonlocal requested_at
             if not is_reported and session.connection.now() - requested_at >= EFFECT_POLL_S:
                 requested_at = session.connection.now()
@@ -206,7 +206,7 @@ class SimpleOrder(Snapshot):
                 await await_progress(
                     session,
                     self.name,
-                    is_done=is_done,
+                    is_done=poll_effect,
                     failure_reason=lambda: _supersession(device_order),
                     describe=lambda: str(reports[0]) if reports else f"no {message_type.NAME} was received",
                     timeout=timeout,
