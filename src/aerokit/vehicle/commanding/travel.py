@@ -96,7 +96,7 @@ class TravelActions(VehicleBase):
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
-        is_under_way = False
+        is_under_way = False  # True once the vehicle has accepted the target.
         try:
             unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
             is_under_way = True
@@ -279,6 +279,7 @@ class TravelActions(VehicleBase):
         order: Order,
         mode: Mode,
     ) -> None:
+        """Wait until a heading received after this call is within ``tolerance_deg`` of ``goal_deg``."""
         started = self.connection.now()
         heading = self.telemetry.heading_deg
 
@@ -354,6 +355,7 @@ class TravelActions(VehicleBase):
         return self.autopilot.reposition is not None and self.autopilot.reposition.yaw
 
     def _reposition_yaw(self, heading_deg: float | None) -> float:
+        """Return the yaw of MAV_CMD_DO_REPOSITION in radians; NaN leaves the yaw to the autopilot."""
         if heading_deg is None or not self._turns_by_reposition:
             return math.nan
         return math.remainder(math.radians(heading_deg), 2 * math.pi)
