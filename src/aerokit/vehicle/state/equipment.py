@@ -53,7 +53,8 @@ NORTH_CDEG = 36000
 # The MAV_SENSOR_ORIENTATION of a sensor that looks straight down (MAV_SENSOR_ROTATION_PITCH_270).
 LOOKING_DOWN = 25
 
-GPS_FIX_TYPE_3D = 3
+# The fix types from a 3D fix to PPP, the best one (GPS_FIX_TYPE).
+GPS_FIX_TYPE_3D, GPS_FIX_TYPE_PPP = 3, 8
 
 # Largest cell voltage in BATTERY_STATUS, in mV. The total of a pack above 65.5 V is reported as several "cells", whose
 # sum is the total: all of them except the last have this value.
@@ -104,7 +105,7 @@ class GpsReceiver(Snapshot):
     @property
     def has_3d_fix(self) -> bool:
         """True for a 3D fix or better."""
-        return GPS_FIX_TYPE_3D <= self.fix_type <= 8
+        return GPS_FIX_TYPE_3D <= self.fix_type <= GPS_FIX_TYPE_PPP
 
 
 class Battery(Snapshot):
@@ -186,6 +187,7 @@ def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
+    """Return the receiver of this message. The position is None without a 2D fix, other values while unknown."""
     has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
     coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
     latitude, longitude = coordinates or (None, None)
