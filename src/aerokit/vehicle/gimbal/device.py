@@ -179,6 +179,7 @@ class GimbalDevice:
         # False if the program has named this gimbal, but no message from it was received.
         self.is_discovered = False
         self.pending_orders: int = 0  # number of calls that wait for an order to this gimbal
+        # Rank of the known manager, and time stamp of its newest status; see `update_manager` and `update_status`.
         self._manager_rank = 0
         self._status_ms = 0
         self._system_id = context.session.system_id
@@ -239,17 +240,20 @@ class GimbalDevice:
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
-            self.manager_id, self._manager_rank = component_id, rank
+            self.manager_id = component_id
+            self._manager_rank = rank
             self._status_ms = 0  # The time stamps of the new manager are from another clock.
 
     def reset(self) -> None:
         """Forget what the gimbal and its manager have reported, because the vehicle has rebooted."""
         self.reboots += 1
-        self._status_ms = self._manager_rank = 0
+        self._status_ms = 0
+        self._manager_rank = 0
         self.manager_id = self.component_id if self.number else None
         self.flags = 0
         self.failures = 0
-        self.manager_information = self.device_information = None
+        self.manager_information = None
+        self.device_information = None
 
     def describe_failures(self) -> str:
         return str(GimbalDeviceErrorFlags(self.failures).name or self.failures) if self.failures else ""

@@ -145,6 +145,7 @@ class GimbalRegistry:
         return device
 
     def _on_device(self, message: GimbalDeviceAttitudeStatus) -> None:
+        """Set the attitude of the gimbal, and of the placeholder if this is the first gimbal that reports one."""
         device = self._device_of(message, message.gimbal_device_id)
         if device is None:
             return
@@ -153,7 +154,7 @@ class GimbalRegistry:
         if all(map(math.isfinite, message.q)):
             attitude = from_device(message, self._heading())
         device.set_attitude(message, attitude)
-        if device is self.first_reporting:  # This is the first gimbal that reports its attitude.
+        if device is self.first_reporting:
             self.placeholder.update_flags(message)
             self.placeholder.set_attitude(message, attitude)
 

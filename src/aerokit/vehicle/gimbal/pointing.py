@@ -66,7 +66,8 @@ class RestTarget:
     """
 
     def __init__(self, flag: int, *, accepts_ahead: bool) -> None:
-        self._flag, self._accepts_ahead = flag, accepts_ahead
+        self._flag = flag
+        self._accepts_ahead = accepts_ahead
         # Angles (pitch, roll, yaw from the nose) at the last movement, and its time.
         self._last_angles: tuple[float, float, float] | None = None
         self._moved_at = 0.0
@@ -75,7 +76,8 @@ class RestTarget:
         attitude, updated_at = device.attitude.value, device.attitude.updated_at
         pitch, roll, yaw = attitude.pitch_deg or 0.0, attitude.roll_deg or 0.0, attitude.yaw_from_nose_deg or 0.0
         if self._has_moved((pitch, roll, yaw)):
-            self._last_angles, self._moved_at = (pitch, roll, yaw), updated_at
+            self._last_angles = (pitch, roll, yaw)
+            self._moved_at = updated_at
             return False
         is_ahead = abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
         is_at_rest = bool(device.flags & self._flag) or (self._accepts_ahead and is_ahead)
@@ -148,6 +150,7 @@ async def wait_until_reached(
 
 
 def _describe_state(orders: GimbalOrders, since: float) -> str:
+    """Return a clause about the gimbal's attitude, failures and limits; the order was given at ``since``."""
     source, device = orders.attitude_source, orders.device
     attitude = source.attitude
     if not attitude.is_known:
@@ -174,7 +177,10 @@ def _format_angles(angles: Angles) -> str:
 
 
 def _format_limits(limits: tuple[float, float] | None) -> str:
-    return "unknown" if limits is None else f"{limits[0]:g} to {limits[1]:g}"
+    if limits is None:
+        return "unknown"
+    lowest, highest = limits
+    return f"{lowest:g} to {highest:g}"
 
 
 # Beyond this pitch up or down, yaw and roll are the same rotation.

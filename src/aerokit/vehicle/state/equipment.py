@@ -187,7 +187,7 @@ def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
-    """Return the receiver of this message. The position is None without a 2D fix, other values while unknown."""
+    """Return the receiver of this message, without a position if it has no fix."""
     has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
     coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
     latitude, longitude = coordinates or (None, None)
