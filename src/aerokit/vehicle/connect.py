@@ -115,7 +115,8 @@ async def connect(
         ConnectFailed: no heartbeat of the requested vehicle arrived in time; the error text says what was received
             instead.
     """
-    _check_arguments(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
+    used_dialect = address.bus.dialect if isinstance(address, Connection) else dialect
+    _check_arguments(system_id, timeout, rates, used_dialect)
     if isinstance(address, Connection):
         if record is not None:
             raise InvalidArgument(
@@ -191,6 +192,7 @@ async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None
 def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
+    """Raise InvalidArgument before anything is opened."""
     if system_id is not None and not 1 <= system_id <= 255:
         raise InvalidArgument(
             f"system_id = {system_id} is not allowed: it must be 1 to 255, or None for the first vehicle found"
@@ -274,6 +276,7 @@ class _Search:
 
     def __init__(self, connection: Connection, system_id: int | None) -> None:
         self._connection, self._system_id = connection, system_id
+        # The result: a vehicle that the caller has not received yet, or the error that ended the search.
         self._found: _Found | None = None
         self._error: Exception | None = None
         self._ended = asyncio.Event()

@@ -118,8 +118,12 @@ class Component(ReadOnly):
         parameters: Callable[[], Parameters],
         component_of: Callable[[int], Component],
     ) -> None:
-        self._session, self._sender, self._component_of = session, sender, component_of
-        self._make_files, self._make_parameters = files, parameters
+        self._session = session
+        self._sender = sender
+        # Returns the component with an id, of the same vehicle.
+        self._component_of = component_of
+        self._make_files = files
+        self._make_parameters = parameters
         self.system_id: int = session.system_id
         """System id of the vehicle."""
         self.component_id: int = session.component_id
@@ -341,6 +345,7 @@ async def _general_uri(component: Component, timeout: float) -> str:
 
 
 async def _read_json(component: Component, uri: str) -> dict[str, Any]:
+    """Read a metadata file by MAVFTP, decompress it if necessary, and return its JSON object."""
     if uri.lower().startswith(WEB_SCHEMES):
         raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
     data = decompress(await component.fetch(uri), uri)
@@ -368,9 +373,13 @@ class Components:
     def __init__(
         self, context: VehicleContext, files: Callable[[], Files], parameters: Callable[[], Parameters]
     ) -> None:
-        self._context, self._session = context, context.session
-        self._files, self._parameters = files, parameters
+        self._context = context
+        self._session = context.session
+        # Return the autopilot's objects, which the vehicle creates on first use.
+        self._files = files
+        self._parameters = parameters
         self._by_id: dict[int, Component] = {}
+        # Maps (component id, device id) to the last status.
         self._statuses: dict[tuple[int, int], ComponentStatus] = {}
         session = context.session
         self.cell: StateCell[tuple[ComponentStatus, ...]] = session.connection.new_cell("components", "HEARTBEAT")

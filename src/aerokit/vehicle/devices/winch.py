@@ -168,6 +168,7 @@ class Winch(ReadOnly):
     async def _send_until(
         self, flag: MavWinchStatusFlag, action: WinchActions, timeout: float = ACTION_TIMEOUT_S
     ) -> None:
+        """Send an order, and wait until WINCH_STATUS has this flag."""
         await self._send(action, is_done=lambda status: bool(status.status & flag), timeout=timeout)
 
     async def _send(

@@ -51,7 +51,7 @@ class External:
     def __init__(self, context: VehicleContext, probe: Probe) -> None:
         self._context, self._session, self._probe = context, context.session, probe
         self._encode = MeasurementEncoder(context.session)
-        self._answers = TimesyncAnswers(context.session)
+        self._timesync_answers = TimesyncAnswers(context.session)
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
         """Supply pose and velocity (ODOMETRY). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
@@ -173,6 +173,7 @@ class External:
         await self._await_origin(origin, timeout)
 
     async def _await_origin(self, origin: Position, timeout: float) -> None:
+        """Request GPS_GLOBAL_ORIGIN every POLL_INTERVAL_S until it reports this origin."""
         cell, connection = self._session.telemetry.origin, self._session.connection
         until = connection.now() + timeout
         while (remaining_s := until - connection.now()) > 0:
@@ -198,7 +199,7 @@ class External:
         valid_for_s: float,
     ) -> MeasurementStream[MeasurementT]:
         return MeasurementStream(
-            self._session, kind, value_type, encode, self._answers, self._probe, rate_hz, valid_for_s
+            self._session, kind, value_type, encode, self._timesync_answers, self._probe, rate_hz, valid_for_s
         )
 
 

@@ -57,6 +57,7 @@ class FileChannel:
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
+        # Sessions that are being closed in the background, by their ids.
         self._closing: dict[int, _Closing] = {}
 
     @asynccontextmanager
@@ -221,6 +222,7 @@ class _Closing:
         self.request, self.ended = request, asyncio.Event()
 
     async def confirm(self, transfers: Transfers) -> None:
+        """Wait for the reply, and repeat the request until then. `ended` is set in any case."""
         try:
             with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
                 await transfers.run(self.request)

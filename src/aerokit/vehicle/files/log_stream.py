@@ -41,11 +41,14 @@ class UlogAssembler:
     def __init__(self) -> None:
         self.lost: int = 0
         """Number of messages that were not received."""
+        # Expected sequence number; None before the first message.
         self._next_sequence: int | None = None
         self._has_header = False
         # False after a gap, until the beginning of a ULog message is received.
         self._is_aligned = False
+        # Data from the beginning of a ULog message on that is not complete yet.
         self._buffer = bytearray()
+        # Time of the last message that was used, to compute the duration of a gap.
         self._received_at = 0.0
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
@@ -116,6 +119,7 @@ class LogStream(ReadOnly):
         return self._assembler.lost
 
     async def __aenter__(self) -> Self:
+        """Begin to receive and acknowledge messages, and start the stream."""
         START.check_supported(self._context)
         self._messages.__enter__()
         session = self._context.session
@@ -140,6 +144,7 @@ class LogStream(ReadOnly):
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        """Stop the stream; after an error or a cancellation, without waiting for the acknowledgement."""
         is_stopped = False
         try:
             if error is None:
