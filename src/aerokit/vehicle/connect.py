@@ -258,6 +258,7 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
         for detach in detach_callbacks:
             detach()
         search.close()
+    # The time-out has expired.
     raise ConnectFailed(
         f"no heartbeat of {search.description} arrived within {timeout:g} s on {connection.link.address}:"
         f" {explain_no_vehicle(connection, system_id)}"

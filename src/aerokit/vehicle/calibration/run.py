@@ -96,7 +96,8 @@ class CalibrationRun:
                 raise BusyError(f"{self.call_name}: {run.call_name} is in progress; nothing was sent")
             await run.wait_cancelled()
         self.check_ready()  # The vehicle may have been armed during the wait.
-        self._cancel_command, self._cannot_cancel_reason = cancel, cannot_cancel_reason
+        self._cancel_command = cancel
+        self._cannot_cancel_reason = cannot_cancel_reason
         self._started_at = self.session.connection.now()
         self._runs.append(self)
         self.context.on_finish.append(self.abandon)

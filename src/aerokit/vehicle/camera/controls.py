@@ -324,6 +324,7 @@ class StorageMixin(CameraMixin):
                 if reported != mode:
                     await anyio.sleep(MODE_POLL_INTERVAL_S)
             return
+        # The time-out has expired.
         outcome = f"reports {reported}" if reported else "reports no mode"
         raise self._link.timeout_error(f"accepted the mode {mode}, but {outcome} after {timeout:g} s")
 

@@ -364,7 +364,8 @@ class CameraBlock:
     async def __aenter__(self) -> None:
         """Check the camera's capabilities, and start the operation."""
         await self._check()
-        operation = self._operation = ActiveOperation(self._link, self._subject, self._stop_command)
+        operation = ActiveOperation(self._link, self._subject, self._stop_command)
+        self._operation = operation
         try:
             await self._start(operation.order)
         except BaseException as error:

@@ -241,7 +241,8 @@ class PhotoInterval:
     async def __aenter__(self) -> Self:
         """Start the series."""
         await self._link.require_capability("photo_interval", "capture_image")
-        operation = self._operation = ActiveOperation(self._link, "series", lambda: self._shutter.stop_command)
+        operation = ActiveOperation(self._link, "series", lambda: self._shutter.stop_command)
+        self._operation = operation
         try:
             await self._begin(operation)
         except BaseException as error:
@@ -259,7 +260,7 @@ class PhotoInterval:
         before = await self._shutter.reliable_status()
         self._next_index = None if before is None else before.image_count
         first_index = 0 if before is None else before.image_count
-        self._newest_index, self._newest_at = first_index - 1, self._link.now()
+        self._set_newest(first_index - 1)
         self._known_reset_at = self._log.reset_at
         self._new_captures.__enter__()
         await self._shutter.start_series(operation.order, self._seconds, self._count, before)
@@ -333,7 +334,7 @@ class PhotoInterval:
                 self._known_reset_at = self._log.reset_at
                 self._next_index = first.index
                 self._is_start_guessed = False
-                self._newest_index, self._newest_at = first.index, self._link.now()
+                self._set_newest(first.index)
                 self._waiting = {first.index: first}
             # Without a status, the first capture determines the start. A later capture with a much lower index shows
             # that the first index was corrupt, and then determines the start instead.
@@ -352,7 +353,12 @@ class PhotoInterval:
                 if capture.index > self._newest_index:
                     if self._delivered:  # The start cannot be corrected once a capture was delivered.
                         self._is_start_guessed = False
-                    self._newest_index, self._newest_at = capture.index, self._link.now()
+                    self._set_newest(capture.index)
+
+    def _set_newest(self, index: int) -> None:
+        """Record the highest index so far."""
+        self._newest_index = index
+        self._newest_at = self._link.now()
 
     def _max_new_captures(self) -> float:
         """Upper limit of the number of pictures taken since the newest capture."""

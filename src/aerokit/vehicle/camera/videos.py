@@ -143,6 +143,7 @@ class VideoMixin(CameraMixin):
             if is_reported and is_recording is not expected:
                 await self.status.wait_until(lambda status: status.is_recording is expected)
             return
+        # The time-out has expired.
         outcome = "does not record" if expected else "still records"
         raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 

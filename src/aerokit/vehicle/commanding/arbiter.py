@@ -162,7 +162,8 @@ class CommandArbiter:
         self._ordered_since_disarmed.clear()
         # No order was given after this time (infinity), so `current` ignores all orders from before the reboot until
         # the vehicle arms again.
-        self._armed_by_program, self._armed_at = None, math.inf
+        self._armed_by_program = None
+        self._armed_at = math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
 
@@ -387,7 +388,8 @@ class CommandArbiter:
 
     def _posted_modes(self) -> tuple[Mode, ...]:
         """Modes that posted orders, including superseded ones, may still lead to."""
-        return tuple(mode for order in self._posted if not order.is_confirmed for mode in order.modes)
+        unconfirmed_orders = [order for order in self._posted if not order.is_confirmed]
+        return tuple(mode for order in unconfirmed_orders for mode in order.modes)
 
     def _is_steering(self) -> bool:
         """True while the vehicle is in a mode of the newest order and there was no takeover."""

@@ -38,7 +38,8 @@ class Circle(ClosedPath):
     """A circle; the phase is the bearing from its centre in radians."""
 
     def __init__(self, radius_m: float, *, clockwise: bool, first_phase: float) -> None:
-        self._radius_m, self._direction = radius_m, 1 if clockwise else -1
+        self._radius_m = radius_m
+        self._direction = 1 if clockwise else -1
         self.first_phase: float = first_phase
 
     def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
@@ -118,7 +119,8 @@ class PathFlight:
         self._flown_m += self._present_speed_m_s * seconds
         if self._flown_m >= length_m:
             self.is_on_path = True
-            self._present_speed_m_s, self._flown_m = 0.0, length_m
+            self._flown_m = length_m
+            self._present_speed_m_s = 0.0
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
             coordinate + fraction * component for coordinate, component in zip(self._start, to_path, strict=True)
@@ -173,7 +175,8 @@ class TurnCounter:
     """
 
     def __init__(self, radius_m: float, *, clockwise: bool) -> None:
-        self._radius_m, self._direction = radius_m, 1 if clockwise else -1
+        self._radius_m = radius_m
+        self._direction = 1 if clockwise else -1
         self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
         # Bearing from the centre to the vehicle in radians; None while the vehicle is not near the circle.
         self._bearing: float | None = None

@@ -101,7 +101,7 @@ class FollowedTarget:
         speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
         # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
         place = position.latest.replace(altitude_relative_m=None)
-        self.latest = TargetState(place, speeds, received_at, received_at)
+        self.latest = TargetState(place, speeds, reported_at=received_at, first_reported_at=received_at)
 
     def add(self, position: object) -> None:
         """Process a position that the program supplied. An unchanged position counts as a new report.
@@ -118,17 +118,18 @@ class FollowedTarget:
         if latest is not None and now - latest.reported_at < MIN_INTERVAL_S:
             return
         if latest is None:
-            self.latest = TargetState(position, ZERO, now, now)
+            self.latest = TargetState(position, ZERO, reported_at=now, first_reported_at=now)
         elif position == latest.position:
             is_change_overdue = now - latest.first_reported_at > OVERDUE_INTERVALS * self._interval_s
             # If the position should have changed by now, the target has stopped.
             velocity = ZERO if is_change_overdue else latest.velocity
-            self.latest = TargetState(position, velocity, now, latest.first_reported_at)
+            self.latest = latest.replace(velocity=velocity, reported_at=now)
         else:
             self._interval_s = now - latest.first_reported_at
             velocity = _mean_velocity(latest.position, position, self._interval_s)
-            is_jump = math.hypot(*velocity) > MAX_TARGET_SPEED_M_S
-            self.latest = TargetState(position, ZERO if is_jump else velocity, now, now)
+            if math.hypot(*velocity) > MAX_TARGET_SPEED_M_S:  # The position has jumped.
+                velocity = ZERO
+            self.latest = TargetState(position, velocity, reported_at=now, first_reported_at=now)
 
 
 def _mean_velocity(start: Position, end: Position, seconds: float) -> tuple[float, float, float]:
@@ -239,7 +240,8 @@ class FollowStream(SteeringStream[TargetState]):
         target = self._target
         if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
             return
-        scope = self._reading = Cancellation()
+        scope = Cancellation()
+        self._reading = scope
 
         async def read() -> None:
             with scope:

@@ -102,9 +102,12 @@ class ImpactDetector:
         elif has_stopped_suddenly:
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
-                self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._telemetry)
+                self._impact_m_s = self._max_sink_m_s
+                self._impact_height_m = height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
-            self._impact_m_s = self._impact_height_m = None  # The vehicle flies on, so it did not hit the ground.
+            # The vehicle flies on, so it did not hit the ground.
+            self._impact_m_s = None
+            self._impact_height_m = None
         # The vehicle does not sink now, so a descent can only begin at this height.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
             self._top_m = height_m
@@ -162,7 +165,8 @@ class GroundCheck:
             self._reported_at = None
             return False
         if self._reported_at is None:
-            self._reported_at, self._settled_since = now, math.inf
+            self._reported_at = now
+            self._settled_since = math.inf
             self._reported_height_m = height_above_home(self._session.telemetry)
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 

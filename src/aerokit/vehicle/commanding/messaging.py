@@ -132,7 +132,8 @@ class _StreamMonitor:
 
     def reset(self) -> None:
         """Forget the messages and events that arrived before a new request."""
-        self.has_received, self.must_request = False, asyncio.Event()
+        self.has_received = False
+        self.must_request = asyncio.Event()
 
     def _on_message(self, message: Message) -> None:
         self.has_received = True

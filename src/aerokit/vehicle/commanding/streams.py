@@ -121,7 +121,9 @@ class ValueStream(Generic[ValueT]):
         """Replace the value. It is encoded at once, so that an invalid value is refused here, not when it is sent."""
         message = self._encode(value)
         message.encode()
-        self._value, self._message, self._set_at = value, message, self._now()
+        self._value = value
+        self._message = message
+        self._set_at = self._now()
 
     def _begin_sending(self) -> None:
         self._replace_value(self._value)
@@ -248,7 +250,8 @@ class SteeringStream(ValueStream[ValueT]):
         except BaseException:
             self._end()
             raise
-        order = self._order = self._prepared_order or self._context.arbiter.order(mode)
+        order = self._prepared_order or self._context.arbiter.order(mode)
+        self._order = order
         # A vehicle that is already in the stream's mode may execute the first value as soon as it is sent.
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:

@@ -175,7 +175,8 @@ class TravelActions(VehicleBase):
         max_silence_s: float | None,
     ) -> None:
         """Wait for the arrival. Meanwhile, repeat ``unacknowledged_target``, see :meth:`_send_target`."""
-        started = sent_at = self.connection.now()
+        started = self.connection.now()
+        sent_at = started  # when `unacknowledged_target` was last sent
 
         def resend_if_due() -> None:
             nonlocal sent_at
@@ -267,7 +268,8 @@ class TravelActions(VehicleBase):
             direction = 0  # the shorter way
             if relative:
                 direction = 1 if heading_deg >= 0 else -1
-            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal_deg, rate_deg_s, direction, 0)
+            absolute = 0
+            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal_deg, rate_deg_s, direction, absolute)
         await self._await_heading(goal_deg, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -396,7 +398,8 @@ class LookActions(VehicleBase):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
         above_home_m = place["z"] if is_relative else place["z"] - self._position.home_altitude()
-        await self._send_roi(MavCmd.DO_SET_ROI, 0, 0, 0, 0, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
+        unused = (0, 0, 0, 0)  # param1 to param4
+        await self._send_roi(MavCmd.DO_SET_ROI, *unused, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
         """Send MAV_CMD_DO_SET_ROI_LOCATION; return False if the firmware does not support it as COMMAND_INT."""
@@ -418,6 +421,7 @@ class LookActions(VehicleBase):
         return True
 
     async def _send_roi(self, command: int, *params: float) -> None:
+        """Send a command as an order of its own about the region of interest."""
         with self._new_roi_order() as order:
             await self._sender.send_long(order, command, *params)
 

@@ -154,6 +154,7 @@ class _WebDownload:
                 return await asyncio.to_thread(self._download)
         finally:
             self._abort()
+        # The time-out has expired.
         raise FileTimeout(f"{self._uri} did not arrive within {WEB_TIMEOUT_S:g} s")
 
     def _abort(self) -> None:

@@ -68,7 +68,7 @@ class Shell(ReadOnly):
         """Close the shell by a message that requests no response."""
         self._output.close()
         if self._is_open and self._session.connection.is_open:
-            self._send(b"", 0)
+            self._send(b"", flags=0)
         self._is_open = False
 
     def write(self, line: str) -> None:

@@ -203,7 +203,8 @@ class FileChannel:
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
         with suppress(AerokitError):  # The connection may be closed.
             self.transfers.connection.send(request.message)
-            closing = self._closing[session] = _Closing(request)
+            closing = _Closing(request)
+            self._closing[session] = closing
             self.transfers.background.start(lambda: closing.confirm(self.transfers), "aerokit close file")
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
@@ -219,7 +220,8 @@ class _Closing:
     """A session that is being closed in the background."""
 
     def __init__(self, request: FtpRequest) -> None:
-        self.request, self.ended = request, asyncio.Event()
+        self.request = request
+        self.ended = asyncio.Event()
 
     async def confirm(self, transfers: Transfers) -> None:
         """Wait for the reply, and repeat the request until then. `ended` is set in any case."""

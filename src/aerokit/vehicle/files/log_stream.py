@@ -64,9 +64,10 @@ class UlogAssembler:
             self._is_aligned = False
         self._next_sequence = (message.sequence + 1) % SEQUENCE_RANGE
         if not self._has_header:
-            self._has_header = self._is_aligned = data.startswith(MAGIC)
-            if not self._has_header:
+            if not data.startswith(MAGIC):
                 return b""  # The log begins with its header, so nothing before the header is used.
+            self._has_header = True
+            self._is_aligned = True
             prefix, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
         elif not self._is_aligned:
             if message.first_message_offset == NO_MESSAGE_START:

@@ -219,7 +219,8 @@ class GimbalDevice:
         self.attitude.set(attitude, self._source(message))
 
     def update_flags(self, message: GimbalDeviceAttitudeStatus) -> None:
-        self.flags, self.failures = message.flags, message.failure_flags
+        self.flags = message.flags
+        self.failures = message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
         """Set the controllers from a status; return False for a late status, which is older than the newest one."""

@@ -102,7 +102,8 @@ class GimbalRegistry:
         key = (component_id, number)
         device = self.devices.get(key)
         if device is None and len(self.devices) < MAX_GIMBALS:
-            device = self.devices[key] = GimbalDevice(self._context, *key)
+            device = GimbalDevice(self._context, component_id, number)
+            self.devices[key] = device
             if component_id == self._session.component_id and number == 1:
                 device.topic = ROI  # The vehicle's region of interest moves this gimbal.
         return device

@@ -275,7 +275,8 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.start", "mission")
         if not session.telemetry.is_armed:
             raise OperationRejected("mission.start: the vehicle is not armed: call arm() first; nothing was sent")
-        order = self._order = vehicle_context.arbiter.order(mode)
+        order = vehicle_context.arbiter.order(mode)
+        self._order = order
         self._is_paused = False
         self._tracker.start()
         try:
@@ -311,7 +312,8 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.resume", "mission")
         if not session.telemetry.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
-        order = self._order = vehicle_context.arbiter.order(mode)
+        order = vehicle_context.arbiter.order(mode)
+        self._order = order
         self._tracker.start()
         try:
             await self._enter_mode(mode, order, timeout)

@@ -58,11 +58,12 @@ class Parameters(ReadOnly):
     """
 
     def __init__(self, session: Messaging, files: Files) -> None:
-        self._transfers = transfers = session.transfers
-        self._access = ParameterAccess(transfers, files)
+        self._transfers = session.transfers
+        self._access = ParameterAccess(session.transfers, files)
         session.at_close(self._access.store.attach())
         session.on_reboot.append(self._access.forget)
         self._names = NameResolver(self._access)
+        # Set by `load_metadata`.
         self._metadata: Metadata | None = None
         self._writer = ParameterWriter(self._access, self._names, self._note_of)
         self._registry = RestoreRegistry()

@@ -193,8 +193,9 @@ class ParameterWrite(Snapshot):
 
 
 def _failed_write(name: str, requested: float, known: Parameter | None, error: AerokitError) -> ParameterWrite:
+    """Return the result of a write that failed; ``known`` has the last known value, if there is one."""
     value, type_ = (math.nan, ParameterType.REAL32) if known is None else (known.value, known.type)
-    return ParameterWrite(name, requested, value, type_, "failed", "", error)
+    return ParameterWrite(name, requested, value, type_, outcome="failed", error=error)
 
 
 def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:

@@ -223,7 +223,8 @@ class CommandSender:
                 order_status=order_status,
                 is_sent=was_just_sent,
             )
-            run = self._runs[key] = ExchangeRun(self._connection, exchange)
+            run = ExchangeRun(self._connection, exchange)
+            self._runs[key] = run
             self._order_statuses[key] = order_status
             try:
                 return await run.result()
@@ -239,7 +240,8 @@ class CommandSender:
         """Abort the running command with this key if its order has ended, so that a newer command need not wait."""
         order_status = self._order_statuses.get(key)
         if order_status is not None and order_status.end:
-            text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {order_status.end}"
+            _, command = key
+            text = f"no COMMAND_ACK for {command_name(command)} yet; not sent again: {order_status.end}"
             self._runs[key].abort(CommandTimeout(text))
 
     def _min_attempt_timeout_s(self) -> float:

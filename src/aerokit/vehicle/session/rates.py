@@ -142,10 +142,12 @@ class MessageRates:
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
         if stream is None:
-            stream = self._streams[message_type.ID] = self._new_stream(message_type)
+            stream = self._new_stream(message_type)
+            self._streams[message_type.ID] = stream
         stream.is_optional = stream.is_optional and is_optional
         if stream.is_refused:  # The vehicle may accept another rate than the refused one.
-            stream.is_refused, stream.requested_hz = False, None
+            stream.is_refused = False
+            stream.requested_hz = None
         token = object()
         stream.requests[token] = hz
         self._has_due_streams.set()
@@ -159,9 +161,11 @@ class MessageRates:
     def request_again(self) -> None:
         """Request all messages again, because the vehicle may have lost the requests, for example by a reboot."""
         for stream in self._streams.values():
-            stream.requested_hz, stream.retry_interval_s = None, RETRY_INTERVAL_S
+            stream.requested_hz = None
             stream.is_refused = False
-            stream.failures, stream.next_attempt_at = 0, -math.inf
+            stream.retry_interval_s = RETRY_INTERVAL_S
+            stream.failures = 0
+            stream.next_attempt_at = -math.inf
         self._reset_count += 1
         self._has_due_streams.set()
 

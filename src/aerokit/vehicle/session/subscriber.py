@@ -107,7 +107,8 @@ class ComponentSubscriber:
         cell = self._cells.get(message_type)
         if cell is None:
             self._connection.check_types((message_type,))
-            cell = self._cells[message_type] = self._new_cell(message_type)
+            cell = self._new_cell(message_type)
+            self._cells[message_type] = cell
             self._register_cell(cell)
             rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
         if rate_hz is not None:

@@ -173,7 +173,9 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
     """Return all sensors reported so far, with the new reading in RANGEFINDER (older ArduPilot) as sensor 0."""
-    return _replaced(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
+    return _replaced(
+        context.before, RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN), _id_of
+    )
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:

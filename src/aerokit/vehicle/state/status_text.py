@@ -100,14 +100,17 @@ class _IncompleteText:
 
     def __init__(self, severity: int) -> None:
         self.severity = severity
-        self.next_seq = 0
+        self.next_seq = 0  # the expected number of the next chunk
         self._parts: list[bytes] = []
 
     def add(self, seq: int, chunk: bytes, now: float) -> None:
+        """Append a chunk, after "…" if chunks before it are missing."""
         if seq > self.next_seq:
             self._parts.append(ELLIPSIS.encode())
         self._parts.append(chunk)
-        self.next_seq, self.last_chunk, self.last_chunk_at = seq + 1, chunk, now
+        self.next_seq = seq + 1
+        self.last_chunk = chunk
+        self.last_chunk_at = now
 
     def complete(self, now: float) -> StatusText:
         return StatusText(self.severity, _text(b"".join(self._parts)), now)

@@ -290,7 +290,8 @@ class Telemetry(States):
 
     def _learn_autopilot(self, heartbeat: messages.Heartbeat) -> None:
         """Use the autopilot of the first HEARTBEAT, which also decides which messages report a state."""
-        self.autopilot = self._context.autopilot = autopilot_for(heartbeat)
+        self.autopilot = autopilot_for(heartbeat)
+        self._context.autopilot = self.autopilot
         self._knows_autopilot = True
         for name, cell in self._cells.items():
             cell.waits_for = STATES[name].waits_for(self.autopilot)
