@@ -365,19 +365,22 @@ async def vehicles_on(
     """
     connection.raise_if_ended()
     vehicles: dict[int, Vehicle] = {}
+    tasks = BackgroundTasks(connection.fail)
 
     async def stay_connected(system_id: int) -> None:
+        """Connect to one vehicle, and keep it connected until `vehicles_on` ends."""
         try:
             async with connect(connection, system_id=system_id, rates=rates) as vehicle:
                 vehicles[system_id] = vehicle
                 if on_found is not None:
                     on_found(vehicle)
-                await asyncio.Event().wait()  # Wait until `vehicles_on` ends and cancels this task.
+                await asyncio.Event().wait()  # This event is never set: `vehicles_on` cancels the task at its end.
         except AerokitError as error:
             # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
             logger.info("the connection to system %d failed or ended: %s", system_id, error)
 
     async def search() -> None:
+        """Start a task for each vehicle that is found."""
         try:
             async for event in connection.vehicles():
                 if event.system_id not in vehicles:
@@ -385,7 +388,6 @@ async def vehicles_on(
         except AerokitError as error:
             logger.info("the search for vehicles has ended: %s", error)
 
-    tasks = BackgroundTasks(connection.fail)
     tasks.start(search)
     try:
         yield vehicles

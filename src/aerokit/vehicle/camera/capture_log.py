@@ -173,6 +173,7 @@ class CaptureLog:
         self._add(message, from_image(message, self._link.number or 0, self._link.now()))
 
     def _on_feedback(self, message: m.CameraFeedback) -> None:
+        """Store ArduPilot's report of a picture. Its index has 16 bits, so it may return to 0."""
         number = message.cam_idx + 1
         highest = self._highest
         has_wrapped = highest is not None and highest.capture.index > HALF_RANGE

@@ -238,6 +238,7 @@ class CameraLink(CameraOrders):
             self._attach(message_type, callback)
 
     def _attach(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
+        """Call ``callback`` with this camera's messages of one type, until the vehicle's `async with` block is left."""
         bus, component_id = self._session.connection.bus, self.component.component_id
 
         def on_message(message: Any) -> None:
@@ -249,6 +250,7 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:
+        """Return True if a message of this camera's component is not about another camera of the autopilot."""
         # Each message type has only one or two of these fields, and a firmware may leave them at 0. If all are 0, the
         # message is from the first camera.
         if not self.is_autopilot_attached:

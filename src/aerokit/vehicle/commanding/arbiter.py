@@ -94,6 +94,7 @@ class CommandArbiter:
         return order
 
     def _is_newest(self, order: Order) -> bool:
+        """Return True if the order is not withdrawn, and no newer order about its topics was given."""
         latest_orders = (self.latest(topic) for topic in order.ended_by)
         is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
         return not order.is_withdrawn and not is_superseded
@@ -412,6 +413,7 @@ class CommandArbiter:
             order.on_system_status(state)
 
     def _on_armed(self, armed_before: bool | None, armed: bool) -> None:
+        """Process the armed state in each HEARTBEAT, changed or not."""
         if armed_before and not armed:
             self._ordered_since_disarmed.clear()
         if armed and not armed_before:

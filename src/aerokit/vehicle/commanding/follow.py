@@ -92,6 +92,7 @@ class FollowedTarget:
         return self.latest
 
     def _read_vehicle(self, telemetry: Any) -> None:
+        """Take position and velocity from the cells of a target that is a vehicle."""
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return
@@ -290,6 +291,7 @@ class FollowStream(SteeringStream[TargetState]):
         return self._context.sender.mode_for("follow", "setpoint")
 
     def _tick(self, due: float) -> None:
+        """Read the target, and send the set-point for its position."""
         try:
             state = self._tracker.read()
             if state is not None:

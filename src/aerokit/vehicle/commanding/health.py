@@ -200,6 +200,7 @@ class Health:
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
+        """Return one text for each missing estimate, after a missing GPS fix, which is the probable cause."""
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []

@@ -187,7 +187,7 @@ class Order:
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
-        # Sets of modes, by their numbers in HEARTBEAT.custom_mode. A mode outside of these sets is a takeover.
+        # Sets of modes, by their numbers in HEARTBEAT.custom_mode. The class describes the kinds of modes.
         self._own_modes = {mode.custom_mode for mode in modes}
         self._expected_modes = set(expected)
         self._modes_before = set() if mode_before is None else {mode_before.custom_mode} - self._expected_modes

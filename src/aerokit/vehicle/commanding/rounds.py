@@ -135,6 +135,7 @@ class RoundFlight:
                 self._circle_problem = ""
 
         def failure_reason() -> str | None:
+            """Return why the rounds cannot succeed: the mode, a status text that refuses them, or a wrong radius."""
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
             refusal = next(refusals, "")
             if refusal:

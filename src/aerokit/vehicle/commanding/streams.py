@@ -267,6 +267,7 @@ class SteeringStream(ValueStream[ValueT]):
         return self
 
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
+        """Make the vehicle hold; if the stream has stopped by itself and the program does not know it yet, raise."""
         if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)
         if self._stop_error is None:

@@ -179,6 +179,7 @@ class TravelActions(VehicleBase):
         sent_at = started  # when `unacknowledged_target` was last sent
 
         def resend_if_due() -> None:
+            """Send the target once more, unless a takeover is possible or the computer slept since the last time."""
             nonlocal sent_at
             now = self.connection.now()
             if unacknowledged_target is None or now - sent_at < RESEND_INTERVAL_S:

@@ -403,11 +403,12 @@ class Components:
         return self._by_id[component_id]
 
     def _new(self, component_id: int) -> Component:
+        """Create a component with a session of its own; the autopilot shares the session of the vehicle."""
         from aerokit.vehicle.files.files import Files
         from aerokit.vehicle.parameters.parameters import Parameters
 
         sender = self._context.sender
-        if component_id == self._session.component_id:  # The autopilot uses the same objects as the vehicle.
+        if component_id == self._session.component_id:
             return Component(self._session, sender, self._files, self._parameters, self.component)
         session = ComponentSession(self._session, component_id)
         files = Files(session.transfers)

@@ -112,7 +112,7 @@ class TargetLanding:
         self._context = context
         self._session = context.session
         self._stream = stream
-        # The last measurement that was sent to the vehicle.
+        # The last measurement that was passed to the stream.
         self._last: TargetMeasurement | None = None
         # When the target was last visible, and the vehicle's height at that time.
         self._seen_at = -math.inf

@@ -268,6 +268,7 @@ class GimbalControl:
             release.send_soon()
 
     async def _request_control(self) -> None:
+        """Send the command that requests control; raise NotSupported if the manager does not know it."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary)
         try:
@@ -323,6 +324,7 @@ class GimbalControl:
         return controllers.primary if self._is_primary else controllers.secondary
 
     def _release_command(self) -> ReleaseCommand:
+        """Return the command that releases control, unless control was lost or other blocks need it."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary, release=True)
         requests = orders.registry.control_requests

@@ -75,7 +75,7 @@ class MissionEndDetector:
         self._is_last_item_landing = last_command in LANDING_PURPOSES
         self._ends_in_air = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
-        # Modes in which the vehicle lands at the end: of the last item, or of any item if the items are unknown.
+        # Modes in which the vehicle may land: the mode of the last item if it is a landing or return, otherwise all.
         purposes = [LANDING_PURPOSES[last_command]] if last_command in LANDING_PURPOSES else LANDING_PURPOSES.values()
         self._landing_modes = tuple(
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in purposes
@@ -384,6 +384,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._tracker.on_transfer_count(count)
 
     def _check_item(self, item: int) -> None:
+        """Raise InvalidArgument unless the mission has this item. If their number is unknown, accept all."""
         count = self._tracker.count.latest
         last = MAX_ITEM if count is None else count - 1
         if count == 0:

@@ -57,17 +57,17 @@ class PlanChannel:
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
         """Send all items. If a refusal does not identify the refused item, send the items again one at a time."""
         window = self._context.autopilot.mission_upload_window
-        exchange = await self._upload(items, window=window)
+        exchange = await self._new_upload(items, window=window)
         try:
             return await self._run(exchange)
         except MissionRejected:
             if not exchange.is_refusal_ambiguous:
                 raise
-        return await self._run(await self._upload(items, window=1))
+        return await self._run(await self._new_upload(items, window=1))
 
     async def send_part(self, items: Sequence[MissionItem], first_seq: int) -> UploadResult | None:
         """Replace the items from ``first_seq`` on; return None if the vehicle does not support partial uploads."""
-        exchange = await self._upload(items, window=1, first_seq=first_seq)
+        exchange = await self._new_upload(items, window=1, first_seq=first_seq)
         try:
             result = await self._run(exchange)
         except MissionRejected:
@@ -137,9 +137,10 @@ class PlanChannel:
         self.is_single_precision = not is_supported
         return is_supported
 
-    async def _upload(
+    async def _new_upload(
         self, items: Sequence[MissionItem], *, window: int, first_seq: int | None = None
     ) -> MissionUpload:
+        """Create the exchange that sends these items; ``first_seq`` is None for a whole plan."""
         return MissionUpload(
             *self._target,
             items,

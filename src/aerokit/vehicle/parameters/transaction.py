@@ -156,6 +156,7 @@ class TemporaryParameters(_Block):
         self._was_entered = False
 
     async def __aenter__(self) -> dict[str, ParameterWrite]:
+        """Set the values; if one of them cannot be set, restore all."""
         if self._was_entered:
             raise InvalidArgument("this block was entered already: call temporarily() again")
         self._was_entered = True

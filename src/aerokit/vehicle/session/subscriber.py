@@ -84,11 +84,11 @@ class ComponentSubscriber:
             for message_type in message_types:
                 check_rate(message_type, rate_hz)
 
-        # Called when the program enters the `with` block of the subscription.
         def attach(sink: Sink) -> list[Detach]:
+            """Attach the sink and request the rates, when the `with` block of the subscription is entered."""
             filtered_sink = sink if entire_system else self._of_component(sink)
             detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)
-            detach_callbacks.append(self._connection.on_end(subscription.close))
+            detach_callbacks.append(self._connection.on_end(subscription.close))  # `subscription` is assigned below.
             for message_type in message_types:
                 hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
                 if hz is not None:
