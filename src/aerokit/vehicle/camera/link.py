@@ -250,7 +250,7 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:
-        """Return True if a message of this camera's component is not about another camera of the autopilot."""
+        """Return True if a message of the component is about this camera. An autopilot may have several cameras."""
         # Each message type has only one or two of these fields, and a firmware may leave them at 0. If all are 0, the
         # message is from the first camera.
         if not self.is_autopilot_attached:

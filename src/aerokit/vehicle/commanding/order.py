@@ -251,14 +251,16 @@ class Order:
         number = mode.custom_mode
         is_first_report = self._mode_now is None
         is_change = not is_first_report and number != self._mode_now
+        is_settled = reported_at >= self._settles_at
+        is_expected = number in self._expected_modes and number in self._accepted_modes
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
             has_taken_effect = is_change or not self._requires_mode_change
-            if has_taken_effect and reported_at >= self._settles_at:
+            if has_taken_effect and is_settled:
                 self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
-        elif number in self._expected_modes & self._accepted_modes and reported_at >= self._settles_at:
+        elif is_expected and is_settled:
             # An earlier order of the program has taken effect, so only another party can restore the mode before it.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.

@@ -46,7 +46,10 @@ class AngleTarget:
 
     def is_reached(self, device: GimbalDevice) -> bool:
         targets = self._target_angles()
-        return targets is not None and all(map(self._is_near, _angles_of(device.attitude.value), targets))
+        if targets is None:
+            return False
+        angles = _angles_of(device.attitude.value)
+        return all(self._is_near(angle, target) for angle, target in zip(angles, targets, strict=True))
 
     def _is_near(self, angle: float | None, target: float | None) -> bool:
         if target is None:  # Any angle is accepted.
