@@ -361,12 +361,12 @@ class StorageMixin(CameraMixin):
         """
         check_range("number", number, 1, 255)
         await self._link.identify()
-        # param2 = 1 formats the medium, param3 = 1 also resets the image log of the camera.
+        format_medium, reset_image_log = 1, 1  # param2 and param3
         await self._link.command(
             MavCmd.STORAGE_FORMAT,
             number,
-            1,
-            1,
+            format_medium,
+            reset_image_log,
             attempts=1,
             attempt_timeout=timeout,
             progress_timeout=timeout,

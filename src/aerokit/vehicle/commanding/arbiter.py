@@ -252,6 +252,7 @@ class CommandArbiter:
         self._sent.append(sent)
         try:
             yield sent
+            # The block has not raised, so the vehicle has accepted the command.
             self._record_accepted(armed)
         finally:
             self._sent.remove(sent)

@@ -358,7 +358,7 @@ class ModeActions(VehicleBase):
         order = self._arbiter.current or self._arbiter.newest
         if order is None:
             return ""
-        if not order.has_lost_mode:
+        if not order.has_lost_mode:  # Without a mode change, only a failsafe is a takeover.
             return order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:

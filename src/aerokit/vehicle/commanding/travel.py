@@ -453,4 +453,5 @@ class LookActions(VehicleBase):
                 if error.result != MavResult.UNSUPPORTED:
                     raise
                 self._raise_if_superseded(order)
+        # The firmware supports only the older command.
         await self._send_roi(MavCmd.DO_SET_ROI)

@@ -184,7 +184,9 @@ class Component(ReadOnly):
         if kind == "general":
             return general
         entries = general.get("metadataTypes")
-        for entry in entries if isinstance(entries, list) else ():
+        if not isinstance(entries, list):  # The file is damaged, or lists nothing.
+            entries = []
+        for entry in entries:
             if not isinstance(entry, dict) or entry.get("type") != METADATA_TYPES[kind]:
                 continue
             if isinstance(entry.get("uri"), str):

@@ -235,8 +235,9 @@ class Actuators(ReadOnly):
         # On ArduPilot, a test with throttle 0 for 0 s ends a running test. On PX4, a test of 0 s releases the output.
         if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
             command = MavCmd.ACTUATOR_TEST
-            start = (throttle_percent / 100, duration_s, 0, 0, number)
-            stop = (math.nan, 0, 0, 0, number)
+            unused = (0, 0)
+            start = (throttle_percent / 100, duration_s, *unused, number)
+            stop = (math.nan, 0, *unused, number)
         else:
             command = MavCmd.DO_MOTOR_TEST
             motor_count = 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from aerokit._internal.arguments import check_range, checks_arguments
@@ -179,11 +180,9 @@ class External:
         while (remaining_s := until - connection.now()) > 0:
             self._request_origin()
             wait_s = min(POLL_INTERVAL_S, remaining_s)
-            try:
+            with suppress(OperationTimeout):
                 await cell.wait_until(lambda reported: _are_close(reported, origin), timeout=wait_s)
-            except OperationTimeout:
-                continue
-            return
+                return
         report = f"it last reported {cell.latest}" if cell.is_known else "it has reported no origin"
         raise OperationTimeout(f"set_origin: the vehicle did not report the origin within {timeout:g} s; {report}")
 

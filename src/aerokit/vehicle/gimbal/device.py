@@ -100,16 +100,24 @@ def information_of(
     """Combine the messages of manager and device; the manager's capabilities and limits take precedence."""
     source = manager or device
     assert source is not None
-    limits = (
-        _limits(source.roll_min, source.roll_max),
-        _limits(source.pitch_min, source.pitch_max),
-        _limits(source.yaw_min, source.yaw_max),
+    information = GimbalInformation(
+        gimbal_device_id=device_id,
+        manager_component_id=manager_id,
+        capabilities=source.cap_flags,
+        roll_deg=_limits(source.roll_min, source.roll_max),
+        pitch_deg=_limits(source.pitch_min, source.pitch_max),
+        yaw_deg=_limits(source.yaw_min, source.yaw_max),
     )
     if device is None:
-        return GimbalInformation(device_id, manager_id, source.cap_flags, *limits)
-    names = (device.vendor_name, device.model_name, device.custom_name)
-    versions = (_version(device.firmware_version), _version(device.hardware_version))
-    return GimbalInformation(device_id, manager_id, source.cap_flags, *limits, *names, *versions, device.uid)
+        return information
+    return information.replace(
+        vendor=device.vendor_name,
+        model=device.model_name,
+        custom_name=device.custom_name,
+        firmware_version=_version(device.firmware_version),
+        hardware_version=_version(device.hardware_version),
+        uid=device.uid,
+    )
 
 
 def _limits(low: float, high: float) -> tuple[float, float] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
@@ -31,8 +31,14 @@ if TYPE_CHECKING:
 # times a second.
 STILL_S, STILL_DEG = 0.4, 0.5
 
-# Pitch, roll, yaw from north, yaw from the nose. None means that any angle is accepted.
-Angles = tuple[float | None, float | None, float | None, float | None]
+
+class Angles(NamedTuple):
+    """Angles in degrees. None means: in an attitude, that the angle is unknown; in a target, that any is accepted."""
+
+    pitch: float | None
+    roll: float | None
+    yaw_from_north: float | None
+    yaw_from_nose: float | None
 
 
 class AngleTarget:
@@ -171,7 +177,7 @@ def _describe_state(orders: GimbalOrders, since: float) -> str:
 
 
 def _angles_of(attitude: GimbalAttitude) -> Angles:
-    return (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
+    return Angles(attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
 
 
 def _format_angles(angles: Angles) -> str:
@@ -199,7 +205,7 @@ def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: b
     is_vertical = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
     from_north_deg = None if from_nose or is_vertical else yaw
     from_nose_deg = yaw if from_nose and not is_vertical else None
-    return (pitch, roll, from_north_deg, from_nose_deg)
+    return Angles(pitch, roll, from_north_deg, from_nose_deg)
 
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
@@ -215,7 +221,8 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
     pitch = math.degrees(math.atan2(height_m, distance_m))
     has_bearing = distance_m > MIN_BEARING_DISTANCE_M and abs(pitch) <= MAX_PITCH_FOR_YAW_DEG
     yaw_from_north = here.bearing_to(target) if has_bearing else None
-    return (pitch, None, yaw_from_north, None)  # Any roll is accepted, and the yaw is checked from north only.
+    # Any roll is accepted, and the yaw is checked from north only.
+    return Angles(pitch, roll=None, yaw_from_north=yaw_from_north, yaw_from_nose=None)
 
 
 def _height_above(here: Position, target: Position) -> float | None:

@@ -109,12 +109,12 @@ class PlanContext:
         ids_by_mission_type = (current.mission_id, current.fence_id, current.rally_points_id)
         return ids_by_mission_type[mission_type]
 
-    async def wait_for_plan_id(self, mission_type: int, opaque_id: int) -> bool:
+    async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
         """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""
         received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:
-            if self.plan_id(mission_type, started_at) == opaque_id:
+            if self.plan_id(mission_type, started_at) == expected_id:
                 received.set()
 
         detach = self.session.connection.bus.attach(MissionCurrent, check, system_id=self.session.system_id)

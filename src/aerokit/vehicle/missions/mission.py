@@ -458,4 +458,5 @@ class MissionControl(VehiclePlan["Mission"]):
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
+            # The vehicle does not know MISSION_START.
             await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)

@@ -336,7 +336,10 @@ class PlanTransfer(Generic[PlanT]):
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only the differences. Returns False if the vehicle's plan is unknown or differs in too many items."""
+        """Send only the differences; return True if the vehicle has the plan now.
+
+        Returns False if the vehicle's plan is unknown or differs in too many items.
+        """
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._mission_type, self._cache.updated_at)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import anyio
 
@@ -245,6 +245,15 @@ class VehicleWatch:
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
 
 
+class _Counts(NamedTuple):
+    """Counters at one time: frames received from the vehicle, its frames that were lost, and bytes on the link."""
+
+    at: float
+    received: int
+    lost: int
+    total_bytes: int
+
+
 class LinkWatch:
     """Measures the link to one vehicle once a second: loss by sequence numbers, delay by TIMESYNC, rates by counting.
 
@@ -269,7 +278,7 @@ class LinkWatch:
         # Times of the unanswered TIMESYNC requests in nanoseconds, which identify their answers.
         self._open_requests: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
         self._next_request_at = connection.now()
-        # Result of `_count` at the last report.
+        # The counters at the last report.
         self._counts_before = self._count()
         self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
 
@@ -324,24 +333,23 @@ class LinkWatch:
 
     def _report(self) -> None:
         """Publish the link's quality since the last report."""
-        counts, counts_before = self._count(), self._counts_before
+        counts, before = self._count(), self._counts_before
         self._counts_before = counts
-        now, (received, lost), total_bytes = counts
-        reported_at, (received_before, lost_before), total_bytes_before = counts_before
-        seconds = max(now - reported_at, 1e-9)
-        frames, missing = max(0, received - received_before), max(0, lost - lost_before)
+        seconds = max(counts.at - before.at, 1e-9)
+        frames = max(0, counts.received - before.received)
+        missing = max(0, counts.lost - before.lost)
         report = LinkReport(
-            now,
+            counts.at,
             self._system_id,
             loss_percent=100 * missing / (frames + missing) if frames + missing else None,
             round_trip_s=self._round_trip_s,
             frames_per_s=frames / seconds,
-            bytes_per_s=(total_bytes - total_bytes_before) / seconds,
+            bytes_per_s=(counts.total_bytes - before.total_bytes) / seconds,
         )
         self._on_report(report)
         self._connection.bus.publish(report)
 
-    def _count(self) -> tuple[float, tuple[int, int], int]:
-        """Return the time, the numbers of frames received from the vehicle and lost, and of bytes on the link."""
+    def _count(self) -> _Counts:
         total_bytes = sum(statistics.bytes for statistics in self._connection.statistics())
-        return self._connection.now(), self._connection.counts(self._system_id), total_bytes
+        received, lost = self._connection.counts(self._system_id)
+        return _Counts(self._connection.now(), received, lost, total_bytes)

@@ -26,6 +26,7 @@ MAX_OPEN = 16
 ELLIPSIS = "…"
 
 _Sender = tuple[int, int]
+"""System id and component id."""
 
 
 class StatusTextAssembler:
@@ -36,6 +37,7 @@ class StatusTextAssembler:
     """
 
     def __init__(self) -> None:
+        # Maps the sender and the id of a text to the chunks received so far.
         self._incomplete: dict[tuple[_Sender, int], _IncompleteText] = {}
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
