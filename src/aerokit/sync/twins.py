@@ -1837,7 +1837,7 @@ class Actuators(TwinOf["AsyncActuators"]):
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers first.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
-            because a second one would spin the motor again.
+        because a second one would spin the motor again.
 
         The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
         the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports

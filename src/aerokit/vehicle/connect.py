@@ -115,7 +115,8 @@ async def connect(
         ConnectFailed: no heartbeat of the requested vehicle arrived in time; the error text says what was received
             instead.
     """
-    _check_arguments(system_id, timeout, rates, address.bus.dialect if isinstance(address, Connection) else dialect)
+    used_dialect = address.bus.dialect if isinstance(address, Connection) else dialect
+    _check_arguments(system_id, timeout, rates, used_dialect)
     if isinstance(address, Connection):
         if record is not None:
             raise InvalidArgument(
@@ -191,6 +192,7 @@ async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None
 def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
+    """Raise InvalidArgument before anything is opened."""
     if system_id is not None and not 1 <= system_id <= 255:
         raise InvalidArgument(
             f"system_id = {system_id} is not allowed: it must be 1 to 255, or None for the first vehicle found"
@@ -256,6 +258,7 @@ async def _find_vehicle(connection: Connection, system_id: int | None, timeout: 
         for detach in detach_callbacks:
             detach()
         search.close()
+    # The time-out has expired.
     raise ConnectFailed(
         f"no heartbeat of {search.description} arrived within {timeout:g} s on {connection.link.address}:"
         f" {explain_no_vehicle(connection, system_id)}"
@@ -274,6 +277,7 @@ class _Search:
 
     def __init__(self, connection: Connection, system_id: int | None) -> None:
         self._connection, self._system_id = connection, system_id
+        # The result: a vehicle that the caller has not received yet, or the error that ended the search.
         self._found: _Found | None = None
         self._error: Exception | None = None
         self._ended = asyncio.Event()
@@ -361,19 +365,22 @@ async def vehicles_on(
     """
     connection.raise_if_ended()
     vehicles: dict[int, Vehicle] = {}
+    tasks = BackgroundTasks(connection.fail)
 
     async def stay_connected(system_id: int) -> None:
+        """Connect to one vehicle, and keep it connected until `vehicles_on` ends."""
         try:
             async with connect(connection, system_id=system_id, rates=rates) as vehicle:
                 vehicles[system_id] = vehicle
                 if on_found is not None:
                     on_found(vehicle)
-                await asyncio.Event().wait()  # Wait until `vehicles_on` ends and cancels this task.
+                await asyncio.Event().wait()  # This event is never set: `vehicles_on` cancels the task at its end.
         except AerokitError as error:
             # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
             logger.info("the connection to system %d failed or ended: %s", system_id, error)
 
     async def search() -> None:
+        """Start a task for each vehicle that is found."""
         try:
             async for event in connection.vehicles():
                 if event.system_id not in vehicles:
@@ -381,7 +388,6 @@ async def vehicles_on(
         except AerokitError as error:
             logger.info("the search for vehicles has ended: %s", error)
 
-    tasks = BackgroundTasks(connection.fail)
     tasks.start(search)
     try:
         yield vehicles

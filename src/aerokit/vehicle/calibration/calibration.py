@@ -49,6 +49,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
 
     def __init__(self, run: CalibrationRun, steps: AsyncGenerator[CalibrationStep, None]) -> None:
         self._run, self._steps = run, steps
+        # The event loop of the iteration; None before the first step.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_over = False
 
@@ -198,4 +199,5 @@ class CalibrationControl:
 
 
 def _acknowledged(instruction: str) -> Procedure:
+    """Return the procedure of a calibration that ends at the acknowledgement of its command."""
     return partial(procedures.acknowledged, instruction=instruction)

@@ -70,7 +70,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
             return now() - calibrating_at > END_GRACE_S
 
         await run.start(*params)
-        step = run.step(0.0, "keep the vehicle still")
+        step = run.new_step(0.0, "keep the vehicle still")
         yield step
         while True:
             await run.wait(lambda: reports or has_ended_silently())
@@ -113,7 +113,7 @@ def _step_after(step: CalibrationStep, report: CalibrationReport) -> Calibration
 async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
     """ArduPilot: run a calibration that consists of one command. The acknowledgement of the command is the result."""
     run.check_ready()
-    yield run.step(None, instruction)
+    yield run.new_step(None, instruction)
     await run.begin(cancel=None)
     await run.start(*params)
     yield run.result()
@@ -133,7 +133,7 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
     """ArduCopter: set ESC_CALIBRATION to 3, so that the vehicle calibrates the ESCs at its next boot."""
     run.check_ready()
     old_value = await _read_parameter(run, "ESC_CALIBRATION")
-    yield run.step(None, "remove the propellers, then continue", needs_confirmation=True)
+    yield run.new_step(None, "remove the propellers, then continue", needs_confirmation=True)
     await run.begin(cancel=None)
     try:
         await run.parameters().set("ESC_CALIBRATION", CALIBRATE_AT_BOOT)
@@ -162,6 +162,7 @@ async def _restore(run: CalibrationRun, name: str, value: float) -> None:
 
 
 async def _read_parameter(run: CalibrationRun, name: str) -> float:
+    """Return the value of a parameter; raise NotSupported if the vehicle does not have it."""
     try:
         return (await run.parameters().read(name)).value
     except ParameterRejected:
@@ -178,6 +179,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
     def on_message(message: MagCalProgress | MagCalReport) -> None:
+        """Record progress or result of one compass. A repeated progress is no change."""
         nonlocal compass_mask, has_changed
         compass_mask |= message.cal_mask
         if isinstance(message, MagCalReport):
@@ -202,12 +204,12 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         for message_type in (MagCalProgress, MagCalReport):
             cleanup.callback(session.connection.bus.attach(message_type, on_message, system_id=session.system_id))
             cleanup.callback(session.rates.request(message_type, REPORT_HZ, is_optional=True))
-        yield run.step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
+        yield run.new_step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
         while not is_complete():
             await run.wait(was_reported)
             has_changed = False
             progress = min(percents.values(), default=0) / 100
-            yield run.step(progress, "turn the vehicle slowly in all directions, about each of its axes")
+            yield run.new_step(progress, "turn the vehicle slowly in all directions, about each of its axes")
     failures = [
         f"compass {report.compass_id} {_status_name(report.cal_status)} (fitness {report.fitness:.1f} mgauss)"
         for report in reports.values()
@@ -262,7 +264,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 pose = POSES[AccelcalVehiclePos(request)]
                 remaining = tuple(POSES.values())[request - 1 :]  # ArduPilot requests the poses 1 to 6 in this order.
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
-                yield run.step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
+                yield run.new_step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed_pose, confirmed_at = request, now()
                 # ArduPilot has repeated its request until it received the confirmation. The repetitions are obsolete.
@@ -304,8 +306,10 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
 
         cleanup.callback(channels.observe(lambda _, value: on_channels(value), every_arrival=True))
         # Each `yield` returns when the person has confirmed the step.
-        yield run.step(0.0, "move all sticks and switches to all their ends, then continue", needs_confirmation=True)
-        yield run.step(
+        yield run.new_step(
+            0.0, "move all sticks and switches to all their ends, then continue", needs_confirmation=True
+        )
+        yield run.new_step(
             0.5, "centre the sticks, with the throttle at its lowest, then continue", needs_confirmation=True
         )
         trims = _pulses(channels.latest)

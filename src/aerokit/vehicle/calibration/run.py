@@ -58,16 +58,17 @@ class CalibrationRun:
         self.parameters: Callable[[], Parameters] = parameters
         self.call_name: str = f"calibrate.{sensor}"  # how error texts name the call
         self._runs = runs  # all runs of this vehicle that may be in progress
-        self.step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
+        self.new_step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel_command: tuple[float, ...] | None = None  # MAV_CMD and its parameters
-        self._cannot_cancel_reason = ""
+        self._cannot_cancel_reason = ""  # tells the user why the calibration cannot be cancelled; empty if it can
         self._started_at = math.inf
-        self._cancel_sent_at: float | None = None
+        self._cancel_sent_at: float | None = None  # when the cancel command was last sent
         # The arbiter keeps the order to cancel, and its command, until this stack is closed.
         self._cancel_order_stack = ExitStack()
         self._sent_cancel: SentCommand | None = None
-        self._has_rebooted = self._is_abandoned = False
-        self._ended = asyncio.Event()
+        self._has_rebooted = False
+        self._is_abandoned = False
+        self._ended = asyncio.Event()  # set once the calibration has ended on the vehicle
 
     # ------------------------------------------------------------------------------- start and end
 
@@ -95,7 +96,8 @@ class CalibrationRun:
                 raise BusyError(f"{self.call_name}: {run.call_name} is in progress; nothing was sent")
             await run.wait_cancelled()
         self.check_ready()  # The vehicle may have been armed during the wait.
-        self._cancel_command, self._cannot_cancel_reason = cancel, cannot_cancel_reason
+        self._cancel_command = cancel
+        self._cannot_cancel_reason = cannot_cancel_reason
         self._started_at = self.session.connection.now()
         self._runs.append(self)
         self.context.on_finish.append(self.abandon)
@@ -246,7 +248,7 @@ class CalibrationRun:
         """Register the end of the calibration, and return the last step."""
         self.finish()
         texts = self.session.texts_since(self._started_at)
-        return self.step(1.0, instruction, result=CalibrationResult(compasses, reboot_due, texts))
+        return self.new_step(1.0, instruction, result=CalibrationResult(compasses, reboot_due, texts))
 
     def failure(self, reason: str) -> OperationRejected:
         """Return the error of a calibration that failed, with the vehicle's texts."""

@@ -182,13 +182,17 @@ class Cameras:
     """Discovers the cameras of one vehicle and creates their ``Camera`` objects."""
 
     def __init__(self, context: VehicleContext, components: Components) -> None:
-        self._context, self._session, self._components = context, context.session, components
+        self._context = context
+        self._session = context.session
+        self._components = components
+        # Maps numbers to the objects that `at` has created.
         self._cameras: dict[int, Camera] = {}
         session = context.session
         self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
-        # Captures of cameras attached to the autopilot, kept until it is known which camera is the first.
+        # Captures of cameras attached to the autopilot, as number and message, kept until it is known which camera is
+        # the first.
         self._early_captures: list[tuple[int, Any]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)

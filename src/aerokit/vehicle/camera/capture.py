@@ -317,6 +317,7 @@ def _pillow(module: str) -> Any:
 
 
 def _exif_tags(capture: Capture) -> dict[int, Any]:
+    """Return the EXIF tags for time and elevation angle, where known, by their numbers in the standard."""
     tags: dict[int, Any] = {}
     time = _time_of(capture)
     if time is not None:

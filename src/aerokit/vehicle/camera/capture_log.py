@@ -50,9 +50,12 @@ class _Entry:
     __slots__ = ("boot_us", "capture", "kind", "utc_us")
 
     def __init__(self, message: Message, capture: Capture) -> None:
-        self.kind, self.capture = type(message), capture
+        self.kind = type(message)
+        self.capture = capture
+        # Time stamps in microseconds: UTC, and since boot. A time stamp that the message does not have is 0.
         if isinstance(message, m.CameraImageCaptured):
-            self.utc_us, self.boot_us = message.time_utc, message.time_boot_ms * 1000
+            self.utc_us = message.time_utc
+            self.boot_us = message.time_boot_ms * 1000
         else:
             stamp: int = getattr(message, "time_usec", 0)  # UTC, or the time since boot if the sender has no UTC
             is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
@@ -60,6 +63,7 @@ class _Entry:
             self.boot_us = 0 if is_utc else stamp
 
     def reports_same_picture(self, other: _Entry) -> bool:
+        """Return True if this entry and another one with the same index are about the same picture."""
         # PX4 reports each picture by two messages of different types, which arrive in quick succession.
         if self.kind is not other.kind:
             return abs(self.capture.received_at - other.capture.received_at) <= DUPLICATE_WINDOW_S
@@ -88,6 +92,7 @@ class CaptureLog:
     def __init__(self, link: CameraLink) -> None:
         self._link = link
         self._by_index: dict[int, _Entry] = {}
+        # Indices of the captures that are being requested.
         self._requested: set[int] = set()
         self._highest: _Entry | None = None  # the entry with the highest plausible index
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
@@ -168,6 +173,7 @@ class CaptureLog:
         self._add(message, from_image(message, self._link.number or 0, self._link.now()))
 
     def _on_feedback(self, message: m.CameraFeedback) -> None:
+        """Store ArduPilot's report of a picture. Its index has 16 bits, so it may return to 0."""
         number = message.cam_idx + 1
         highest = self._highest
         has_wrapped = highest is not None and highest.capture.index > HALF_RANGE
@@ -185,6 +191,7 @@ class CaptureLog:
             self._add(message, capture)
 
     def _on_status(self, message: m.CameraCaptureStatus) -> None:
+        """Process the number of pictures. A lower number than before shows that the camera counts from 0 again."""
         boot_ms, count = message.time_boot_ms, message.image_count
         if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
             return  # This status was sent before the newest one, and arrived late.
@@ -196,7 +203,9 @@ class CaptureLog:
 
     def _reset(self) -> None:
         self._by_index.clear()
-        self._highest = self._outlier = self._failed = None
+        self._highest = None
+        self._outlier = None
+        self._failed = None
         self._count = 0
         self.reset_at = self._link.now()
 
@@ -244,7 +253,10 @@ class CaptureLog:
         self._publish(message, capture, is_new=is_new)
 
     def _update_highest(self, entry: _Entry) -> None:
-        # An index far above the highest one may be corrupt, so it counts only when the next picture confirms it.
+        """Record the entry with the highest index.
+
+        An index far above the highest one may be corrupt, so it counts only when the next picture confirms it.
+        """
         index, highest, outlier = entry.capture.index, self._highest, self._outlier
         self._outlier = None
         if highest is None or 0 <= index - highest.capture.index <= MAX_INDEX_GAP:
@@ -256,7 +268,10 @@ class CaptureLog:
                 self._outlier = entry
 
     def _add_failed(self, message: Message, entry: _Entry) -> None:
-        # The camera may use the index of a failed picture again, so a failed picture never replaces a successful one.
+        """Publish a failed picture, and store it unless a successful picture has the same index.
+
+        The camera may use the index of a failed picture again.
+        """
         index, last_failed = entry.capture.index, self._failed
         if last_failed is not None and last_failed.capture.index == index and last_failed.reports_same_picture(entry):
             return  # The message is repeated.

@@ -144,6 +144,7 @@ class LensMixin(CameraMixin):
     async def _set(
         self, action: str, capability: str, command: int, kind: int, value: float, *, attempts: int = 4
     ) -> None:
+        """Send a zoom or focus command once the camera's capabilities allow it."""
         await self._link.require_capability(action, capability)
         with self._link.new_order(ORDER_SUBJECTS[command]) as order:
             await self._link.command(command, kind, value, self._link.device_id, order=order, attempts=attempts)
@@ -289,7 +290,7 @@ class StorageMixin(CameraMixin):
             "camera.storage", m.StorageInformation, STORAGE_POLL_INTERVAL_S
         )
         """Storage media by number; polled every 5 s while your program uses this value."""
-        self._media: dict[int, CameraStorage] = {}
+        self._media: dict[int, CameraStorage] = {}  # storage media by number
         link.listen(m.CameraSettings, self._on_settings)
         link.listen(m.StorageInformation, self._on_storage)
 
@@ -323,6 +324,7 @@ class StorageMixin(CameraMixin):
                 if reported != mode:
                     await anyio.sleep(MODE_POLL_INTERVAL_S)
             return
+        # The time-out has expired.
         outcome = f"reports {reported}" if reported else "reports no mode"
         raise self._link.timeout_error(f"accepted the mode {mode}, but {outcome} after {timeout:g} s")
 
@@ -359,12 +361,12 @@ class StorageMixin(CameraMixin):
         """
         check_range("number", number, 1, 255)
         await self._link.identify()
-        # param2 = 1 formats the medium, param3 = 1 also resets the image log of the camera.
+        format_medium, reset_image_log = 1, 1  # param2 and param3
         await self._link.command(
             MavCmd.STORAGE_FORMAT,
             number,
-            1,
-            1,
+            format_medium,
+            reset_image_log,
             attempts=1,
             attempt_timeout=timeout,
             progress_timeout=timeout,

@@ -51,10 +51,14 @@ class CameraLink(CameraOrders):
         *,
         on_bound: Callable[[int], None] = lambda _: None,
     ) -> None:
-        self._context, self._session = context, context.session
-        self._component_of, self._on_bound = component_of, on_bound
+        self._context = context
+        self._session = context.session
+        self._component_of = component_of
+        # Called with the number of the camera as soon as it is known.
+        self._on_bound = on_bound
         # True if another object publishes the events of this camera.
         self.is_muted = False
+        # Both are None until a camera is found.
         self._component: Component | None = None
         self.number = None
         self._listeners: list[tuple[type[Message], Callable[[Any], object]]] = []
@@ -64,8 +68,9 @@ class CameraLink(CameraOrders):
         self.unavailable: set[type[Message]] = set()
         # Called when the camera's log of captures was cleared.
         self.on_cleared: list[Callable[[], None]] = []
-        self._identifying = anyio.Lock()
+        self._identify_lock = anyio.Lock()
         self._is_bound = anyio.Event()
+        # Time of the camera's last HEARTBEAT.
         self._heartbeat_at = -math.inf
         # True after a silence of the camera until it has identified itself again. Another camera may use its id now.
         self._was_silent = False
@@ -143,7 +148,7 @@ class CameraLink(CameraOrders):
         Returns None for a camera attached to the autopilot that sends no information.
         """
         if self._needs_information():
-            async with self._identifying:
+            async with self._identify_lock:
                 if self.number is None:
                     await self._find_first_camera()
                 # Another call may have received the information while this call waited for the lock.
@@ -164,6 +169,7 @@ class CameraLink(CameraOrders):
             self.bind(AUTOPILOT_CAMERA_IDS[0])
 
     async def _request_information(self) -> None:
+        """Request CAMERA_INFORMATION; raise only if a camera with its own component id does not identify itself."""
         try:
             await self.requests.request(m.CameraInformation, self.device_id, where=self._is_from_this_camera)
         except CommandRejected:
@@ -232,6 +238,7 @@ class CameraLink(CameraOrders):
             self._attach(message_type, callback)
 
     def _attach(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
+        """Call ``callback`` with this camera's messages of one type, until the vehicle's `async with` block is left."""
         bus, component_id = self._session.connection.bus, self.component.component_id
 
         def on_message(message: Any) -> None:
@@ -243,6 +250,7 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:
+        """Return True if a message of the component is about this camera. An autopilot may have several cameras."""
         # Each message type has only one or two of these fields, and a firmware may leave them at 0. If all are 0, the
         # message is from the first camera.
         if not self.is_autopilot_attached:
@@ -252,6 +260,7 @@ class CameraLink(CameraOrders):
         return bool((number_from_1 or number_from_0 + 1) == self.number)
 
     def _on_heartbeat(self, _: m.Heartbeat) -> None:
+        """Record a HEARTBEAT; after a silence, identify the camera again, because it may be another one."""
         previous_at, self._heartbeat_at = self._heartbeat_at, self.now()
         is_first = previous_at == -math.inf
         if not is_first and self._heartbeat_at - previous_at > MAX_SILENCE_S:
@@ -292,6 +301,7 @@ class ActiveOperation:
     def __init__(self, link: CameraLink, subject: str, stop_command: Callable[[], tuple[float, ...]]) -> None:
         self._link, self._stop_command = link, stop_command
         self.order: Order = link.begin_order(subject)
+        # True once the stop command was sent, or is no longer needed.
         self._is_over = False
         link.on_finish.append(self._finish)
 
@@ -346,13 +356,18 @@ class CameraBlock:
         start: Callable[[Order], Awaitable[None]],
         stop_command: Callable[[], tuple[float, ...]],
     ) -> None:
-        self._link, self._subject = link, subject
-        self._check, self._start, self._stop_command = check, start, stop_command
+        self._link = link
+        self._subject = subject
+        self._check = check
+        self._start = start
+        self._stop_command = stop_command
         self._operation: ActiveOperation | None = None
 
     async def __aenter__(self) -> None:
+        """Check the camera's capabilities, and start the operation."""
         await self._check()
-        operation = self._operation = ActiveOperation(self._link, self._subject, self._stop_command)
+        operation = ActiveOperation(self._link, self._subject, self._stop_command)
+        self._operation = operation
         try:
             await self._start(operation.order)
         except BaseException as error:

@@ -249,8 +249,12 @@ class _PolledCell:
     ) -> None:
         self._now, self._cell = now, cell
         self.message_type, self.period_s = message_type, period_s
-        self.read_at = self.requested_at = -math.inf
-        self.is_refused = self.is_doubtful = False
+        # Times at which the program last used the value, and at which the message was last requested.
+        self.read_at = -math.inf
+        self.requested_at = -math.inf
+        # Set by the camera's answer to the last request; see UNSUPPORTED and MAYBE_UNSUPPORTED.
+        self.is_refused = False
+        self.is_doubtful = False
         cell._feed_from(self)  # From now on, the state value calls `pending` and `watchers_changed`.
 
     @property
@@ -267,6 +271,7 @@ class _PolledCell:
         self.read_at = self._now()
 
     def is_due(self) -> bool:
+        """Return True if the message must be requested now."""
         now = self._now()
         is_used = self._cell._is_watched or now - self.read_at <= INTEREST_TIMEOUT_S
         period_s = max(DOUBTFUL_POLL_INTERVAL_S, self.period_s) if self.is_doubtful else self.period_s
@@ -280,6 +285,7 @@ class MessageRequests:
     def __init__(self, link: CameraOrders) -> None:
         self._link = link
         self._polled: list[_PolledCell] = []
+        # Messages that the camera sends only after the older commands.
         self._legacy_types: set[type[Message]] = set()
 
     async def request(
@@ -319,6 +325,7 @@ class MessageRequests:
         where: Callable[[MessageT], bool],
         timeout: float,
     ) -> MessageT | None:
+        """Request one message by the older command; return None if it does not arrive in time."""
         command, legacy_params = LEGACY_REQUESTS[message_type]
         if message_type in NUMBERED_MESSAGES and params:  # The caller requests one item by its number.
             legacy_params = (params[0], *legacy_params[1:])
@@ -338,7 +345,8 @@ class MessageRequests:
     def forget_refusals(self) -> None:
         self._legacy_types.clear()
         for cell in self._polled:
-            cell.is_refused = cell.is_doubtful = False
+            cell.is_refused = False
+            cell.is_doubtful = False
 
     async def run(self) -> None:
         """Poll the state values that are in use, until cancelled."""
@@ -349,6 +357,7 @@ class MessageRequests:
                     await self._refresh(cell)
 
     async def _refresh(self, cell: _PolledCell) -> None:
+        """Request the message of one state value, and record whether the camera has refused it."""
         cell.requested_at = self._link.now()
         try:
             await self.request(cell.message_type, timeout=POLL_INTERVAL_S)

@@ -82,10 +82,7 @@ class Shutter:
                 error = await self.order_photo(before)
                 while True:
                     while capture := new_captures.pop():
-                        # The camera may use the index of a failed picture again. A low index therefore also belongs to
-                        # a new picture, unless the log already had a capture with this index.
-                        is_old = before is not None and capture.index < before.image_count
-                        if not is_old or capture.index not in known_indices:
+                        if _is_new(capture, before, known_indices):
                             return self._checked(capture)
                     round_trip_s = self.link.round_trip_s or 0.0
                     has_arrived = await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s))
@@ -125,6 +122,7 @@ class Shutter:
         return None
 
     def _checked(self, capture: Capture) -> Capture:
+        """Return the capture; raise OperationRejected if the camera failed to take the picture."""
         if capture.success is False:
             raise OperationRejected(f"{self.link.describe()} could not take the picture")
         return capture
@@ -184,6 +182,16 @@ class Shutter:
         return (TRIGGER, 0, UNCHANGED, 0, 0) if self.link.is_trigger else (STOP, self.link.device_id)
 
 
+def _is_new(capture: Capture, before: CameraStatus | None, known_indices: set[int]) -> bool:
+    """Return True if a capture may be of a picture that was ordered after the status ``before``.
+
+    The camera may use the index of a failed picture again. A low index therefore also belongs to a new picture, unless
+    the log already had a capture with this index.
+    """
+    is_low = before is not None and capture.index < before.image_count
+    return not is_low or capture.index not in known_indices
+
+
 def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
     """Return True if the camera certainly has taken no picture between the two reports, and is taking none."""
     return before is not None and status.image_count <= before.image_count and not status.is_capturing
@@ -197,14 +205,18 @@ class PhotoInterval:
     """
 
     def __init__(self, shutter: Shutter, seconds: float, count: int) -> None:
-        self._shutter, self._seconds, self._count = shutter, seconds, count
-        self._link, self._log = shutter.link, shutter.log
+        self._shutter = shutter
+        self._seconds = seconds
+        self._count = count
+        self._link = shutter.link
+        self._log = shutter.log
         self._new_captures = CaptureQueue(self._log.cell)
         # Index of the capture to deliver next.
         self._next_index: int | None = None
         # `reset_at` of the log when `_next_index` was determined. After a newer reset, the camera counts from 0 again,
         # so that `_next_index` is no longer valid.
         self._known_reset_at = self._log.reset_at
+        # The last capture, if it may be the first one after a reset; see `_first_after_reset`.
         self._possible_first: Capture | None = None
         # True if the index of the first capture was taken as the start, because no status was available.
         self._is_start_guessed = False
@@ -216,6 +228,7 @@ class PhotoInterval:
         # Received captures that were not delivered yet: the successful ones by index, and the failed ones.
         self._waiting: dict[int, Capture] = {}
         self._failed: list[Capture] = []
+        # Numbers of captures that the iterator has returned, and that could not be received.
         self._delivered = 0
         self._missed = 0
         self._operation: ActiveOperation | None = None
@@ -226,8 +239,10 @@ class PhotoInterval:
         return self._missed
 
     async def __aenter__(self) -> Self:
+        """Start the series."""
         await self._link.require_capability("photo_interval", "capture_image")
-        operation = self._operation = ActiveOperation(self._link, "series", lambda: self._shutter.stop_command)
+        operation = ActiveOperation(self._link, "series", lambda: self._shutter.stop_command)
+        self._operation = operation
         try:
             await self._begin(operation)
         except BaseException as error:
@@ -241,17 +256,19 @@ class PhotoInterval:
         return self
 
     async def _begin(self, operation: ActiveOperation) -> None:
+        """Determine the index of the first capture, and start the series. Captures are queued from now on."""
         before = await self._shutter.reliable_status()
         self._next_index = None if before is None else before.image_count
         first_index = 0 if before is None else before.image_count
-        self._newest_index, self._newest_at = first_index - 1, self._link.now()
+        self._set_newest(first_index - 1)
         self._known_reset_at = self._log.reset_at
         self._new_captures.__enter__()
         await self._shutter.start_series(operation.order, self._seconds, self._count, before)
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        """Stop the series, unless the camera has ended it by itself after the requested number of pictures."""
         self._new_captures.__exit__()
-        # A camera ends the series after the requested number by itself; PX4's trigger does not know the number.
+        # PX4's trigger does not know the requested number.
         has_ended = 0 < self._count <= self._delivered and not self._link.is_trigger
         if self._operation is not None and has_ended:
             self._operation.discard()
@@ -317,7 +334,7 @@ class PhotoInterval:
                 self._known_reset_at = self._log.reset_at
                 self._next_index = first.index
                 self._is_start_guessed = False
-                self._newest_index, self._newest_at = first.index, self._link.now()
+                self._set_newest(first.index)
                 self._waiting = {first.index: first}
             # Without a status, the first capture determines the start. A later capture with a much lower index shows
             # that the first index was corrupt, and then determines the start instead.
@@ -336,7 +353,12 @@ class PhotoInterval:
                 if capture.index > self._newest_index:
                     if self._delivered:  # The start cannot be corrected once a capture was delivered.
                         self._is_start_guessed = False
-                    self._newest_index, self._newest_at = capture.index, self._link.now()
+                    self._set_newest(capture.index)
+
+    def _set_newest(self, index: int) -> None:
+        """Record the highest index so far."""
+        self._newest_index = index
+        self._newest_at = self._link.now()
 
     def _max_new_captures(self) -> float:
         """Upper limit of the number of pictures taken since the newest capture."""

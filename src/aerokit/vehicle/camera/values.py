@@ -208,6 +208,7 @@ def place_of(
 
 
 def information_of(message: m.CameraInformation, number: int) -> CameraInformation:
+    """Decode CAMERA_INFORMATION of the camera with this number."""
     # Major, minor, patch and dev version, one byte each, lowest byte first.
     version = message.firmware_version
     numbers = [(version >> shift) & 0xFF for shift in (0, 8, 16, 24)]
@@ -231,10 +232,12 @@ def information_of(message: m.CameraInformation, number: int) -> CameraInformati
 
 
 def mode_of(message: m.CameraSettings) -> str:
+    """Return the name of the mode in CAMERA_SETTINGS; "unknown" for another mode."""
     return next((name for name, number in MODES.items() if number == message.mode_id), "unknown")
 
 
 def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
+    """Decode CAMERA_CAPTURE_STATUS."""
     is_recording = message.video_status == 1
     return CameraStatus(
         is_capturing=message.image_status in CAPTURING,
@@ -248,6 +251,7 @@ def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
 
 
 def storage_of(message: m.StorageInformation) -> CameraStorage:
+    """Decode STORAGE_INFORMATION. The sizes are valid only if the medium is ready."""
     is_ready = message.status == StorageStatus.READY
     return CameraStorage(
         number=message.storage_id,
@@ -292,6 +296,7 @@ def stream_state(message: m.VideoStreamInformation | m.VideoStreamStatus) -> dic
 
 
 def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
+    """Decode CAMERA_TRACKING_IMAGE_STATUS. The mode determines which of the fields are valid."""
     corners = (message.rec_top_x, message.rec_top_y, message.rec_bottom_x, message.rec_bottom_y)
     is_point = message.tracking_mode == Tracking.POINT
     is_rectangle = message.tracking_mode == Tracking.RECTANGLE
@@ -307,6 +312,7 @@ def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
 
 
 def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
+    """Decode CAMERA_TRACKING_GEO_STATUS."""
     heading = finite_or_none(message.hdg)
     return TrackedPlace(
         is_active=bool(message.tracking_status & TrackingFlags.ACTIVE),
@@ -322,6 +328,7 @@ def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
 
 
 def thermal_range_of(message: m.CameraThermalRange) -> ThermalRange:
+    """Decode CAMERA_THERMAL_RANGE."""
     return ThermalRange(
         stream=message.stream_id,
         max_celsius=message.max,

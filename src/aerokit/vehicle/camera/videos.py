@@ -51,7 +51,7 @@ class VideoMixin(CameraMixin):
             "camera.thermal_range", m.CameraThermalRange, THERMAL_POLL_INTERVAL_S
         )
         """Coldest and hottest point of the thermal image; polled every second while your program uses this value."""
-        self._streams: dict[int, CameraStream] = {}
+        self._streams: dict[int, CameraStream] = {}  # video streams by number
         link.listen(m.CameraCaptureStatus, lambda message: link.set_cell(self.status, status_of(message), message))
         link.listen(m.VideoStreamInformation, self._on_stream)
         link.listen(m.VideoStreamStatus, self._on_stream_status)
@@ -83,6 +83,7 @@ class VideoMixin(CameraMixin):
             await self._start(order, status_hz, timeout)
 
     async def _start(self, order: Order, status_hz: float, timeout: float) -> None:
+        """Start recording, and wait until the camera reports that it records."""
         command = (START, self._link.video_stream, status_hz, self._link.device_id)
         await self._link.order_once(
             order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
@@ -142,6 +143,7 @@ class VideoMixin(CameraMixin):
             if is_reported and is_recording is not expected:
                 await self.status.wait_until(lambda status: status.is_recording is expected)
             return
+        # The time-out has expired.
         outcome = "does not record" if expected else "still records"
         raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
 

@@ -59,20 +59,27 @@ class CommandArbiter:
         """True while the result of a mode change is unknown, so that the reported mode may still change."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
-        self._any_mode_until = self._arming_accepted_at = self._disarmed_at = -math.inf
+        # Until this time, any reported mode may be the effect of a raw command.
+        self._any_mode_until = -math.inf
+        self._arming_accepted_at = -math.inf
+        # Time of the last report of disarmed.
+        self._disarmed_at = -math.inf
         # Time of the last change from disarmed to armed, and the order with which this program caused it; None if
         # another party armed the vehicle.
         self._armed_at = -math.inf
         self._armed_by_program: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
+        # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
-        self._sent: list[SentCommand] = []  # commands whose `sending` block is active
+        self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
+        # The newest order about each topic, even if it was withdrawn or has ended.
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()
+        # The modes that the program ordered last: the time of the order, and the number of the mode.
         self._ordered_modes: deque[tuple[float, int]] = deque(maxlen=16)
-        self._on_steering: list[Callable[[], None]] = []
+        self._steering_callbacks: list[Callable[[], None]] = []
         telemetry.mode.observe(self._on_mode, every_arrival=True)
         telemetry.system_status.observe(self._on_system_status, every_arrival=True)
         telemetry.armed.observe(self._on_armed, every_arrival=True)
@@ -87,6 +94,7 @@ class CommandArbiter:
         return order
 
     def _is_newest(self, order: Order) -> bool:
+        """Return True if the order is not withdrawn, and no newer order about its topics was given."""
         latest_orders = (self.latest(topic) for topic in order.ended_by)
         is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
         return not order.is_withdrawn and not is_superseded
@@ -98,6 +106,7 @@ class CommandArbiter:
         """End the posted orders about these topics, because a newer order was given."""
         topics = tuple(topics)
         self._ordered_since_disarmed.update(topics)
+        # This order has no rules of its own: it is registered only to be newer than the posted ones.
         self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
@@ -141,10 +150,10 @@ class CommandArbiter:
 
     def on_steering(self, callback: Callable[[], None]) -> None:
         """Register a callback that is called before each new steering order."""
-        self._on_steering.append(callback)
+        self._steering_callbacks.append(callback)
 
     def _notify_steering(self) -> None:
-        for callback in self._on_steering:
+        for callback in self._steering_callbacks:
             callback()
 
     def on_reboot(self) -> None:
@@ -154,7 +163,8 @@ class CommandArbiter:
         self._ordered_since_disarmed.clear()
         # No order was given after this time (infinity), so `current` ignores all orders from before the reboot until
         # the vehicle arms again.
-        self._armed_by_program, self._armed_at = None, math.inf
+        self._armed_by_program = None
+        self._armed_at = math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
 
@@ -242,6 +252,7 @@ class CommandArbiter:
         self._sent.append(sent)
         try:
             yield sent
+            # The block has not raised, so the vehicle has accepted the command.
             self._record_accepted(armed)
         finally:
             self._sent.remove(sent)
@@ -379,7 +390,8 @@ class CommandArbiter:
 
     def _posted_modes(self) -> tuple[Mode, ...]:
         """Modes that posted orders, including superseded ones, may still lead to."""
-        return tuple(mode for order in self._posted if not order.is_confirmed for mode in order.modes)
+        unconfirmed_orders = [order for order in self._posted if not order.is_confirmed]
+        return tuple(mode for order in unconfirmed_orders for mode in order.modes)
 
     def _is_steering(self) -> bool:
         """True while the vehicle is in a mode of the newest order and there was no takeover."""
@@ -402,6 +414,7 @@ class CommandArbiter:
             order.on_system_status(state)
 
     def _on_armed(self, armed_before: bool | None, armed: bool) -> None:
+        """Process the armed state in each HEARTBEAT, changed or not."""
         if armed_before and not armed:
             self._ordered_since_disarmed.clear()
         if armed and not armed_before:

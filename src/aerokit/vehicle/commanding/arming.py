@@ -98,6 +98,7 @@ class ArmingActions(VehicleBase):
                 else:
                     await changes.next(min(timeout, ask_at - self.connection.now()))
             return
+        # The time-out has expired.
         recent_texts = self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S)
         missing_now = self._health.missing_for_flight()
         # The vehicle may have become ready just after the last check. Nothing is missing then.
@@ -186,11 +187,17 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
 
     async def _arm_in_present_mode(self, force: bool, timeout: float, max_silence_s: float | None) -> None:
+        """Send the arm command once, and wait for its effect.
+
+        After any error but a refusal, `ArmCleanup` watches whether the vehicle arms late, and disarms it.
+        """
         started, was_armed = self.connection.now(), self.telemetry.is_armed
         with self._arbiter.auxiliary_order() as order:
             try:
-                await self._sender.send_arm(order, True, force=force)
-                await self._await_armed(True, order, started, timeout, max_silence_s)
+                await self._sender.send_arm(order, armed=True, force=force)
+                await self._await_armed(
+                    armed=True, order=order, started=started, timeout=timeout, max_silence_s=max_silence_s
+                )
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
             except CommandTimeout as error:
@@ -224,11 +231,13 @@ class ArmingActions(VehicleBase):
         started = self.connection.now()
         with self._arbiter.auxiliary_order(ends_flight=True) as order:
             try:
-                await self._sender.send_arm(order, False, force=force)
+                await self._sender.send_arm(order, armed=False, force=force)
             except CommandRejected as error:
                 # ArduCopter sends no status text when it refuses to disarm in the air (AP_Arming_Copter.cpp, disarm).
                 raise self._session.with_reasons(error, started, self._reason_if_flying()) from None
-            await self._await_armed(False, order, started, timeout, max_silence_s)
+            await self._await_armed(
+                armed=False, order=order, started=started, timeout=timeout, max_silence_s=max_silence_s
+            )
 
     def _reason_if_flying(self) -> tuple[str, ...]:
         """Return the landed state as a reason, if it shows that the vehicle is flying."""
@@ -238,7 +247,7 @@ class ArmingActions(VehicleBase):
         return (f"the vehicle is not on the ground (landed state {MavLandedState(landed).name})",)
 
     async def _await_armed(
-        self, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
+        self, *, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
     ) -> None:
         """Wait until a HEARTBEAT received after ``started`` reports that the vehicle is armed, or disarmed."""
         cell = self.telemetry.armed
@@ -335,6 +344,7 @@ class ArmingActions(VehicleBase):
             with anyio.move_on_after(timeout if unanswered is None else min(timeout, ARM_WATCH_S)):
                 await self._await_reboot(reboots_before)
                 return
+        # The vehicle has not rebooted in time.
         if unanswered is not None:
             raise CommandTimeout(f"{unanswered}; the command is sent only once, and may still be executed")
         raise OperationTimeout(
@@ -352,7 +362,8 @@ class ArmingActions(VehicleBase):
 
         The polls are frequent at first, because a fast simulation soon exceeds its uptime from before the reboot.
         """
-        started = next_request_at = self.connection.now()
+        started = self.connection.now()
+        next_request_at = started
         while self._session.watch.reboots == reboots_before:
             self.connection.raise_if_ended()
             now = self.connection.now()

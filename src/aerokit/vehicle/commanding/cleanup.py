@@ -38,7 +38,9 @@ class BackgroundTask:
 
     def __init__(self, session: VehicleSession, name: str, warning_clause: str) -> None:
         self._session, self._name, self._warning_clause = session, name, warning_clause
+        # Cancels the task; None before the first task, and once the task is done or cancelled.
         self._scope: Cancellation | None = None
+        # Set when the latest task has ended, also after it was cancelled.
         self._done: asyncio.Event | None = None
 
     @property
@@ -114,7 +116,8 @@ class FlightCleanup:
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender
         self.stop_stream: Callable[[str], None] | None = None
-        self._flight: Order | None = None
+        # The order that a call awaits in `flying`.
+        self._awaited_order: Order | None = None
         self._task = BackgroundTask(session, "aerokit hold", warning_clause="before a hold was confirmed")
         # A new steering order makes the confirmation of an earlier hold pointless.
         arbiter.on_steering(self._task.cancel)
@@ -230,7 +233,7 @@ class FlightCleanup:
 
         The vehicle must also hold after it has hit the ground, because its target may still be in the air.
         """
-        self._flight = order
+        self._awaited_order = order
         try:
             yield
         except OperationRejected:
@@ -238,8 +241,8 @@ class FlightCleanup:
                 self.hold_in_background(order)
             raise
         finally:
-            if self._flight is order:
-                self._flight = None
+            if self._awaited_order is order:
+                self._awaited_order = None
 
     def check_no_stream(self) -> None:
         """Raise BusyError if a set-point stream is open."""
@@ -270,8 +273,8 @@ class FlightCleanup:
         """At the end of the vehicle's `async with` block, end the flights of other tasks, and hold the vehicle."""
         if self.stop_stream is not None:
             self.stop_stream("the async with block of its vehicle was left")
-        if self._flight is not None:
-            self.hold_in_background(self._flight)
+        if self._awaited_order is not None:
+            self.hold_in_background(self._awaited_order)
 
     @property
     def _holds_by_reposition(self) -> bool:
@@ -358,7 +361,7 @@ class ArmCleanup:
         with anyio.CancelScope(shield=True):
             try:
                 with self._arbiter.auxiliary_order(ends_flight=True) as disarm_order:
-                    await self._sender.send_arm(disarm_order, False)
+                    await self._sender.send_arm(disarm_order, armed=False)
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 

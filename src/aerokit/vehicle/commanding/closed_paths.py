@@ -38,7 +38,8 @@ class Circle(ClosedPath):
     """A circle; the phase is the bearing from its centre in radians."""
 
     def __init__(self, radius_m: float, *, clockwise: bool, first_phase: float) -> None:
-        self._radius_m, self._direction = radius_m, 1 if clockwise else -1
+        self._radius_m = radius_m
+        self._direction = 1 if clockwise else -1
         self.first_phase: float = first_phase
 
     def at(self, phase: float) -> tuple[Vector, Vector, Vector]:
@@ -85,10 +86,17 @@ class PathFlight:
         centre: tuple[float, float, float],
         heading: Callable[[Vector, Vector], float | None],
     ) -> None:
-        self._path, self._speed_m_s, self._centre, self._heading = path, speed_m_s, centre, heading
+        self._path = path
+        self._speed_m_s = speed_m_s
+        self._centre = centre
+        self._heading = heading
         self._start = start
-        self._phase, self._last_phase = path.first_phase, path.first_phase + 2 * math.pi * rounds
-        self._flown_m = self._present_speed_m_s = 0.0
+        # Phase of the set-point, and phase at the end of the path.
+        self._phase = path.first_phase
+        self._last_phase = path.first_phase + 2 * math.pi * rounds
+        # Distance of the set-point from `_start`, until it is on the path.
+        self._flown_m = 0.0
+        self._present_speed_m_s = 0.0
         self.is_on_path: bool = False
         """True once the set-point has reached the path."""
 
@@ -102,6 +110,7 @@ class PathFlight:
         return self._advance_on_path(seconds) if self.is_on_path else self._advance_to_path(seconds)
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
+        """Move the set-point along the straight line to the first point of the path."""
         (path_north, path_east), _, _ = self._path.at(self._path.first_phase)
         start_north, start_east, start_down = self._start
         to_path = (path_north - start_north, path_east - start_east, -start_down)  # The path is at down = 0.
@@ -110,7 +119,8 @@ class PathFlight:
         self._flown_m += self._present_speed_m_s * seconds
         if self._flown_m >= length_m:
             self.is_on_path = True
-            self._present_speed_m_s, self._flown_m = 0.0, length_m
+            self._flown_m = length_m
+            self._present_speed_m_s = 0.0
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
             coordinate + fraction * component for coordinate, component in zip(self._start, to_path, strict=True)
@@ -120,6 +130,7 @@ class PathFlight:
         return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), (0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:
+        """Move the set-point along the path, and compute the velocity and acceleration that keep the vehicle on it."""
         _, tangent, _ = self._path.at(self._phase)
         metres_per_radian = math.hypot(*tangent)
         self._change_speed(seconds, (self._last_phase - self._phase) * metres_per_radian)
@@ -149,8 +160,10 @@ class PathFlight:
     def _setpoint(
         self, place: Vector, down: float, velocity: tuple[float, float, float], acceleration: Vector
     ) -> TrajectorySetpoint:
-        north, east, centre_down = self._centre
-        position = (north + place[0], east + place[1], centre_down + down)
+        """Return the set-point for a place relative to the centre, in the local frame."""
+        centre_north, centre_east, centre_down = self._centre
+        north, east = place
+        position = (centre_north + north, centre_east + east, centre_down + down)
         yaw_deg = self._heading(place, velocity[:2])
         return TrajectorySetpoint(*position, *velocity, *acceleration, yaw_deg=yaw_deg)
 
@@ -162,7 +175,8 @@ class TurnCounter:
     """
 
     def __init__(self, radius_m: float, *, clockwise: bool) -> None:
-        self._radius_m, self._direction = radius_m, 1 if clockwise else -1
+        self._radius_m = radius_m
+        self._direction = 1 if clockwise else -1
         self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
         # Bearing from the centre to the vehicle in radians; None while the vehicle is not near the circle.
         self._bearing: float | None = None

@@ -78,7 +78,7 @@ class VehicleBase(States):
     """Base class of the parts of :class:`aerokit.Vehicle`. The parts share the context and do not call each other."""
 
     def __init__(self, context: VehicleContext) -> None:
-        self._context, session = context, context.session
+        session = context.session
         self.connection: Connection = session.connection
         """The connection of the vehicle."""
         self.system_id: int = session.system_id
@@ -93,9 +93,14 @@ class VehicleBase(States):
         """The state cells. Most of them are also properties of the vehicle."""
         self.link_quality: StateCell[LinkReport] = session.link_quality
         """Packet loss, delay and data rates of the last second."""
-        self._session, self._arbiter, self._sender = session, context.arbiter, context.sender
-        self._flight_cleanup, self._arm_cleanup = context.flight_cleanup, context.arm_cleanup
-        self._health, self._position = context.health, context.vehicle_position
+        self._context = context
+        self._session = session
+        self._arbiter = context.arbiter
+        self._sender = context.sender
+        self._flight_cleanup = context.flight_cleanup
+        self._arm_cleanup = context.arm_cleanup
+        self._health = context.health
+        self._position = context.vehicle_position
 
     def _cell_of(self, name: str) -> StateCell[Any]:
         return self.telemetry.cells[name]

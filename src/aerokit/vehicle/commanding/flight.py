@@ -109,7 +109,7 @@ class FlightActions(VehicleBase):
             raise self._with_landed_state(error) from error
 
     def _with_landed_state(self, error: CommandRejected) -> CommandRejected:
-        """Add the landed state to the error of a refused take-off, because the vehicle does not give this reason."""
+        """Add the landed state to the error of a refused take-off, because the vehicle's refusal does not name it."""
         state = IN_THE_AIR.get(self.telemetry.landed_state.latest)
         altitude_m = self._position.altitude_relative()
         is_high = altitude_m > MIN_FLYING_HEIGHT_M
@@ -135,6 +135,7 @@ class FlightActions(VehicleBase):
         return plan
 
     async def _begin_take_off(self, plan: TakeOff, order: Order) -> None:
+        """Send the steps of the take-off: a mode, a command, or both. A reported climb acknowledges the command."""
         if plan.mode is not None:
             await self._sender.ensure_mode(plan.mode, order)
         if plan.command is not None:
@@ -272,6 +273,7 @@ class FlightActions(VehicleBase):
             )
 
     async def _await_home(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
+        """Wait until the vehicle is above home, for an autopilot that does not land after a return."""
         home = self.telemetry.home.value
         place = Position(home.latitude_deg, home.longitude_deg)
         arrival_radius_m = self.autopilot.arrival_radius_m
@@ -356,7 +358,7 @@ class ModeActions(VehicleBase):
         order = self._arbiter.current or self._arbiter.newest
         if order is None:
             return ""
-        if not order.has_lost_mode:
+        if not order.has_lost_mode:  # Without a mode change, only a failsafe is a takeover.
             return order.failsafe
         may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
         if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:

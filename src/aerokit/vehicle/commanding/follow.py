@@ -80,6 +80,7 @@ class FollowedTarget:
     def __init__(self, target: FollowTarget, now: Callable[[], float]) -> None:
         self._target, self._now = target, now
         self.latest: TargetState | None = None
+        # Seconds between the last two different positions.
         self._interval_s = 0.0
 
     def read(self) -> TargetState | None:
@@ -91,6 +92,7 @@ class FollowedTarget:
         return self.latest
 
     def _read_vehicle(self, telemetry: Any) -> None:
+        """Take position and velocity from the cells of a target that is a vehicle."""
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return
@@ -100,7 +102,7 @@ class FollowedTarget:
         speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
         # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
         place = position.latest.replace(altitude_relative_m=None)
-        self.latest = TargetState(place, speeds, received_at, received_at)
+        self.latest = TargetState(place, speeds, reported_at=received_at, first_reported_at=received_at)
 
     def add(self, position: object) -> None:
         """Process a position that the program supplied. An unchanged position counts as a new report.
@@ -117,17 +119,18 @@ class FollowedTarget:
         if latest is not None and now - latest.reported_at < MIN_INTERVAL_S:
             return
         if latest is None:
-            self.latest = TargetState(position, ZERO, now, now)
+            self.latest = TargetState(position, ZERO, reported_at=now, first_reported_at=now)
         elif position == latest.position:
             is_change_overdue = now - latest.first_reported_at > OVERDUE_INTERVALS * self._interval_s
             # If the position should have changed by now, the target has stopped.
             velocity = ZERO if is_change_overdue else latest.velocity
-            self.latest = TargetState(position, velocity, now, latest.first_reported_at)
+            self.latest = latest.replace(velocity=velocity, reported_at=now)
         else:
             self._interval_s = now - latest.first_reported_at
             velocity = _mean_velocity(latest.position, position, self._interval_s)
-            is_jump = math.hypot(*velocity) > MAX_TARGET_SPEED_M_S
-            self.latest = TargetState(position, ZERO if is_jump else velocity, now, now)
+            if math.hypot(*velocity) > MAX_TARGET_SPEED_M_S:  # The position has jumped.
+                velocity = ZERO
+            self.latest = TargetState(position, velocity, reported_at=now, first_reported_at=now)
 
 
 def _mean_velocity(start: Position, end: Position, seconds: float) -> tuple[float, float, float]:
@@ -173,13 +176,20 @@ class FollowStream(SteeringStream[TargetState]):
             raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
         unknown = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)  # replaced when the stream is entered
         super().__init__(context, self._encode_place, unknown, RATE_HZ, valid_for_s, MAX_LAG_S)
-        self._target, self._tracker = target, FollowedTarget(target, self._now)
+        self._target = target
+        self._tracker = FollowedTarget(target, self._now)
         self._encode_position = SetpointEncoder(context).position
-        self._place, self._max_distance_m = place, max_distance_m
+        self._place = place
+        self._max_distance_m = max_distance_m
         self._impact = ImpactDetector(context.session.telemetry)
+        # Cancels the background task that reads the target, if there is one.
         self._reading: Cancellation | None = None
+        # Why the source of positions ended or failed, as a clause; empty while it works.
         self._end_reason = ""
-        self._bearing_deg = self._course_deg = self._own_altitude_m = 0.0
+        # Set when the block is entered: bearing from the target, course of the target, altitude of the follower.
+        self._bearing_deg = 0.0
+        self._course_deg = 0.0
+        self._own_altitude_m = 0.0
 
     @property
     def target(self) -> Position | None:
@@ -207,6 +217,7 @@ class FollowStream(SteeringStream[TargetState]):
     # ------------------------------------------------------------------------------- the block
 
     async def __aenter__(self) -> Self:
+        """Wait for the first position of the target, and then begin the stream in the mode for set-points."""
         self._raise_if_entered()
         self._context.vehicle_position.check_flying("follow")
         mode = self._stream_mode()
@@ -230,7 +241,8 @@ class FollowStream(SteeringStream[TargetState]):
         target = self._target
         if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
             return
-        scope = self._reading = Cancellation()
+        scope = Cancellation()
+        self._reading = scope
 
         async def read() -> None:
             with scope:
@@ -279,6 +291,7 @@ class FollowStream(SteeringStream[TargetState]):
         return self._context.sender.mode_for("follow", "setpoint")
 
     def _tick(self, due: float) -> None:
+        """Read the target, and send the set-point for its position."""
         try:
             state = self._tracker.read()
             if state is not None:

@@ -66,7 +66,10 @@ class ImpactDetector:
 
     def __init__(self, telemetry: Telemetry) -> None:
         self._telemetry = telemetry
-        self._updated_at = self._sank_fast_at = -math.inf
+        # Time of the last velocity that was processed, and of the last one that was a fast descent.
+        self._updated_at = -math.inf
+        self._sank_fast_at = -math.inf
+        # Maximum sink rate of the present or last fast descent.
         self._max_sink_m_s = 0.0
         # Sink rate before the impact, and height of the vehicle at the impact. The sink rate is None if there was no
         # impact.
@@ -89,18 +92,22 @@ class ImpactDetector:
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
         height_m = self._current_height()
+        sinks_fast = velocity.down_m_s >= IMPACT_M_S
         has_just_sunk_fast = cell.updated_at - self._sank_fast_at <= max_stop_s
-        if velocity.down_m_s >= IMPACT_M_S:  # The vehicle sinks as fast as before an impact.
+        has_stopped_suddenly = has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S
+        if sinks_fast:
             max_sink_before_m_s = self._max_sink_m_s if has_just_sunk_fast else 0.0
             self._max_sink_m_s = max(max_sink_before_m_s, velocity.down_m_s)
             self._sank_fast_at = cell.updated_at
-        elif abs(velocity.down_m_s) < STILL_M_S and has_just_sunk_fast:
-            # The vehicle has suddenly stopped sinking. Unless it has lost at least MIN_DROP_M of height, this is no
-            # impact, but an error of the reported velocity.
+        elif has_stopped_suddenly:
+            # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
-                self._impact_m_s, self._impact_height_m = self._max_sink_m_s, height_above_home(self._telemetry)
+                self._impact_m_s = self._max_sink_m_s
+                self._impact_height_m = height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
-            self._impact_m_s = self._impact_height_m = None  # The vehicle flies on, so it did not hit the ground.
+            # The vehicle flies on, so it did not hit the ground.
+            self._impact_m_s = None
+            self._impact_height_m = None
         # The vehicle does not sink now, so a descent can only begin at this height.
         if velocity.down_m_s < STILL_M_S and not has_just_sunk_fast:
             self._top_m = height_m
@@ -130,6 +137,7 @@ class GroundCheck:
         # Time and height of the report that the vehicle is on the ground.
         self._reported_at: float | None = None
         self._reported_height_m: float | None = None
+        # Time since which the vehicle moves up or down slower than SETTLED_M_S; infinite while it moves faster.
         self._settled_since = math.inf
 
     @contextmanager
@@ -157,7 +165,8 @@ class GroundCheck:
             self._reported_at = None
             return False
         if self._reported_at is None:
-            self._reported_at, self._settled_since = now, math.inf
+            self._reported_at = now
+            self._settled_since = math.inf
             self._reported_height_m = height_above_home(self._session.telemetry)
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 

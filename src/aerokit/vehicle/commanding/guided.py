@@ -225,7 +225,10 @@ class SetpointStream(SteeringStream[SetpointT]):
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
-        self._repeats_left, self._sent_at = INITIAL_REPEATS, -math.inf
+        # For autopilots that restart their path: how often a new set-point is still sent at the stream's rate, and when
+        # it was sent last.
+        self._repeats_left = INITIAL_REPEATS
+        self._sent_at = -math.inf
         self._stall = StallDetector(context.session)
         if isinstance(initial, BRAKED_BY_AUTOPILOT):
             self._impact = ImpactDetector(context.session.telemetry)
@@ -259,12 +262,15 @@ class SetpointStream(SteeringStream[SetpointT]):
             self._repeats_left = INITIAL_REPEATS
 
     def _send(self) -> None:
+        """Send the set-point, unless the autopilot would only restart its path to the same place."""
         is_due = self._repeats_left > 0 or self._now() - self._sent_at >= REPEAT_INTERVAL_S
         if is_due or not self._restarts_path:
             super()._send()
-            self._repeats_left, self._sent_at = self._repeats_left - 1, self._now()
+            self._repeats_left -= 1
+            self._sent_at = self._now()
 
     def _stop_reason(self, lag: float) -> str | None:
+        """Also stop the stream if the vehicle stays in place although its set-point requires motion."""
         if self._mode is None or not wants_motion(self._value, self._context):
             # A vehicle that does not have to move cannot stall, so the detection starts again.
             self._stall = StallDetector(self._session)

@@ -47,7 +47,9 @@ class Health:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session, self._telemetry, self._autopilot = session, session.telemetry, session.autopilot
-        self._restored_at = self._checked_at = -math.inf
+        # Times at which the link was last restored, and at which the vehicle was last requested to run its checks.
+        self._restored_at = -math.inf
+        self._checked_at = -math.inf
         session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))
 
     def _on_restored(self, event: LinkRestored) -> None:
@@ -198,6 +200,7 @@ class Health:
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
+        """Return one text for each missing estimate, after a missing GPS fix, which is the probable cause."""
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []

@@ -214,7 +214,8 @@ class ManeuverActions(VehicleBase):
             raise InvalidArgument(f"turns = {turns!r} is not allowed without radius_m")
         center = self.telemetry.position.fresh(POSITION_MAX_AGE_S) if target is None else travel_target(target)
         if radius_m is None:
-            counter, command = None, int(MavCmd.DO_REPOSITION)
+            counter = None
+            command = int(MavCmd.DO_REPOSITION)
             # The speed, the radius and the yaw are left to the vehicle.
             params: tuple[float, ...] = (-1.0, float(MavDoRepositionFlags.CHANGE_MODE), 0.0, math.nan)
             mode = self._sender.mode_for("loiter", self.autopilot.reposition_purpose)

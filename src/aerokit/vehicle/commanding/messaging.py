@@ -120,6 +120,7 @@ class _StreamMonitor:
     """Tracks whether streamed messages arrive, and sets ``must_request`` when the vehicle may have lost the request."""
 
     def __init__(self, session: VehicleSession, cleanup: ExitStack) -> None:
+        # Both are reset by each request.
         self.has_received = False
         self.must_request = asyncio.Event()
         self._system_id = session.system_id
@@ -131,7 +132,8 @@ class _StreamMonitor:
 
     def reset(self) -> None:
         """Forget the messages and events that arrived before a new request."""
-        self.has_received, self.must_request = False, asyncio.Event()
+        self.has_received = False
+        self.must_request = asyncio.Event()
 
     def _on_message(self, message: Message) -> None:
         self.has_received = True
@@ -223,9 +225,11 @@ class MessagingActions(VehicleBase):
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: it must be MAV_FRAME_GLOBAL (0)")
+        commands = self._session.commands
+        send = commands.send_place if or_long else commands.send_int
         frame_option = {} if or_long else {"frame": frame}  # `send_place` has a fixed frame.
         return await self._sender.send_raw(
-            self._session.commands.send_place if or_long else self._session.commands.send_int,
+            send,
             command,
             *params,
             **frame_option,

@@ -187,17 +187,22 @@ class Order:
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
-        # Sets of modes, by their numbers in HEARTBEAT.custom_mode.
+        # Sets of modes, by their numbers in HEARTBEAT.custom_mode. The class describes the kinds of modes.
         self._own_modes = {mode.custom_mode for mode in modes}
         self._expected_modes = set(expected)
         self._modes_before = set() if mode_before is None else {mode_before.custom_mode} - self._expected_modes
         self._accepted_modes = self._modes_before | self._expected_modes
+        # The last reports of the vehicle: mode, arming and MAV_STATE. None before the first report.
         self._mode_now = None if mode_before is None else mode_before.custom_mode
         self._armed_now = armed_before
-        self._state_before, self._ends_flight = state_before, ends_flight
-        self._ends_on_mode_change, self._ends_on_disarm = ends_on_mode_change, ends_on_disarm
+        self._state_before = state_before
+        # An order that ends the flight (land, return, disarm) stays valid during a failsafe.
+        self._ends_flight = ends_flight
+        self._ends_on_mode_change = ends_on_mode_change
+        self._ends_on_disarm = ends_on_disarm
         self._is_newest = is_newest
-        self._settles_at, self._any_mode_until = settles_at, any_until
+        self._settles_at = settles_at
+        self._any_mode_until = any_until
         self._requires_mode_change = requires_mode_change
 
     @property
@@ -246,14 +251,16 @@ class Order:
         number = mode.custom_mode
         is_first_report = self._mode_now is None
         is_change = not is_first_report and number != self._mode_now
+        is_settled = reported_at >= self._settles_at
+        is_expected = number in self._expected_modes and number in self._accepted_modes
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
             has_taken_effect = is_change or not self._requires_mode_change
-            if has_taken_effect and reported_at >= self._settles_at:
+            if has_taken_effect and is_settled:
                 self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
-        elif number in self._expected_modes & self._accepted_modes and reported_at >= self._settles_at:
+        elif is_expected and is_settled:
             # An earlier order of the program has taken effect, so only another party can restore the mode before it.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
@@ -315,13 +322,16 @@ class SentCommand:
         self.heartbeat_at: float = -math.inf
         """Time of the last HEARTBEAT."""
         self._is_effect_reported = False
+        # Modes, by their numbers in HEARTBEAT.custom_mode: the last reported one, and those that the command leads to.
         self._mode_now = None if mode_now is None else mode_now.custom_mode
         self._modes = {mode.custom_mode for mode in modes}
         self._armed_now = armed_now
         self.arms = armed
         """True if the command arms the vehicle, False if it disarms it, None if it does neither."""
+        # True once a newer command of the program disarms what this one arms, or the reverse.
         self._is_overruled = False
-        self._is_done, self._slept_s = is_done, slept_s
+        self._is_done = is_done
+        self._slept_s = slept_s
 
     @property
     def is_confirmed(self) -> bool:

@@ -140,7 +140,7 @@ class PostedOrder:
             while armed.updated_at <= answered_at or not self._arbiter.is_state_recent:
                 await changes.next(POLL_INTERVAL_S)
             return not self.end
-        return False
+        return False  # No HEARTBEAT was received in time.
 
     async def wait_confirmed(self, timeout: float) -> None:
         """Wait until HEARTBEAT reports the order's effect. Returns at once if it is already reported.

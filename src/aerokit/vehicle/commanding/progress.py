@@ -157,7 +157,9 @@ class StallDetector:
         # The place that the vehicle has not left recently, and the time at which it arrived there.
         self._place: Position | None = None
         self._there_since = -math.inf
-        self._max_height_m, self._max_sink_m_s = -math.inf, 0.0
+        # The highest place and the fastest descent so far, for the error text.
+        self._max_height_m = -math.inf
+        self._max_sink_m_s = 0.0
         self._sank_fast_at = -math.inf
 
     @property
@@ -183,6 +185,7 @@ class StallDetector:
         return None
 
     def _record_descent(self, here: Position) -> None:
+        """Record height and sink rate of a vehicle that has just arrived at this place."""
         velocity = self._session.telemetry.velocity.latest
         if here.altitude_relative_m is not None:
             self._max_height_m = max(self._max_height_m, here.altitude_relative_m)
@@ -232,6 +235,7 @@ class VehiclePosition:
 
     def __init__(self, session: VehicleSession) -> None:
         self._telemetry, self._autopilot = session.telemetry, session.autopilot
+        # Radius that the vehicle was ordered to circle with; 0 if there is none.
         self._circle_m = 0.0
         session.telemetry.mode.observe(lambda *_: self.record_circle(0.0))
 

@@ -59,14 +59,19 @@ class RoundFlight:
         *,
         center_name: str = "center",
     ) -> None:
-        self._context, self._session, self._telemetry = context, context.session, context.session.telemetry
-        self._operation, self._center, self._counter = operation, center, counter
+        self._context = context
+        self._session = context.session
+        self._telemetry = context.session.telemetry
+        self._operation = operation
+        self._center = center
+        self._counter = counter
         self._rounds = math.inf if rounds is None else rounds
         max_distance_m, self._timeout, self._max_silence_s = limits
         # Reason why the vehicle does not fly the ordered circle; empty if it does. If there is a reason, the vehicle is
         # ordered to hold.
         self._circle_problem = ""
         position = context.vehicle_position
+        # The center as arguments of a COMMAND_INT.
         self._place = position.command_place(center, center_name)
         position.check_reach(center_name, [center], max_distance_m)
         position.check_flying(operation)
@@ -130,6 +135,7 @@ class RoundFlight:
                 self._circle_problem = ""
 
         def failure_reason() -> str | None:
+            """Return why the rounds cannot succeed: the mode, a status text that refuses them, or a wrong radius."""
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
             refusal = next(refusals, "")
             if refusal:
@@ -227,10 +233,12 @@ class RoundFlight:
         initial_deg = self._telemetry.heading_deg.latest
 
         def heading(place: Vector, velocity: Vector) -> float | None:
-            if facing == "center":
-                return math.degrees(math.atan2(-place[1], -place[0])) % 360
-            if facing == "ahead" and math.hypot(*velocity) > 0:
-                return math.degrees(math.atan2(velocity[1], velocity[0])) % 360
+            north_m, east_m = place
+            north_m_s, east_m_s = velocity
+            if facing == "center":  # The place is relative to the center, so the center is in the opposite direction.
+                return math.degrees(math.atan2(-east_m, -north_m)) % 360
+            if facing == "ahead" and math.hypot(north_m_s, east_m_s) > 0:
+                return math.degrees(math.atan2(east_m_s, north_m_s)) % 360
             return initial_deg if facing == "initial" else None
 
         return heading

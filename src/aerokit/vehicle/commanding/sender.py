@@ -121,7 +121,7 @@ class OrderSender:
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
         return error
 
-    async def send_arm(self, order: Order, armed: bool, *, force: bool = False) -> None:
+    async def send_arm(self, order: Order, *, armed: bool, force: bool = False) -> None:
         """Send the command to arm or disarm."""
         # `ArmCleanup` must not take the ack of an earlier command for the ack of this one.
         self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
@@ -343,7 +343,9 @@ class OrderSender:
                 return await send(command, *params, **options)
             names = self._session.telemetry.mode_names
             modes = self._session.autopilot.modes_of_command(command, params, names)
-            armed = params[0] == 1 if command == MavCmd.COMPONENT_ARM_DISARM and params else None
+            armed: bool | None = None  # True if the command arms the vehicle, False if it disarms the vehicle.
+            if command == MavCmd.COMPONENT_ARM_DISARM and params:
+                armed = params[0] == 1
             with (
                 self._raw_order(command, modes) as order,
                 self._arbiter.sending(order, modes=modes, armed=armed) as sent,

@@ -180,19 +180,19 @@ class SimpleOrder(Snapshot):
         ``target`` is the id of the component that sends the message.
         """
         session, message_type = context.session, getattr(m, effect.message)
-        reports: list[Message] = []  # The list has at most one message, the latest.
+        latest: Message | None = None
         is_reported = False
         requested_at = session.connection.now()
 
         def on_message(message: Message) -> None:
-            nonlocal is_reported
+            nonlocal latest, is_reported
             frame = message.received_frame
             if frame is None or frame.component_id == target:
-                reports[:] = [message]
+                latest = message
                 is_reported = is_reported or effect.is_reported(message, *values)
 
-        def is_done() -> bool:
-            """Return True once the effect is reported; until then, request the message again and again."""
+        def poll_effect() -> bool:
+            """Return True once the effect is reported; until then, request the message every EFFECT_POLL_S."""
             nonlocal requested_at
             if not is_reported and session.connection.now() - requested_at >= EFFECT_POLL_S:
                 requested_at = session.connection.now()
@@ -202,13 +202,13 @@ class SimpleOrder(Snapshot):
         detach = session.connection.bus.attach(message_type, on_message, system_id=session.system_id)
         try:
             # A vehicle that refuses requests for the message may still stream it.
-            if await _has_message(context, message_type.ID, target) or reports:
+            if await _has_message(context, message_type.ID, target) or latest is not None:
                 await await_progress(
                     session,
                     self.name,
-                    is_done=is_done,
+                    is_done=poll_effect,
                     failure_reason=lambda: _supersession(device_order),
-                    describe=lambda: str(reports[0]) if reports else f"no {message_type.NAME} was received",
+                    describe=lambda: f"no {message_type.NAME} was received" if latest is None else str(latest),
                     timeout=timeout,
                 )
         finally:

@@ -91,7 +91,9 @@ class StickStream(SteeringStream[StickInput]):
     ) -> None:
         super().__init__(context, self._message_of, initial or StickInput(), rate_hz, valid_for_s, max_lag_s)
         self._rules = context.session.autopilot.sticks
-        self._probe, self._has_sent = probe, False
+        self._probe = probe
+        # True while the vehicle may execute stick positions that were not released yet.
+        self._has_sent = False
         telemetry = context.session.telemetry
         self._chosen_mode = None if mode is None else self._session.autopilot.find_mode(mode, telemetry.mode_names)
 
@@ -120,6 +122,7 @@ class StickStream(SteeringStream[StickInput]):
         return self._chosen_mode or self._context.sender.mode_for("sticks", "sticks")
 
     async def _check_support(self) -> None:
+        """Read the parameters that decide whether the vehicle accepts stick positions, and raise if it ignores them."""
         if self._session.autopilot.name == "PX4":
             source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
             if source in (RC_ONLY, DISABLED):
@@ -149,6 +152,7 @@ class StickStream(SteeringStream[StickInput]):
             raise OperationRejected("sticks: bit 1 of RC_OPTIONS makes ArduPilot ignore overrides; clear this bit")
 
     def _message_of(self, sticks: StickInput) -> Message:
+        """Return the MANUAL_CONTROL for these positions; raise InvalidArgument if one of them is out of range."""
         for name in ("forward", "right", "throttle", "yaw"):
             check_range(name, getattr(sticks, name), -1, 1)
         check_range("buttons", sticks.buttons, 0, MAX_BUTTONS)
@@ -179,10 +183,10 @@ class StickStream(SteeringStream[StickInput]):
             target = self._session.system_id
             message = ManualControl(target=target, x=NO_VALUE, y=NO_VALUE, z=NO_VALUE, r=NO_VALUE, buttons=0)
         elif self._rules.release == "channels":
-            # The message has 18 channels. The upper ten, above channel 8, have another value for a release.
+            # The message has 18 channels. A release has one value for channels 1 to 8, and another for 9 to 18.
             released_upper_count = SUB_CHANNELS - 8
-            upper = [RELEASED_UPPER] * released_upper_count + [UNCHANGED] * (10 - released_upper_count)
-            values = [RELEASED] * 8 + upper
+            unchanged_count = 18 - SUB_CHANNELS
+            values = [RELEASED] * 8 + [RELEASED_UPPER] * released_upper_count + [UNCHANGED] * unchanged_count
             message = RcChannelsOverride(self._session.system_id, self._session.component_id, *values)
         if message is not None:
             with contextlib.suppress(AerokitError):  # The overrides expire by themselves.

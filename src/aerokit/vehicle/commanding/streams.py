@@ -72,15 +72,24 @@ class ValueStream(Generic[ValueT]):
         check_range("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
         check_range("valid_for_s", valid_for_s, 0, 60, above=True)
         check_range("max_lag_s", max_lag_s, 0, 60, above=True)
-        self._context, self._session = context, context.session
+        self._context = context
+        self._session = context.session
         self._encode = encode
-        self._period_s, self._valid_for_s, self._max_lag_s = 1 / rate_hz, valid_for_s, max_lag_s
+        self._period_s = 1 / rate_hz
+        self._valid_for_s = valid_for_s
+        # Maximum delay of a tick; a longer delay means that the event loop was blocked.
+        self._max_lag_s = max_lag_s
+        # The latest value, its message (None before the block is entered), and the time at which it was supplied.
         self._value = initial
         self._message: Message | None = None
         self._set_at = -math.inf
+        # Calls `_tick`; None while nothing is sent.
         self._timer: asyncio.TimerHandle | None = None
+        # Set once the stream has stopped. The error is raised by the next call, or when the block is left.
         self._stop_error: AerokitError | None = None
-        self._has_raised_stop = self._was_entered = self._is_changing_mode = False
+        self._has_raised_stop = False
+        self._was_entered = False
+        self._is_changing_mode = False
         self._began_sending_at = math.inf
 
     @property
@@ -112,7 +121,9 @@ class ValueStream(Generic[ValueT]):
         """Replace the value. It is encoded at once, so that an invalid value is refused here, not when it is sent."""
         message = self._encode(value)
         message.encode()
-        self._value, self._message, self._set_at = value, message, self._now()
+        self._value = value
+        self._message = message
+        self._set_at = self._now()
 
     def _begin_sending(self) -> None:
         self._replace_value(self._value)
@@ -223,6 +234,7 @@ class SteeringStream(ValueStream[ValueT]):
         """Raise if the vehicle would ignore the values, before anything is sent."""
 
     async def __aenter__(self) -> Self:
+        """Give the steering order, change to the stream's mode, and begin to send the initial value."""
         self._raise_if_entered()
         self._replace_value(self._value)  # Raises for an invalid value before anything is sent.
         cleanup = self._context.flight_cleanup
@@ -238,7 +250,8 @@ class SteeringStream(ValueStream[ValueT]):
         except BaseException:
             self._end()
             raise
-        order = self._order = self._prepared_order or self._context.arbiter.order(mode)
+        order = self._prepared_order or self._context.arbiter.order(mode)
+        self._order = order
         # A vehicle that is already in the stream's mode may execute the first value as soon as it is sent.
         order.may_move = order.may_move or self._session.telemetry.is_in(mode)
         try:
@@ -254,6 +267,7 @@ class SteeringStream(ValueStream[ValueT]):
         return self
 
     async def __aexit__(self, exc_type: object, exc: BaseException | None, traceback: object) -> None:
+        """Make the vehicle hold; if the stream has stopped by itself and the program does not know it yet, raise."""
         if self._stop_error is None and (reason := self._takeover_reason()):
             self._stop(reason, hold=False)
         if self._stop_error is None:
@@ -333,9 +347,11 @@ class TakeoverCheck:
 
     def __init__(self, context: VehicleContext, next_mode: Mode) -> None:
         telemetry, autopilot = context.session.telemetry, context.session.autopilot
-        self._telemetry, self._next_mode = telemetry, next_mode
+        self._telemetry = telemetry
+        self._arbiter = context.arbiter
+        self._next_mode = next_mode
         self._mode_before = telemetry.mode.latest
-        self._arbiter, self._order_before = context.arbiter, context.arbiter.latest(STEERING)
+        self._order_before = context.arbiter.latest(STEERING)
         take_off_mode = autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol)
         hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
         self._end_of_take_off = (take_off_mode, hold_mode)

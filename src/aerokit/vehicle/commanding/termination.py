@@ -15,6 +15,8 @@ TerminationIntent = Literal["terminate flight"]
 ShutdownIntent = Literal["shut down"]
 
 ANSWER_TIMEOUT_S = 3.0
+TERMINATE = 1.0
+"""param1 of DO_FLIGHTTERMINATION that terminates the flight."""
 SHUTDOWN = 2
 """param1 of PREFLIGHT_REBOOT_SHUTDOWN that switches the autopilot off."""
 SEND_ONCE: dict[str, Any] = {"attempts": 1, "attempt_timeout": ANSWER_TIMEOUT_S}
@@ -44,11 +46,12 @@ class TerminationActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
-        modes = self.autopilot.modes_of_command(MavCmd.DO_FLIGHTTERMINATION, (1.0,))
+        modes = self.autopilot.modes_of_command(MavCmd.DO_FLIGHTTERMINATION, (TERMINATE,))
         self._arm_cleanup.stop()
         order = self._arbiter.order(*modes, ends_flight=True)
         try:
-            await self._sender.send_long(order, MavCmd.DO_FLIGHTTERMINATION, 1.0, modes=modes, armed=False, **SEND_ONCE)
+            command = MavCmd.DO_FLIGHTTERMINATION
+            await self._sender.send_long(order, command, TERMINATE, modes=modes, armed=False, **SEND_ONCE)
         except CommandTimeout as error:
             raise CommandTimeout(f"{error}; the flight may have been terminated nevertheless") from None
         armed, state = self.telemetry.armed, self.telemetry.system_status

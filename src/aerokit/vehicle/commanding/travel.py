@@ -96,7 +96,7 @@ class TravelActions(VehicleBase):
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
-        is_under_way = False
+        is_under_way = False  # True once the vehicle has accepted the target.
         try:
             unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
             is_under_way = True
@@ -175,9 +175,11 @@ class TravelActions(VehicleBase):
         max_silence_s: float | None,
     ) -> None:
         """Wait for the arrival. Meanwhile, repeat ``unacknowledged_target``, see :meth:`_send_target`."""
-        started = sent_at = self.connection.now()
+        started = self.connection.now()
+        sent_at = started  # when `unacknowledged_target` was last sent
 
         def resend_if_due() -> None:
+            """Send the target once more, unless a takeover is possible or the computer slept since the last time."""
             nonlocal sent_at
             now = self.connection.now()
             if unacknowledged_target is None or now - sent_at < RESEND_INTERVAL_S:
@@ -267,7 +269,8 @@ class TravelActions(VehicleBase):
             direction = 0  # the shorter way
             if relative:
                 direction = 1 if heading_deg >= 0 else -1
-            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal_deg, rate_deg_s, direction, 0)
+            absolute = 0
+            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal_deg, rate_deg_s, direction, absolute)
         await self._await_heading(goal_deg, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -279,6 +282,7 @@ class TravelActions(VehicleBase):
         order: Order,
         mode: Mode,
     ) -> None:
+        """Wait until a heading received after this call is within ``tolerance_deg`` of ``goal_deg``."""
         started = self.connection.now()
         heading = self.telemetry.heading_deg
 
@@ -354,6 +358,7 @@ class TravelActions(VehicleBase):
         return self.autopilot.reposition is not None and self.autopilot.reposition.yaw
 
     def _reposition_yaw(self, heading_deg: float | None) -> float:
+        """Return the yaw of MAV_CMD_DO_REPOSITION in radians; NaN leaves the yaw to the autopilot."""
         if heading_deg is None or not self._turns_by_reposition:
             return math.nan
         return math.remainder(math.radians(heading_deg), 2 * math.pi)
@@ -394,7 +399,8 @@ class LookActions(VehicleBase):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
         above_home_m = place["z"] if is_relative else place["z"] - self._position.home_altitude()
-        await self._send_roi(MavCmd.DO_SET_ROI, 0, 0, 0, 0, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
+        unused = (0, 0, 0, 0)  # param1 to param4
+        await self._send_roi(MavCmd.DO_SET_ROI, *unused, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
         """Send MAV_CMD_DO_SET_ROI_LOCATION; return False if the firmware does not support it as COMMAND_INT."""
@@ -416,6 +422,7 @@ class LookActions(VehicleBase):
         return True
 
     async def _send_roi(self, command: int, *params: float) -> None:
+        """Send a command as an order of its own about the region of interest."""
         with self._new_roi_order() as order:
             await self._sender.send_long(order, command, *params)
 
@@ -446,4 +453,5 @@ class LookActions(VehicleBase):
                 if error.result != MavResult.UNSUPPORTED:
                     raise
                 self._raise_if_superseded(order)
+        # The firmware supports only the older command.
         await self._send_roi(MavCmd.DO_SET_ROI)

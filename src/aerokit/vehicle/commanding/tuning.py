@@ -73,9 +73,11 @@ class TuningActions(VehicleBase):
                     if answer.progress != percent and on_progress is not None:
                         on_progress(answer.progress)
                     percent = answer.progress
-                    await anyio.sleep(POLL_INTERVAL_S if percent < TUNED_PERCENT else 0)
+                    is_tuned = percent >= TUNED_PERCENT
+                    await anyio.sleep(0 if is_tuned else POLL_INTERVAL_S)
                     self._sender.raise_if_ended(order)
-                    if percent < TUNED_PERCENT and self._age_of(answer) > MAX_ANSWER_AGE_S:
+                    # The next poll would start another tuning if PX4 has ended this one in the meantime.
+                    if not is_tuned and self._age_of(answer) > MAX_ANSWER_AGE_S:
                         raise CommandTimeout(
                             "autotune: this program was blocked for too long and could not poll PX4; PX4 may go on"
                             " tuning"
@@ -97,6 +99,7 @@ class TuningActions(VehicleBase):
         raise CommandTimeout(f"autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning; {link}")
 
     def _age_of(self, answer: CommandAck) -> float:
+        """Return the seconds since the answer was received, including the time for which the computer slept."""
         frame = answer.received_frame
         received_at = self.connection.now() if frame is None else frame.received_at
         return self.connection.now() - received_at + self.connection._slept_since(received_at)

@@ -118,8 +118,12 @@ class Component(ReadOnly):
         parameters: Callable[[], Parameters],
         component_of: Callable[[int], Component],
     ) -> None:
-        self._session, self._sender, self._component_of = session, sender, component_of
-        self._make_files, self._make_parameters = files, parameters
+        self._session = session
+        self._sender = sender
+        # Returns the component with an id, of the same vehicle.
+        self._component_of = component_of
+        self._make_files = files
+        self._make_parameters = parameters
         self.system_id: int = session.system_id
         """System id of the vehicle."""
         self.component_id: int = session.component_id
@@ -180,7 +184,9 @@ class Component(ReadOnly):
         if kind == "general":
             return general
         entries = general.get("metadataTypes")
-        for entry in entries if isinstance(entries, list) else ():
+        if not isinstance(entries, list):  # The file is damaged, or lists nothing.
+            entries = []
+        for entry in entries:
             if not isinstance(entry, dict) or entry.get("type") != METADATA_TYPES[kind]:
                 continue
             if isinstance(entry.get("uri"), str):
@@ -341,6 +347,7 @@ async def _general_uri(component: Component, timeout: float) -> str:
 
 
 async def _read_json(component: Component, uri: str) -> dict[str, Any]:
+    """Read a metadata file by MAVFTP, decompress it if necessary, and return its JSON object."""
     if uri.lower().startswith(WEB_SCHEMES):
         raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
     data = decompress(await component.fetch(uri), uri)
@@ -368,9 +375,13 @@ class Components:
     def __init__(
         self, context: VehicleContext, files: Callable[[], Files], parameters: Callable[[], Parameters]
     ) -> None:
-        self._context, self._session = context, context.session
-        self._files, self._parameters = files, parameters
+        self._context = context
+        self._session = context.session
+        # Return the autopilot's objects, which the vehicle creates on first use.
+        self._files = files
+        self._parameters = parameters
         self._by_id: dict[int, Component] = {}
+        # Maps (component id, device id) to the last status.
         self._statuses: dict[tuple[int, int], ComponentStatus] = {}
         session = context.session
         self.cell: StateCell[tuple[ComponentStatus, ...]] = session.connection.new_cell("components", "HEARTBEAT")
@@ -394,11 +405,12 @@ class Components:
         return self._by_id[component_id]
 
     def _new(self, component_id: int) -> Component:
+        """Create a component with a session of its own; the autopilot shares the session of the vehicle."""
         from aerokit.vehicle.files.files import Files
         from aerokit.vehicle.parameters.parameters import Parameters
 
         sender = self._context.sender
-        if component_id == self._session.component_id:  # The autopilot uses the same objects as the vehicle.
+        if component_id == self._session.component_id:
             return Component(self._session, sender, self._files, self._parameters, self.component)
         session = ComponentSession(self._session, component_id)
         files = Files(session.transfers)

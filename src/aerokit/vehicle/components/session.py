@@ -141,16 +141,20 @@ class _WebDownload:
     """A download in a thread, which is aborted from outside if the caller stops waiting."""
 
     def __init__(self, uri: str, idle_timeout_s: float) -> None:
-        self._uri, self._idle_timeout_s = uri, min(idle_timeout_s, WEB_TIMEOUT_S)
+        self._uri = uri
+        self._idle_timeout_s = min(idle_timeout_s, WEB_TIMEOUT_S)
+        # Shared with the thread: its connections, which `_abort` closes, and the flag that ends it.
         self._connections: list[HTTPConnection] = []
         self._is_aborted = False
 
     async def content(self) -> bytes:
+        """Return the content of the file. The thread is aborted if the caller is cancelled or the time is over."""
         try:
             with anyio.move_on_after(WEB_TIMEOUT_S):
                 return await asyncio.to_thread(self._download)
         finally:
             self._abort()
+        # The time-out has expired.
         raise FileTimeout(f"{self._uri} did not arrive within {WEB_TIMEOUT_S:g} s")
 
     def _abort(self) -> None:
@@ -173,8 +177,11 @@ class _WebDownload:
         return connect
 
     def _opener(self) -> OpenerDirector:
-        # The default opener of urllib also has handlers for file: and ftp:. The opener here has only handlers for http:
-        # and https:, so that an address cannot make aerokit read a local file.
+        """Return an opener of urllib for http: and https:, whose connections `_abort` can close.
+
+        The default opener also has handlers for file: and ftp:, so that an address could make aerokit read a local
+        file.
+        """
         from http.client import HTTPConnection, HTTPSConnection
         from urllib import request
 
@@ -201,6 +208,7 @@ class _WebDownload:
         return opener
 
     def _download(self) -> bytes:
+        """Return the content of the file; runs in the thread."""
         from http.client import HTTPException
 
         try:

@@ -58,12 +58,15 @@ class Settings:
         files_of: Callable[[int], Files],
     ) -> None:
         self._transfers = session.transfers
-        self._information, self._files_of = information, files_of
+        self._request_information = information
+        # Returns the files of the component with this id.
+        self._files_of = files_of
         self._known: dict[str, Setting] = {}
         self._missing: set[str] = set()  # names of settings that the component does not have
         self._is_complete = False
         self._definition: CameraDefinition | None = None
-        self._downloading, self._writing = asyncio.Lock(), asyncio.Lock()
+        self._download_lock = asyncio.Lock()
+        self._write_lock = asyncio.Lock()
         session.subscriber.listen(m.ParamExtValue, lambda message: self._store(setting_of(message)))
         session.subscriber.listen(m.ParamExtAck, self._on_ack)
         session.subscriber.listen(m.CameraSettings, self._on_mode)
@@ -139,7 +142,7 @@ class Settings:
 
         with self._transfers.limit(timeout):
             if uri is None:
-                uri = (await self._information()).cam_definition_uri
+                uri = (await self._request_information()).cam_definition_uri
             if not uri:
                 raise NotSupported(
                     f"component {self._transfers.component_id} names no definition file: its settings can be read and"
@@ -178,7 +181,7 @@ class Settings:
         """
         transfers = self._transfers
         with transfers.limit(timeout):
-            async with self._downloading:
+            async with self._download_lock:
                 if refresh or not self._is_complete:
                     exchange = SettingList(
                         transfers.system_id,
@@ -234,7 +237,7 @@ class Settings:
         """
         check_name(name)
         with self._transfers.limit(timeout):
-            async with self._writing:
+            async with self._write_lock:
                 setting_definition = self._definition_of(name)
                 if setting_definition is None:
                     return self._with_definition(await self._write_undefined(name, value, idle_timeout_s))
@@ -284,6 +287,7 @@ class Settings:
     async def _write(
         self, name: str, value: SettingValue, wire_type: int, old_value: SettingValue | None, idle_timeout_s: float
     ) -> Setting:
+        """Send PARAM_EXT_SET, and return the setting that the component confirms."""
         transfers = self._transfers
         exchange = SettingWrite(
             transfers.system_id,
@@ -298,6 +302,7 @@ class Settings:
         return await transfers.run(exchange)
 
     async def _read(self, names: Iterable[str], idle_timeout_s: float) -> dict[str, SettingAnswer]:
+        """Request settings; return a setting or an error for each name."""
         transfers = self._transfers
         exchange = SettingReads(
             transfers.system_id,

@@ -205,7 +205,7 @@ class Actuators(ReadOnly):
         """Spin one motor of a disarmed vehicle, and return when it has stopped; remove the propellers first.
 
         ArduPilot: MAV_CMD_DO_MOTOR_TEST. PX4: MAV_CMD_ACTUATOR_TEST, if COM_MOT_TEST_EN is 1. The command is sent once,
-            because a second one would spin the motor again.
+        because a second one would spin the motor again.
 
         The motor stops after ``duration_s``. If the call is cancelled or fails while the motor may turn, aerokit orders
         the motor to stop at once. ArduCopter reports armed during the test, and the call returns when it reports
@@ -235,8 +235,9 @@ class Actuators(ReadOnly):
         # On ArduPilot, a test with throttle 0 for 0 s ends a running test. On PX4, a test of 0 s releases the output.
         if MavCmd.DO_MOTOR_TEST in session.autopilot.unsupported_commands:
             command = MavCmd.ACTUATOR_TEST
-            start = (throttle_percent / 100, duration_s, 0, 0, number)
-            stop = (math.nan, 0, 0, 0, number)
+            unused = (0, 0)
+            start = (throttle_percent / 100, duration_s, *unused, number)
+            stop = (math.nan, 0, *unused, number)
         else:
             command = MavCmd.DO_MOTOR_TEST
             motor_count = 1

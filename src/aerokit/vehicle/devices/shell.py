@@ -48,6 +48,7 @@ class Shell(ReadOnly):
         self._is_open = False
 
     async def __aenter__(self) -> Self:
+        """Open the shell, and wait for its prompt."""
         autopilot = self._session.autopilot
         if not autopilot.has_shell:
             raise NotSupported(f"shell: {autopilot.firmware} has no shell; nothing was sent")
@@ -67,7 +68,7 @@ class Shell(ReadOnly):
         """Close the shell by a message that requests no response."""
         self._output.close()
         if self._is_open and self._session.connection.is_open:
-            self._send(b"", 0)
+            self._send(b"", flags=0)
         self._is_open = False
 
     def write(self, line: str) -> None:
@@ -92,6 +93,7 @@ class Shell(ReadOnly):
             self._send(data[start : start + DATA_BYTES], _RESPOND)
 
     def _send(self, data: bytes, flags: int) -> None:
+        """Send at most DATA_BYTES bytes to the shell."""
         message = SerialControl(
             device=SerialControlDev.DEV_SHELL,
             flags=flags,

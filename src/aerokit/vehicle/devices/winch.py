@@ -88,18 +88,18 @@ class Winch(ReadOnly):
         # The order is created before the wait for a status. A newer order that is given during the wait then ends this
         # order.
         order = self._context.arbiter.device_order(self._topic)
-        start = await receive_once(self._context, m.WinchStatus, self._component_id)
+        status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
 
         def has_paid_out(status: m.WinchStatus) -> bool:
-            assert start is not None
-            goal_m = start.line_length + length_m
+            assert status_before is not None
+            goal_m = status_before.line_length + length_m
             return abs(status.line_length - goal_m) <= LENGTH_TOLERANCE_M
 
         await self._send(
             WinchActions.RELATIVE_LENGTH_CONTROL,
             length_m,
             rate_m_s,
-            is_done=None if start is None else has_paid_out,
+            is_done=None if status_before is None else has_paid_out,
             timeout=timeout,
             order=order,
         )
@@ -168,6 +168,7 @@ class Winch(ReadOnly):
     async def _send_until(
         self, flag: MavWinchStatusFlag, action: WinchActions, timeout: float = ACTION_TIMEOUT_S
     ) -> None:
+        """Send an order, and wait until WINCH_STATUS has this flag."""
         await self._send(action, is_done=lambda status: bool(status.status & flag), timeout=timeout)
 
     async def _send(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from aerokit._internal.arguments import check_range, checks_arguments
@@ -51,7 +52,7 @@ class External:
     def __init__(self, context: VehicleContext, probe: Probe) -> None:
         self._context, self._session, self._probe = context, context.session, probe
         self._encode = MeasurementEncoder(context.session)
-        self._answers = TimesyncAnswers(context.session)
+        self._timesync_answers = TimesyncAnswers(context.session)
 
     def odometry(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[OdometryMeasurement]:
         """Supply pose and velocity (ODOMETRY). Set VISO_TYPE on ArduPilot, EKF2_EV_CTRL on PX4."""
@@ -173,16 +174,15 @@ class External:
         await self._await_origin(origin, timeout)
 
     async def _await_origin(self, origin: Position, timeout: float) -> None:
+        """Request GPS_GLOBAL_ORIGIN every POLL_INTERVAL_S until it reports this origin."""
         cell, connection = self._session.telemetry.origin, self._session.connection
         until = connection.now() + timeout
         while (remaining_s := until - connection.now()) > 0:
             self._request_origin()
             wait_s = min(POLL_INTERVAL_S, remaining_s)
-            try:
+            with suppress(OperationTimeout):
                 await cell.wait_until(lambda reported: _are_close(reported, origin), timeout=wait_s)
-            except OperationTimeout:
-                continue
-            return
+                return
         report = f"it last reported {cell.latest}" if cell.is_known else "it has reported no origin"
         raise OperationTimeout(f"set_origin: the vehicle did not report the origin within {timeout:g} s; {report}")
 
@@ -198,7 +198,7 @@ class External:
         valid_for_s: float,
     ) -> MeasurementStream[MeasurementT]:
         return MeasurementStream(
-            self._session, kind, value_type, encode, self._answers, self._probe, rate_hz, valid_for_s
+            self._session, kind, value_type, encode, self._timesync_answers, self._probe, rate_hz, valid_for_s
         )
 
 

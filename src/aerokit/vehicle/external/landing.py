@@ -109,14 +109,19 @@ class TargetLanding:
     """Passes the targets from their source to the stream, and collects the data of the report."""
 
     def __init__(self, context: VehicleContext, stream: MeasurementStream[TargetMeasurement]) -> None:
-        self._context, self._session, self._stream = context, context.session, stream
+        self._context = context
+        self._session = context.session
+        self._stream = stream
+        # The last measurement that was passed to the stream.
         self._last: TargetMeasurement | None = None
         # When the target was last visible, and the vehicle's height at that time.
         self._seen_at = -math.inf
         self._seen_height_m: float | None = None
         # The lowest height so far, and the greatest climb above it.
-        self._lowest_m, self._climbed_m = math.inf, 0.0
+        self._lowest_m = math.inf
+        self._climbed_m = 0.0
         self._losses: list[TargetLoss] = []
+        # The exception of the program's source; None if it has not failed.
         self._source_error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
@@ -196,5 +201,6 @@ class TargetLanding:
             unseen_s = self._now() - self._seen_at
             if LOST_AFTER_S < unseen_s < math.inf:
                 self._losses.append(TargetLoss(unseen_s, self._seen_height_m))
-            self._last, self._seen_at = target, self._now()
+            self._last = target
+            self._seen_at = self._now()
             self._seen_height_m = height_above_home(self._session.telemetry)

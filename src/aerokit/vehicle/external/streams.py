@@ -43,7 +43,7 @@ class TimesyncAnswers:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        self._open_streams = 0
+        self._open_streams = 0  # number of streams that need the answers
         self._detach: Detach | None = None
 
     def open(self) -> None:
@@ -100,17 +100,26 @@ class MeasurementStream(Generic[MeasurementT]):
     ) -> None:
         check_range("rate_hz", rate_hz, 0, MAX_RATE_HZ, above=True)
         check_range("valid_for_s", valid_for_s, 0, 60, above=True)
-        self._session, self._value_type, self._encode = session, value_type, encode
+        self._session = session
         self._kind: ExternalKind = kind
-        self._timesync_answers, self._probe = timesync_answers, probe
-        self._period_s, self._valid_for_s = 1 / rate_hz, valid_for_s
+        self._value_type = value_type
+        self._encode = encode
+        self._timesync_answers = timesync_answers
+        self._probe = probe
+        self._period_s = 1 / rate_hz
+        self._valid_for_s = valid_for_s
+        # Values of the parameters that select the measurements, read when the block is entered.
         self._parameters: dict[str, float] = {}
         # The messages of the measurement to send at the end of the period, and the time of the measurement.
         self._waiting: tuple[tuple[Message, ...], float] | None = None
+        # Calls `_flush` at the end of the period, if a measurement waits.
         self._timer: asyncio.TimerHandle | None = None
+        # End of the present period: the next measurement is sent then at the earliest.
         self._next_at = -math.inf
-        self._is_open = self._was_entered = False
-        self._sent = self._dropped = 0
+        self._is_open = False
+        self._was_entered = False
+        self._sent = 0
+        self._dropped = 0
 
     @property
     def sent(self) -> int:
@@ -217,7 +226,8 @@ class MeasurementStream(Generic[MeasurementT]):
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._is_open, self._waiting = False, None
+        self._is_open = False
+        self._waiting = None
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -57,6 +57,7 @@ class FileChannel:
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
+        # Sessions that are being closed in the background, by their ids.
         self._closing: dict[int, _Closing] = {}
 
     @asynccontextmanager
@@ -202,7 +203,8 @@ class FileChannel:
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
         with suppress(AerokitError):  # The connection may be closed.
             self.transfers.connection.send(request.message)
-            closing = self._closing[session] = _Closing(request)
+            closing = _Closing(request)
+            self._closing[session] = closing
             self.transfers.background.start(lambda: closing.confirm(self.transfers), "aerokit close file")
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
@@ -218,9 +220,11 @@ class _Closing:
     """A session that is being closed in the background."""
 
     def __init__(self, request: FtpRequest) -> None:
-        self.request, self.ended = request, asyncio.Event()
+        self.request = request
+        self.ended = asyncio.Event()
 
     async def confirm(self, transfers: Transfers) -> None:
+        """Wait for the reply, and repeat the request until then. `ended` is set in any case."""
         try:
             with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
                 await transfers.run(self.request)

@@ -305,6 +305,7 @@ class Files:
         channel = self._channel
 
         async def read_file(file: RemoteFile) -> None:
+            """Read the opened file from the last received byte on; called again if the vehicle closes the file."""
             if file.size < into.start:  # The file is shorter than what an interrupted download has already read.
                 raise _ShorterError
             # A file that the vehicle closes during the read is opened again, so its size may have changed.
@@ -336,6 +337,7 @@ class Files:
         timeout: float | None,
         on_progress: OnProgress | None,
     ) -> None:
+        """Read a file into a local one, from byte ``start`` on."""
         with part.writing(start) as disk:
             into = Reassembly(disk.write, block_size=DATA_SIZE, start=start)
             await self._fetch(path, into, idle_timeout_s, timeout, on_progress)
@@ -353,6 +355,7 @@ class Files:
     async def _upload_to(
         self, file: RemoteFile, path: str, data: bytes, idle_timeout_s: float, on_progress: OnProgress | None
     ) -> None:
+        """Write the content of a file that the vehicle has opened."""
         transfer = FtpUpload(
             self._channel.client,
             path,

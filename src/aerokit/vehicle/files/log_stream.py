@@ -41,11 +41,14 @@ class UlogAssembler:
     def __init__(self) -> None:
         self.lost: int = 0
         """Number of messages that were not received."""
+        # Expected sequence number; None before the first message.
         self._next_sequence: int | None = None
         self._has_header = False
         # False after a gap, until the beginning of a ULog message is received.
         self._is_aligned = False
+        # Data from the beginning of a ULog message on that is not complete yet.
         self._buffer = bytearray()
+        # Time of the last message that was used, to compute the duration of a gap.
         self._received_at = 0.0
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
@@ -61,9 +64,10 @@ class UlogAssembler:
             self._is_aligned = False
         self._next_sequence = (message.sequence + 1) % SEQUENCE_RANGE
         if not self._has_header:
-            self._has_header = self._is_aligned = data.startswith(MAGIC)
-            if not self._has_header:
+            if not data.startswith(MAGIC):
                 return b""  # The log begins with its header, so nothing before the header is used.
+            self._has_header = True
+            self._is_aligned = True
             prefix, data = data[:HEADER_BYTES], data[HEADER_BYTES:]
         elif not self._is_aligned:
             if message.first_message_offset == NO_MESSAGE_START:
@@ -116,6 +120,7 @@ class LogStream(ReadOnly):
         return self._assembler.lost
 
     async def __aenter__(self) -> Self:
+        """Begin to receive and acknowledge messages, and start the stream."""
         START.check_supported(self._context)
         self._messages.__enter__()
         session = self._context.session
@@ -140,6 +145,7 @@ class LogStream(ReadOnly):
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        """Stop the stream; after an error or a cancellation, without waiting for the acknowledgement."""
         is_stopped = False
         try:
             if error is None:

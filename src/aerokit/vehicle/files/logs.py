@@ -65,6 +65,7 @@ class GrowthReporter:
 
     def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
         self._entry, self._on_progress = entry, on_progress
+        # Size of the log in bytes, as the vehicle reports it during the download.
         self._present_size = entry.size
 
     def __call__(self, progress: TransferProgress) -> None:
@@ -74,6 +75,7 @@ class GrowthReporter:
             self._on_progress(progress)
 
     def log_growth(self) -> None:
+        """Log a message if the log has grown since its entry was listed; called at the end of a download."""
         if self._present_size > self._entry.size:
             logger.info(
                 "flight log %d was still being written: listed with %d bytes, downloaded with %d",
@@ -261,6 +263,7 @@ class Logs:
         return path, entry
 
     async def _path(self, entry: LogEntry, idle_timeout_s: float) -> str | None:
+        """Return the path of a log for MAVFTP; None without MAVFTP, or if the file cannot be identified."""
         directories = self._transfers.autopilot.log_directories
         if not directories or not await self._files.is_supported():
             return None

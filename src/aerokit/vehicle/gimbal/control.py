@@ -46,8 +46,12 @@ class ReleaseCommand:
     def __init__(
         self, orders: GimbalOrders, command: int, params: tuple[float, ...], is_still_due: Callable[[], bool]
     ) -> None:
-        self._orders, self._session = orders, orders.session
-        self._command, self._params, self._is_still_due = command, params, is_still_due
+        self._orders = orders
+        self._session = orders.session
+        self._command = command
+        self._params = params
+        self._is_still_due = is_still_due
+        # Component id of the manager when this object was created; another manager may be known later.
         self._target = orders.manager_id
 
     async def send_and_wait(self, description: str) -> None:
@@ -76,6 +80,7 @@ class ReleaseCommand:
             self._send()
 
         async def send_until_acknowledged() -> None:
+            """Send the command if the vehicle was silent, and repeat it until it is acknowledged or no longer due."""
             with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
                 if not can_send_now:
                     await self._session.wait_for_heartbeat()
@@ -117,6 +122,7 @@ class ReleaseCommand:
         return not is_autopilot and self._orders.registry.silent_for_s(self._target) > SILENT_AFTER_S
 
     async def _wait_target_heartbeat(self) -> None:
+        """Wait for the next HEARTBEAT of the gimbal manager."""
         received = asyncio.Event()
 
         def on_heartbeat(heartbeat: Heartbeat) -> None:
@@ -156,14 +162,20 @@ class GimbalControl:
     """
 
     def __init__(self, orders: GimbalOrders, is_primary: bool) -> None:
-        self._orders, self._session = orders, orders.session
+        self._orders = orders
+        self._session = orders.session
         self._is_primary = is_primary
+        # The gimbal, once the manager has confirmed our control.
         self._device: GimbalDevice | None = None
         self._control_request = ControlRequest(0, 0, is_primary=is_primary)  # replaced on entry
+        # The error that describes the loss of control; None while it was not lost.
         self._taken: GimbalTaken | None = None
-        self._loss_was_raised = self._was_entered = self._is_ended = False
+        self._was_loss_raised = False
+        self._was_entered = False
+        self._is_ended = False
+        # Ends the waits of `until_lost`: set when control is lost, and when the block or the connection ends.
         self._lost = asyncio.Event()
-        self._detach: list[Callable[[], None]] = []
+        self._detach_callbacks: list[Callable[[], None]] = []
 
     @property
     def is_primary(self) -> bool:
@@ -195,7 +207,7 @@ class GimbalControl:
         self._session.connection.raise_if_ended()
         if self._taken is None:
             raise OperationRejected(f"{self._orders.name}: the block that had control has ended")
-        self._loss_was_raised = True
+        self._was_loss_raised = True
         return self._taken.system_id, self._taken.component_id
 
     def raise_if_taken(self) -> None:
@@ -205,12 +217,13 @@ class GimbalControl:
             GimbalTaken: another station is in control, or none.
         """
         if self._taken is not None:
-            self._loss_was_raised = True
+            self._was_loss_raised = True
             taken = self._taken
             # Create a new exception each time, because an exception that is raised again also keeps its old tracebacks.
             raise GimbalTaken(str(taken), system_id=taken.system_id, component_id=taken.component_id)
 
     async def __aenter__(self) -> Self:
+        """Request control, and wait until the manager confirms it."""
         orders = self._orders
         if self._was_entered:
             raise BusyError("a GimbalControl can be entered only once: call control() again")
@@ -239,9 +252,10 @@ class GimbalControl:
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        """Release control, or raise GimbalTaken if control was lost and the program does not know that yet."""
         if self._taken is not None:
             self._end()
-            if error is None and not self._loss_was_raised:
+            if error is None and not self._was_loss_raised:
                 self.raise_if_taken()
             return
         if self._is_ended:  # The vehicle's `async with` block has ended before this block.
@@ -254,6 +268,7 @@ class GimbalControl:
             release.send_soon()
 
     async def _request_control(self) -> None:
+        """Send the command that requests control; raise NotSupported if the manager does not know it."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary)
         try:
@@ -268,7 +283,7 @@ class GimbalControl:
         orders, session = self._orders, self._session
         reported = orders.public_device.controllers
         if orders.manager_id == session.component_id:  # Only the autopilot is asked for messages at a rate.
-            self._detach.append(session.rates.request(GimbalManagerStatus, STATUS_HZ, is_optional=True))
+            self._detach_callbacks.append(session.rates.request(GimbalManagerStatus, STATUS_HZ, is_optional=True))
 
         async def wait(seconds: float) -> None:
             await reported.wait_until(
@@ -288,10 +303,11 @@ class GimbalControl:
             raise BusyError(f"{orders.name}: another block of this program already has control")
         self._device = device
         device.control_blocks[self._is_primary] = self
-        self._detach.append(device.controllers.observe(self._on_controllers, every_arrival=True))
+        self._detach_callbacks.append(device.controllers.observe(self._on_controllers, every_arrival=True))
         orders.context.on_finish.append(self._finish)
 
     def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
+        """Record and publish the loss of control when the manager reports another controller."""
         controller = self._controller_in(controllers)
         if controller == self._orders.own_ids or self._taken is not None:
             return
@@ -308,6 +324,7 @@ class GimbalControl:
         return controllers.primary if self._is_primary else controllers.secondary
 
     def _release_command(self) -> ReleaseCommand:
+        """Return the command that releases control, unless control was lost or other blocks need it."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary, release=True)
         requests = orders.registry.control_requests
@@ -334,6 +351,6 @@ class GimbalControl:
             del self._device.control_blocks[self._is_primary]
         if self._finish in self._orders.context.on_finish:
             self._orders.context.on_finish.remove(self._finish)
-        for detach in self._detach:
+        for detach in self._detach_callbacks:
             detach()
-        self._detach.clear()
+        self._detach_callbacks.clear()

@@ -100,16 +100,24 @@ def information_of(
     """Combine the messages of manager and device; the manager's capabilities and limits take precedence."""
     source = manager or device
     assert source is not None
-    limits = (
-        _limits(source.roll_min, source.roll_max),
-        _limits(source.pitch_min, source.pitch_max),
-        _limits(source.yaw_min, source.yaw_max),
+    information = GimbalInformation(
+        gimbal_device_id=device_id,
+        manager_component_id=manager_id,
+        capabilities=source.cap_flags,
+        roll_deg=_limits(source.roll_min, source.roll_max),
+        pitch_deg=_limits(source.pitch_min, source.pitch_max),
+        yaw_deg=_limits(source.yaw_min, source.yaw_max),
     )
     if device is None:
-        return GimbalInformation(device_id, manager_id, source.cap_flags, *limits)
-    names = (device.vendor_name, device.model_name, device.custom_name)
-    versions = (_version(device.firmware_version), _version(device.hardware_version))
-    return GimbalInformation(device_id, manager_id, source.cap_flags, *limits, *names, *versions, device.uid)
+        return information
+    return information.replace(
+        vendor=device.vendor_name,
+        model=device.model_name,
+        custom_name=device.custom_name,
+        firmware_version=_version(device.firmware_version),
+        hardware_version=_version(device.hardware_version),
+        uid=device.uid,
+    )
 
 
 def _limits(low: float, high: float) -> tuple[float, float] | None:
@@ -179,6 +187,7 @@ class GimbalDevice:
         # False if the program has named this gimbal, but no message from it was received.
         self.is_discovered = False
         self.pending_orders: int = 0  # number of calls that wait for an order to this gimbal
+        # Rank of the known manager, and time stamp of its newest status; see `update_manager` and `update_status`.
         self._manager_rank = 0
         self._status_ms = 0
         self._system_id = context.session.system_id
@@ -218,7 +227,8 @@ class GimbalDevice:
         self.attitude.set(attitude, self._source(message))
 
     def update_flags(self, message: GimbalDeviceAttitudeStatus) -> None:
-        self.flags, self.failures = message.flags, message.failure_flags
+        self.flags = message.flags
+        self.failures = message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
         """Set the controllers from a status; return False for a late status, which is older than the newest one."""
@@ -239,17 +249,20 @@ class GimbalDevice:
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
-            self.manager_id, self._manager_rank = component_id, rank
+            self.manager_id = component_id
+            self._manager_rank = rank
             self._status_ms = 0  # The time stamps of the new manager are from another clock.
 
     def reset(self) -> None:
         """Forget what the gimbal and its manager have reported, because the vehicle has rebooted."""
         self.reboots += 1
-        self._status_ms = self._manager_rank = 0
+        self._status_ms = 0
+        self._manager_rank = 0
         self.manager_id = self.component_id if self.number else None
         self.flags = 0
         self.failures = 0
-        self.manager_information = self.device_information = None
+        self.manager_information = None
+        self.device_information = None
 
     def describe_failures(self) -> str:
         return str(GimbalDeviceErrorFlags(self.failures).name or self.failures) if self.failures else ""

@@ -102,7 +102,8 @@ class GimbalRegistry:
         key = (component_id, number)
         device = self.devices.get(key)
         if device is None and len(self.devices) < MAX_GIMBALS:
-            device = self.devices[key] = GimbalDevice(self._context, *key)
+            device = GimbalDevice(self._context, component_id, number)
+            self.devices[key] = device
             if component_id == self._session.component_id and number == 1:
                 device.topic = ROI  # The vehicle's region of interest moves this gimbal.
         return device
@@ -145,6 +146,7 @@ class GimbalRegistry:
         return device
 
     def _on_device(self, message: GimbalDeviceAttitudeStatus) -> None:
+        """Set the attitude of the gimbal, and of the placeholder if this is the first gimbal that reports one."""
         device = self._device_of(message, message.gimbal_device_id)
         if device is None:
             return
@@ -153,7 +155,7 @@ class GimbalRegistry:
         if all(map(math.isfinite, message.q)):
             attitude = from_device(message, self._heading())
         device.set_attitude(message, attitude)
-        if device is self.first_reporting:  # This is the first gimbal that reports its attitude.
+        if device is self.first_reporting:
             self.placeholder.update_flags(message)
             self.placeholder.set_attitude(message, attitude)
 

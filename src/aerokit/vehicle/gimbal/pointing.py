@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
@@ -31,8 +31,14 @@ if TYPE_CHECKING:
 # times a second.
 STILL_S, STILL_DEG = 0.4, 0.5
 
-# Pitch, roll, yaw from north, yaw from the nose. None means that any angle is accepted.
-Angles = tuple[float | None, float | None, float | None, float | None]
+
+class Angles(NamedTuple):
+    """Angles in degrees. None means: in an attitude, that the angle is unknown; in a target, that any is accepted."""
+
+    pitch: float | None
+    roll: float | None
+    yaw_from_north: float | None
+    yaw_from_nose: float | None
 
 
 class AngleTarget:
@@ -46,7 +52,10 @@ class AngleTarget:
 
     def is_reached(self, device: GimbalDevice) -> bool:
         targets = self._target_angles()
-        return targets is not None and all(map(self._is_near, _angles_of(device.attitude.value), targets))
+        if targets is None:
+            return False
+        angles = _angles_of(device.attitude.value)
+        return all(self._is_near(angle, target) for angle, target in zip(angles, targets, strict=True))
 
     def _is_near(self, angle: float | None, target: float | None) -> bool:
         if target is None:  # Any angle is accepted.
@@ -66,16 +75,19 @@ class RestTarget:
     """
 
     def __init__(self, flag: int, *, accepts_ahead: bool) -> None:
-        self._flag, self._accepts_ahead = flag, accepts_ahead
+        self._flag = flag
+        self._accepts_ahead = accepts_ahead
         # Angles (pitch, roll, yaw from the nose) at the last movement, and its time.
         self._last_angles: tuple[float, float, float] | None = None
         self._moved_at = 0.0
 
     def is_reached(self, device: GimbalDevice) -> bool:
+        """Process a new attitude; return True if the gimbal has stood still for STILL_S in its rest position."""
         attitude, updated_at = device.attitude.value, device.attitude.updated_at
         pitch, roll, yaw = attitude.pitch_deg or 0.0, attitude.roll_deg or 0.0, attitude.yaw_from_nose_deg or 0.0
         if self._has_moved((pitch, roll, yaw)):
-            self._last_angles, self._moved_at = (pitch, roll, yaw), updated_at
+            self._last_angles = (pitch, roll, yaw)
+            self._moved_at = updated_at
             return False
         is_ahead = abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
         is_at_rest = bool(device.flags & self._flag) or (self._accepts_ahead and is_ahead)
@@ -148,6 +160,7 @@ async def wait_until_reached(
 
 
 def _describe_state(orders: GimbalOrders, since: float) -> str:
+    """Return a clause about the gimbal's attitude, failures and limits; the order was given at ``since``."""
     source, device = orders.attitude_source, orders.device
     attitude = source.attitude
     if not attitude.is_known:
@@ -164,7 +177,7 @@ def _describe_state(orders: GimbalOrders, since: float) -> str:
 
 
 def _angles_of(attitude: GimbalAttitude) -> Angles:
-    return (attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
+    return Angles(attitude.pitch_deg, attitude.roll_deg, attitude.yaw_deg, attitude.yaw_from_nose_deg)
 
 
 def _format_angles(angles: Angles) -> str:
@@ -174,7 +187,10 @@ def _format_angles(angles: Angles) -> str:
 
 
 def _format_limits(limits: tuple[float, float] | None) -> str:
-    return "unknown" if limits is None else f"{limits[0]:g} to {limits[1]:g}"
+    if limits is None:
+        return "unknown"
+    lowest, highest = limits
+    return f"{lowest:g} to {highest:g}"
 
 
 # Beyond this pitch up or down, yaw and roll are the same rotation.
@@ -189,7 +205,7 @@ def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: b
     is_vertical = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
     from_north_deg = None if from_nose or is_vertical else yaw
     from_nose_deg = yaw if from_nose and not is_vertical else None
-    return (pitch, roll, from_north_deg, from_nose_deg)
+    return Angles(pitch, roll, from_north_deg, from_nose_deg)
 
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
@@ -205,7 +221,8 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
     pitch = math.degrees(math.atan2(height_m, distance_m))
     has_bearing = distance_m > MIN_BEARING_DISTANCE_M and abs(pitch) <= MAX_PITCH_FOR_YAW_DEG
     yaw_from_north = here.bearing_to(target) if has_bearing else None
-    return (pitch, None, yaw_from_north, None)  # Any roll is accepted, and the yaw is checked from north only.
+    # Any roll is accepted, and the yaw is checked from north only.
+    return Angles(pitch, roll=None, yaw_from_north=yaw_from_north, yaw_from_nose=None)
 
 
 def _height_above(here: Position, target: Position) -> float | None:

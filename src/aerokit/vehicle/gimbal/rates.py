@@ -60,9 +60,12 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         check_range("rate_hz", rate_hz, 2, MAX_RATE_HZ)
         super().__init__(orders.context, self._encode_rates, first_rates, rate_hz, valid_for_s, max_lag_s)
         _check_rates(*first_rates)
-        self._orders, self._flags = orders, int(LOCKED if is_from_north else LEVEL)
+        self._orders = orders
+        self._flags = int(LOCKED if is_from_north else LEVEL)
+        # Time at which the manager accepted the first rates. Its silence counts from then on.
         self._began_at = -math.inf
         self._order: Order | None = None
+        # The error that describes the loss of control; None while it was not lost.
         self._taken: AerokitError | None = None
         # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another gimbal.
         self._in_use = ExitStack()
@@ -88,6 +91,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         await self._supply_for((pitch_deg_s, yaw_deg_s), duration_s)
 
     async def __aenter__(self) -> Self:
+        """Order the first rates by a command, which the manager acknowledges, and begin to send rates."""
         if self._was_entered:
             raise BusyError("GimbalRates can be entered only once: call rates() again")
         self._was_entered = True
@@ -110,6 +114,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        """Stop the gimbal, unless another order was given or control was lost. Raise if the stream has stopped."""
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:
             self._stop(reason, hold=False)
@@ -128,8 +133,9 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._session.connection.send(self._encode_rates(self._value))  # Encoded again: the manager may have changed.
 
     def _encode_rates(self, rates: tuple[float, float]) -> Message:
+        """Return the message for these rates (pitch, yaw) that the manager supports."""
         orders = self._orders
-        pitch_rate, yaw_rate = (math.radians(rate) for rate in rates)
+        pitch_rate, yaw_rate = map(math.radians, rates)
         first_fields = (self._session.system_id, orders.manager_id, self._flags, orders.gimbal_id_param)
         if orders.rules.supports_pitchyaw:
             return GimbalManagerSetPitchyaw(*first_fields, pitch=NAN, yaw=NAN, pitch_rate=pitch_rate, yaw_rate=yaw_rate)
@@ -162,6 +168,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._stop_error = self._taken
 
     def _zero_rates_command(self) -> ReleaseCommand:
+        """Return the command that stops the gimbal, unless a newer order was given or control was lost."""
         orders, order = self._orders, self._order
         no_angles, zero_rates, reserved = (NAN, NAN), (0.0, 0.0), 0
         params = (*no_angles, *zero_rates, self._flags, reserved, orders.gimbal_id_param)

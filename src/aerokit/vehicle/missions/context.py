@@ -109,12 +109,12 @@ class PlanContext:
         ids_by_mission_type = (current.mission_id, current.fence_id, current.rally_points_id)
         return ids_by_mission_type[mission_type]
 
-    async def wait_for_plan_id(self, mission_type: int, opaque_id: int) -> bool:
+    async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
         """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""
         received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:
-            if self.plan_id(mission_type, started_at) == opaque_id:
+            if self.plan_id(mission_type, started_at) == expected_id:
                 received.set()
 
         detach = self.session.connection.bus.attach(MissionCurrent, check, system_id=self.session.system_id)
@@ -142,7 +142,7 @@ class MissionTracker:
         self._session = session
         self._source = Source(session.system_id, session.component_id, "MISSION_CURRENT")
         self._offset = int(session.autopilot.home_is_item_0)  # number of items before the program's first item
-        self._repeats_item_reached = session.autopilot.repeats_item_reached
+        self._repeats_item_reached = session.autopilot.repeats_item_reached  # True for PX4.
         new_cell = session.connection.new_cell
         self.current: StateCell[int | None] = new_cell("mission.current", "MISSION_CURRENT")
         self.count: StateCell[int] = new_cell("mission.count", "MISSION_CURRENT with a number of items")
@@ -152,7 +152,10 @@ class MissionTracker:
         self.reached: int | None = None
         # True if the last mission was flown to its end.
         self.is_complete: bool = False
-        self._reached_at = self._last_item_current_at = -math.inf
+        # Time at which `reached` was reached, and time of the last report that the last item is the current one.
+        self._reached_at = -math.inf
+        self._last_item_current_at = -math.inf
+        # True if the vehicle flies to the item in `reached` once more.
         self._is_approached_again = False
         # True if the vehicle has flown the mission since the mission last ended.
         self._was_active = False
@@ -185,14 +188,16 @@ class MissionTracker:
 
     def start(self) -> None:
         """Begin to track a new flight of the mission."""
-        self.is_complete = self._was_active = False
+        self.is_complete = False
+        self._was_active = False
         self._stale_until = self._session.connection.now() + STALE_STATE_S
 
     def forget(self) -> None:
         for cell in (self.current, self.count, self.progress):
             cell.forget()
         self.reached = None
-        self._was_active = self.is_complete = False
+        self.is_complete = False
+        self._was_active = False
 
     def close(self, error: Exception) -> None:
         for cell in (self.current, self.count, self.progress):
@@ -232,6 +237,7 @@ class MissionTracker:
             self._is_approached_again = True
 
     def _on_state(self, state: int) -> None:
+        """Process MISSION_STATE: the mission is being flown, or was flown to its end."""
         if state != MissionState.COMPLETE:
             self._stale_until = -math.inf
             if state == MissionState.ACTIVE and self.is_in_mission_mode and self._session.telemetry.is_armed:
@@ -245,6 +251,7 @@ class MissionTracker:
             self._complete()
 
     def _on_reached(self, _: int | None, seq: int) -> None:
+        """Publish that an item was reached, unless MISSION_ITEM_REACHED is a duplicate or is about home."""
         now = self._session.connection.now()
         item = seq - self._offset  # negative if ArduPilot reports item 0 (home), as it does at a guided target
         # The vehicle repeats its report, so an item counts as reached again only if it was approached again.
@@ -254,7 +261,8 @@ class MissionTracker:
             is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S
         if item < 0 or is_duplicate:
             return
-        self.reached, self._reached_at = item, now
+        self.reached = item
+        self._reached_at = now
         self._is_approached_again = False
         self._session.publish(MissionItemReached, item)
 

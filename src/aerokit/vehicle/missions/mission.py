@@ -63,8 +63,10 @@ class MissionEndDetector:
         self, vehicle_context: VehicleContext, tracker: MissionTracker, mode: Mode, items: Sequence[MissionItem] | None
     ) -> None:
         session = vehicle_context.session
-        self._vehicle_context, self._session = vehicle_context, session
-        self._tracker, self._mode = tracker, mode
+        self._vehicle_context = vehicle_context
+        self._session = session
+        self._tracker = tracker
+        self._mode = mode
         self._order = vehicle_context.arbiter.newest  # the newest order when the wait began
         last_command = items[-1].command if items else None
         is_return = last_command == MavCmd.NAV_RETURN_TO_LAUNCH
@@ -72,11 +74,13 @@ class MissionEndDetector:
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
         self._is_last_item_landing = last_command in LANDING_PURPOSES
         self._ends_in_air = is_return and not session.autopilot.lands_after_return
-        self._return_began_at: float | None = None
+        self._return_began_at: float | None = None  # when `_has_returned` was first called
+        # Modes in which the vehicle may land: the mode of the last item if it is a landing or return, otherwise all.
         purposes = [LANDING_PURPOSES[last_command]] if last_command in LANDING_PURPOSES else LANDING_PURPOSES.values()
         self._landing_modes = tuple(
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in purposes
         )
+        # HEARTBEAT may report the mission mode until this time.
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
@@ -95,12 +99,15 @@ class MissionEndDetector:
             if not self._are_items_known and not self._ends_by_landing:
                 return self._is_on_ground or self._has_stayed_complete()
             # ArduPilot reports completion at home, PX4 already when it begins to return.
-            has_returned = self._ends_in_air and (self._session.autopilot.mission_completes_at_home or self._is_home)
-            return not self._ends_by_landing or self._is_on_ground or has_returned
+            completes_at_home = self._session.autopilot.mission_completes_at_home
+            is_back = self._ends_in_air and (completes_at_home or self._has_returned())
+            return not self._ends_by_landing or self._is_on_ground or is_back
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
         if self._ends_in_air and self._is_landing:
-            return self._is_on_ground or self._is_home
-        self._return_began_at = self._completed_at = None  # The vehicle flies the mission, perhaps once more.
+            return self._is_on_ground or self._has_returned()
+        # The vehicle flies the mission, perhaps once more.
+        self._return_began_at = None
+        self._completed_at = None
         if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
             return True
         progress = self._tracker.progress.latest
@@ -175,9 +182,8 @@ class MissionEndDetector:
     def _is_in_landing_mode(self) -> bool:
         return self._session.telemetry.mode.latest in self._landing_modes
 
-    @property
-    def _is_home(self) -> bool:
-        """True if the vehicle is at home, or ``RETURN_TIMEOUT_S`` have passed since this property was first read."""
+    def _has_returned(self) -> bool:
+        """Return True if the vehicle is at home, or ``RETURN_TIMEOUT_S`` have passed since the first call."""
         session, now = self._session, self._session.connection.now()
         if self._return_began_at is None:
             self._return_began_at = now
@@ -205,7 +211,8 @@ class MissionControl(VehiclePlan["Mission"]):
 
     def __init__(self, context: PlanContext) -> None:
         super().__init__(context)
-        self._vehicle_context, self._session = context.vehicle_context, context.session
+        self._vehicle_context = context.vehicle_context
+        self._session = context.session
         self._tracker = context.tracker
         # The last order that was given by a method of this object.
         self._order: Order | None = None
@@ -268,7 +275,8 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.start", "mission")
         if not session.telemetry.is_armed:
             raise OperationRejected("mission.start: the vehicle is not armed: call arm() first; nothing was sent")
-        order = self._order = vehicle_context.arbiter.order(mode)
+        order = vehicle_context.arbiter.order(mode)
+        self._order = order
         self._is_paused = False
         self._tracker.start()
         try:
@@ -304,7 +312,8 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.resume", "mission")
         if not session.telemetry.is_armed:
             raise OperationRejected("mission.resume: the vehicle is not armed; nothing was sent")
-        order = self._order = vehicle_context.arbiter.order(mode)
+        order = vehicle_context.arbiter.order(mode)
+        self._order = order
         self._tracker.start()
         try:
             await self._enter_mode(mode, order, timeout)
@@ -375,6 +384,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._tracker.on_transfer_count(count)
 
     def _check_item(self, item: int) -> None:
+        """Raise InvalidArgument unless the mission has this item. If their number is unknown, accept all."""
         count = self._tracker.count.latest
         last = MAX_ITEM if count is None else count - 1
         if count == 0:
@@ -406,6 +416,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 raise
 
     async def _set_current_by_message(self, seq: int, timeout: float, order_status: SentCommand | None = None) -> None:
+        """Send MISSION_SET_CURRENT until MISSION_CURRENT reports the item, as long as the order is valid."""
         from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
@@ -447,4 +458,5 @@ class MissionControl(VehiclePlan["Mission"]):
         except CommandRejected as error:
             if error.result != MavResult.UNSUPPORTED:
                 raise
+            # The vehicle does not know MISSION_START.
             await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)

@@ -47,8 +47,11 @@ class MissionStallDetector:
         items: Sequence[MissionItem] | None,
         is_paused: Callable[[], bool],
     ) -> None:
-        self._session, self._tracker, self._mode = session, tracker, mode
-        self._items, self._is_paused = items or (), is_paused
+        self._session = session
+        self._tracker = tracker
+        self._mode = mode
+        self._items = items or ()
+        self._is_paused = is_paused
         self._stall = StallDetector(session)
         # The item at which the vehicle had to move at the last call, and the time since which it has had to move. The
         # item is None if the vehicle was allowed to stand still.

@@ -49,6 +49,7 @@ class PlanChannel:
         self.mission_type = mission_type
         self._context = context
         self._options: dict[str, Any] = {"idle_timeout_s": idle_timeout_s, "on_progress": on_progress}
+        # Path of the plan's file on ArduPilot.
         self._path = PACKED_PATHS[mission_type]
         self._has_changed = False  # True if the vehicle may have received some of our items
         self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
@@ -56,17 +57,17 @@ class PlanChannel:
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
         """Send all items. If a refusal does not identify the refused item, send the items again one at a time."""
         window = self._context.autopilot.mission_upload_window
-        exchange = await self._upload(items, window=window)
+        exchange = await self._new_upload(items, window=window)
         try:
             return await self._run(exchange)
         except MissionRejected:
             if not exchange.is_refusal_ambiguous:
                 raise
-        return await self._run(await self._upload(items, window=1))
+        return await self._run(await self._new_upload(items, window=1))
 
     async def send_part(self, items: Sequence[MissionItem], first_seq: int) -> UploadResult | None:
         """Replace the items from ``first_seq`` on; return None if the vehicle does not support partial uploads."""
-        exchange = await self._upload(items, window=1, first_seq=first_seq)
+        exchange = await self._new_upload(items, window=1, first_seq=first_seq)
         try:
             result = await self._run(exchange)
         except MissionRejected:
@@ -136,9 +137,10 @@ class PlanChannel:
         self.is_single_precision = not is_supported
         return is_supported
 
-    async def _upload(
+    async def _new_upload(
         self, items: Sequence[MissionItem], *, window: int, first_seq: int | None = None
     ) -> MissionUpload:
+        """Create the exchange that sends these items; ``first_seq`` is None for a whole plan."""
         return MissionUpload(
             *self._target,
             items,
@@ -179,12 +181,13 @@ class PlanChannel:
             return ""
         self._has_changed |= exchange.may_have_changed_items
         is_overwritten = self.mission_type in self._context.autopilot.overwrites_plans_in_place
+        is_partly_overwritten = is_overwritten and self._has_changed
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
-        if is_overwritten and self._has_changed and refused_item:
+        if is_partly_overwritten and refused_item:
             new_items = "only item 0 is new" if refused_item == 1 else f"items 0 to {refused_item - 1} are new"
             return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
-        if is_overwritten and self._has_changed:
+        if is_partly_overwritten:
             return "; the vehicle now has some new and some old items: upload again, or clear"
         if is_overwritten and is_silent:
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
@@ -225,14 +228,18 @@ class PlanTransfer(Generic[PlanT]):
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> None:
-        self._context, self._plan_type = context, plan_type
-        self._type = plan_type.MISSION_TYPE
-        self._cache = context.caches[self._type]
-        self._channel = PlanChannel(context, self._type, idle_timeout_s, on_progress)
-        self._offset = context.offset_of(self._type)
+        self._context = context
+        self._plan_type = plan_type
+        self._mission_type = plan_type.MISSION_TYPE
+        self._cache = context.caches[self._mission_type]
+        self._channel = PlanChannel(context, self._mission_type, idle_timeout_s, on_progress)
+        # 1 if the vehicle's item 0 is home, otherwise 0.
+        self._offset = context.offset_of(self._mission_type)
+        # How the vehicle rounds the values of items, for comparisons.
         self._storage = ItemStorage(context.autopilot.mission_storage)
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
+        """Replace the vehicle's plan: send the differences if that is possible, otherwise a file or all items."""
         items = plan.to_items()
         if self._offset:  # Item 0 must be the vehicle's own home, because older firmware may move its home to item 0.
             items = with_home(items, self._context.home)
@@ -283,7 +290,7 @@ class PlanTransfer(Generic[PlanT]):
                 raise NotSupported(f"{self._name}: the vehicle has no file transfer; nothing was sent")
             return True
         # ArduPilot clears the old mission before it reads the file, and refuses to do so while it flies the mission.
-        is_refused = is_upload and self._type == MavMissionType.MISSION and self._context.is_flying_mission
+        is_refused = is_upload and self._mission_type == MavMissionType.MISSION and self._context.is_flying_mission
         return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
@@ -329,20 +336,23 @@ class PlanTransfer(Generic[PlanT]):
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only the differences. Returns False if the vehicle's plan is unknown or differs in too many items."""
+        """Send only the differences; return True if the vehicle has the plan now.
+
+        Returns False if the vehicle's plan is unknown or differs in too many items.
+        """
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
-            reported = self._context.plan_id(self._type, self._cache.updated_at)
+            reported = self._context.plan_id(self._mission_type, self._cache.updated_at)
             checksum = mission_checksum(items)
             # Another station may have just replaced the plan, so the next report must have the same checksum.
-            if reported == checksum and await self._context.wait_for_plan_id(self._type, checksum):
+            if reported == checksum and await self._context.wait_for_plan_id(self._mission_type, checksum):
                 self._cache.set(items, self._context.now())
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
         await self._read(method)  # Another station may have changed the plan.
         changed_seqs = self._changed_seqs(items)
-        if changed_seqs == []:
+        if changed_seqs == []:  # The vehicle has these items already.
             return True
         if changed_seqs is None or not self._is_worthwhile(changed_seqs, len(items)):
             return False
@@ -390,7 +400,7 @@ class PlanTransfer(Generic[PlanT]):
         if not autopilot.reports_mission_checksum or reading_takes_s < CHECKSUM_INTERVAL_S:
             return False
         checksum = mission_checksum(items)
-        if not await self._context.wait_for_plan_id(self._type, checksum):
+        if not await self._context.wait_for_plan_id(self._mission_type, checksum):
             return False  # The checksum did not arrive in time.
         self._cache.set(items, self._context.now())
         return True
@@ -419,7 +429,7 @@ class PlanTransfer(Generic[PlanT]):
 
     @property
     def _name(self) -> str:
-        return PLAN_NAMES[self._type]
+        return PLAN_NAMES[self._mission_type]
 
 
 def _consecutive_ranges(seqs: Collection[int]) -> Iterator[range]:

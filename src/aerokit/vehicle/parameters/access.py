@@ -57,10 +57,10 @@ class ParameterAccess:
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
         self.store: ParameterStore = ParameterStore(transfers)
-        self._downloading = asyncio.Lock()
-        self._writing = asyncio.Lock()
+        self._download_lock = asyncio.Lock()
+        self._write_lock = asyncio.Lock()
         self._has_pack: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
-        self._cached_read_round_trip: RoundTrip | None = None
+        self._cached_read_round_trip: RoundTrip | None = None  # see `_read_round_trip`
         self._boosts = 0  # number of running operations that need a raised rate of answers
         self._written_at: dict[str, float] = {}  # maps each name to the time of its last write
         # Last value of each parameter that this program has written and the vehicle has confirmed.
@@ -96,7 +96,7 @@ class ParameterAccess:
         on_progress: OnProgress | None,
     ) -> ParameterTable:
         """Return the whole list: the known one, a cached one with the vehicle's hash, or a new one."""
-        async with self._downloading:
+        async with self._download_lock:
             if self.store.is_complete and not refresh:
                 return self.store.table
             cached_list = None
@@ -193,6 +193,7 @@ class ParameterAccess:
         return ParameterTable(parameters)
 
     async def _download_list(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
+        """Request the list by PARAM_REQUEST_LIST, one message for each parameter, and then the missing parameters."""
         from aerokit.protocols.parameter_list import ParameterList
 
         transfers = self._transfers
@@ -285,7 +286,7 @@ class ParameterAccess:
         from aerokit.protocols.parameter_requests import ParameterWrites
 
         transfers = self._transfers
-        async with self._writing:
+        async with self._write_lock:
             names = _names(parameters)
             known = [self.store.get(name) for name in names]
             old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
@@ -341,7 +342,7 @@ class ParameterAccess:
             return await self.write(parameters, idle_timeout_s, on_progress)
         answers: dict[str, ParameterAnswer] = {}
         try:
-            async with self._writing:
+            async with self._write_lock:
                 await self._upload_pack(parameters, idle_timeout_s, on_progress)
             answers = await self._read_back(parameters, idle_timeout_s)
         except (FileError, FileTimeout, NotSupported):  # With "auto", all parameters are set one by one instead.
@@ -363,6 +364,7 @@ class ParameterAccess:
         )
 
     async def _read_back(self, written: tuple[Parameter, ...], idle_timeout_s: float) -> dict[str, ParameterAnswer]:
+        """Return the vehicle's values of these parameters, after they were written in a file."""
         if len(written) <= MAX_READ_BACK:
             return await self.read(_names(written), idle_timeout_s)
         await self.download("auto", refresh=True, cache=False, idle_timeout_s=idle_timeout_s, on_progress=None)

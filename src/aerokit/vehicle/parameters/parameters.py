@@ -58,13 +58,14 @@ class Parameters(ReadOnly):
     """
 
     def __init__(self, session: Messaging, files: Files) -> None:
-        self._transfers = transfers = session.transfers
-        self._access = ParameterAccess(transfers, files)
+        self._transfers = session.transfers
+        self._access = ParameterAccess(session.transfers, files)
         session.at_close(self._access.store.attach())
         session.on_reboot.append(self._access.forget)
         self._names = NameResolver(self._access)
+        # Set by `load_metadata`.
         self._metadata: Metadata | None = None
-        self._writing = ParameterWriter(self._access, self._names, self._note_of)
+        self._writer = ParameterWriter(self._access, self._names, self._note_of)
         self._registry = RestoreRegistry()
 
     @property
@@ -206,7 +207,7 @@ class Parameters(ReadOnly):
             InvalidArgument: a name or value is invalid. Nothing was set.
         """
         with self._transfers.limit(timeout):
-            return await self._writing.write(values, idle_timeout_s=idle_timeout_s, on_progress=on_progress)
+            return await self._writer.write(values, idle_timeout_s=idle_timeout_s, on_progress=on_progress)
 
     async def upload(
         self,
@@ -236,7 +237,7 @@ class Parameters(ReadOnly):
                 "auto", refresh=False, cache=False, idle_timeout_s=idle_timeout_s, on_progress=None
             )
             values = self._names.without_duplicates(values, table)
-            return await self._writing.write(
+            return await self._writer.write(
                 values, upload=method, idle_timeout_s=idle_timeout_s, on_progress=on_progress
             )
 
@@ -254,7 +255,7 @@ class Parameters(ReadOnly):
         Raises:
             RollbackFailed: some values could not be restored; ``not_restored`` has them.
         """
-        return TemporaryParameters(self._registry, self._access, self._writing, values, idle_timeout_s)
+        return TemporaryParameters(self._registry, self._access, self._writer, values, idle_timeout_s)
 
     def transaction(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> Transaction:
         """Write several parameters, either all or none.
@@ -264,7 +265,7 @@ class Parameters(ReadOnly):
         Each write is verified. If the block raises or is cancelled, or a write fails, the previous values are
         restored; see :class:`Transaction`.
         """
-        return Transaction(self._registry, self._access, self._writing, self._needs_reboot, idle_timeout_s)
+        return Transaction(self._registry, self._access, self._writer, self._needs_reboot, idle_timeout_s)
 
     async def diff(
         self,
@@ -305,6 +306,7 @@ class Parameters(ReadOnly):
         return table.changed_from_default()
 
     def _with_documented_defaults(self, table: ParameterTable) -> ParameterTable:
+        """Return the table with the defaults in the metadata; raise NotSupported if there are none."""
         defaults = {name: entry.default for name, entry in (self._metadata or {}).items() if name in table}
         if not any(default is not None for default in defaults.values()):
             raise NotSupported(

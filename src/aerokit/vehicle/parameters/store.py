@@ -32,6 +32,7 @@ class ParameterStore:
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._known: dict[str, Parameter] = {}
+        # The known parameters as a table; None until it is built again after a change.
         self._table: ParameterTable | None = ParameterTable()
         # True once the whole list has arrived since the vehicle started.
         self.is_complete: bool = False
@@ -113,6 +114,7 @@ class ParameterStore:
             self._publish(old.get(name), parameter)
 
     def _on_param_value(self, message: ParamValue) -> None:
+        """Update the known parameter from any PARAM_VALUE of the autopilot, whoever requested or set the value."""
         frame = message.received_frame
         if frame is None or frame.component_id != self._transfers.component_id:
             return
@@ -134,6 +136,7 @@ class ParameterStore:
         self._publish(old, new)
 
     def _publish(self, old: Parameter | None, new: Parameter) -> None:
+        """Publish ParameterChanged if the value of a known parameter has changed."""
         if old is None or same_value(old.value, new.value):
             return
         transfers = self._transfers

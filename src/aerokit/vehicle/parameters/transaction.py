@@ -53,19 +53,19 @@ class _Block:
     """Base class: saves parameters before their first write, and restores them."""
 
     def __init__(
-        self, registry: RestoreRegistry, access: ParameterAccess, writing: ParameterWriter, idle_timeout_s: float
+        self, registry: RestoreRegistry, access: ParameterAccess, writer: ParameterWriter, idle_timeout_s: float
     ) -> None:
-        self._registry, self._access, self._writing = registry, access, writing
+        self._registry, self._access, self._writer = registry, access, writer
         self._idle_timeout_s = idle_timeout_s
         self._saved: dict[str, Parameter] = {}  # parameters before their first write in this block
 
     async def _write(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
         await self._save_previous(values)
-        return await self._writing.write(values, idle_timeout_s=self._idle_timeout_s)
+        return await self._writer.write(values, idle_timeout_s=self._idle_timeout_s)
 
     async def _save_previous(self, values: Mapping[str, float]) -> None:
         """Save the parameters before their first write. They are read again, because the store may be outdated."""
-        answers_by_name = await self._writing.names.resolve(values, self._idle_timeout_s)
+        answers_by_name = await self._writer.names.resolve(values, self._idle_timeout_s)
         resolved = [answer for answer in answers_by_name.values() if isinstance(answer, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
         unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
@@ -147,15 +147,16 @@ class TemporaryParameters(_Block):
         self,
         registry: RestoreRegistry,
         access: ParameterAccess,
-        writing: ParameterWriter,
+        writer: ParameterWriter,
         values: Mapping[str, float],
         idle_timeout_s: float,
     ) -> None:
-        super().__init__(registry, access, writing, idle_timeout_s)
+        super().__init__(registry, access, writer, idle_timeout_s)
         self._values = dict(values)
         self._was_entered = False
 
     async def __aenter__(self) -> dict[str, ParameterWrite]:
+        """Set the values; if one of them cannot be set, restore all."""
         if self._was_entered:
             raise InvalidArgument("this block was entered already: call temporarily() again")
         self._was_entered = True
@@ -189,12 +190,13 @@ class Transaction(_Block):
         self,
         registry: RestoreRegistry,
         access: ParameterAccess,
-        writing: ParameterWriter,
+        writer: ParameterWriter,
         needs_reboot: Callable[[str], bool],
         idle_timeout_s: float,
     ) -> None:
-        super().__init__(registry, access, writing, idle_timeout_s)
+        super().__init__(registry, access, writer, idle_timeout_s)
         self._name_needs_reboot = needs_reboot
+        # The vehicle's values of all parameters that were written in this block.
         self._new_values: dict[str, int | float] = {}
         self._is_open = False
 

@@ -153,10 +153,12 @@ def warn_of_rename(renamed: Renamed) -> None:
     """Issue the warning, attributed to the line of the program that called aerokit."""
     from aerokit.parameters.renames import ParameterRenamedWarning
 
-    depth, frame = 2, sys._getframe(1)  # `stacklevel` 2 is the caller of this function, and so is frame 1.
+    # Frame 1 is the caller of this function, and so is `stacklevel` 2.
+    frame, stack_level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("aerokit."):
-        depth, frame = depth + 1, frame.f_back
-    warnings.warn(renamed.warning, ParameterRenamedWarning, stacklevel=depth)
+        frame = frame.f_back
+        stack_level += 1
+    warnings.warn(renamed.warning, ParameterRenamedWarning, stacklevel=stack_level)
 
 
 Outcome = Literal["set", "unchanged", "rounded", "clamped", "failed"]
@@ -191,8 +193,9 @@ class ParameterWrite(Snapshot):
 
 
 def _failed_write(name: str, requested: float, known: Parameter | None, error: AerokitError) -> ParameterWrite:
+    """Return the result of a write that failed; ``known`` has the last known value, if there is one."""
     value, type_ = (math.nan, ParameterType.REAL32) if known is None else (known.value, known.type)
-    return ParameterWrite(name, requested, value, type_, "failed", "", error)
+    return ParameterWrite(name, requested, value, type_, outcome="failed", error=error)
 
 
 def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
@@ -281,6 +284,7 @@ class ParameterWriter:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
+        """Send the planned values, and return the vehicle's answers by the names on the vehicle."""
         if upload is None:
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
         changed = [plan.to_send for plan in plans if not plan.is_unchanged]

@@ -69,7 +69,8 @@ class Caster:
         try:
             parts = urlsplit(url)
             host, port = parts.hostname, parts.port
-        except ValueError:  # This error is not passed on, because its text may contain the password.
+        except ValueError:
+            # The text of this error may contain the password. Without a host, the check below raises another error.
             parts, host, port = urlsplit(""), None, None
         mount = unquote(parts.path[1:])
         is_mount_valid = mount.isascii() and mount.isprintable() and "/" not in mount and " " not in mount
@@ -107,14 +108,18 @@ class _Response:
     """Response of a caster: its status line, and its body without the chunk headers."""
 
     def __init__(self, reader: asyncio.StreamReader, status: str, headers: dict[str, str]) -> None:
-        self._reader, self.status, self._headers = reader, status, headers
+        self._reader = reader
+        self.status = status
+        self._headers = headers
         words = status.split()  # "HTTP/1.1 200 OK", or in NTRIP 1 "ICY 200 OK", "SOURCETABLE 200 OK", "ERROR - text"
+        # The status code; empty if the caster has sent none.
         self.code = words[1] if len(words) > 1 and words[0] != "ERROR" else ""
         self.is_table = words[:1] == ["SOURCETABLE"] or "sourcetable" in headers.get("content-type", "")
         self.is_stream = self.code == "200" and not self.is_table
 
     @classmethod
     async def read(cls, reader: asyncio.StreamReader) -> _Response:
+        """Read the status line and the headers; `body` reads the rest."""
         status = (await reader.readline()).decode("latin-1").strip()
         headers: dict[str, str] = {}
         # In NTRIP 1, the data follow "ICY 200 OK" at once or after an empty line. RtcmReader skips that line.
@@ -164,14 +169,23 @@ class NtripClient:
         send_position: bool | None,
         timeout: float,
     ) -> None:
-        self._session, self._send, self._caster, self._timeout = session, send, caster, timeout
+        self._session = session
+        # Sends one RTCM message to the vehicle.
+        self._send = send
+        self._caster = caster
+        self._timeout = timeout
+        # None until the caster's source table was read.
         self._sends_position = send_position
         self._name = f"NTRIP {caster!r}"
-        self._cancellation, self._ended = Cancellation(), asyncio.Event()
+        # Ends the background task; `_ended` is set when the task has ended.
+        self._cancellation = Cancellation()
+        self._ended = asyncio.Event()
         self._was_entered = False
+        # The open connection to the caster; None while there is none.
         self._writer: asyncio.StreamWriter | None = None
         self._problem = ""
-        self._oversized = self._reconnects = 0
+        self._oversized = 0
+        self._reconnects = 0
 
     @property
     def is_connected(self) -> bool:
@@ -197,6 +211,7 @@ class NtripClient:
         return f"<NtripClient {self._caster!r}, {'connected' if self.is_connected else 'not connected'}>"
 
     async def __aenter__(self) -> Self:
+        """Open the connection, and forward corrections in the background."""
         if self._was_entered:
             raise BusyError("this NtripClient was entered before: call ntrip() again")
         self._was_entered = True
@@ -217,6 +232,7 @@ class NtripClient:
         await run_shielded(self._wait_closed(writer))
 
     async def _wait_closed(self, writer: asyncio.StreamWriter | None) -> None:
+        """Wait briefly until the background task has ended and the connection is closed."""
         with anyio.move_on_after(CLOSE_TIMEOUT_S):
             if not self._session.is_closed:
                 await self._ended.wait()
@@ -305,6 +321,7 @@ class NtripClient:
         raise OperationRejected(f"{self._name}: {reason}")
 
     async def _request(self, mount: str) -> _Response:
+        """Connect to the caster, and request a mount point, or the source table if ``mount`` is empty."""
         caster = self._caster
         context = ssl.create_default_context() if caster.is_encrypted else None
 

@@ -92,7 +92,9 @@ class Rtk:
             "rtk.corrections", context.session.connection.now, "corrections by rtk.send or rtk.ntrip"
         )
         self._session.register_cell(self._corrections)
-        self._messages = self._bytes = 0
+        # Numbers of messages and bytes that were sent.
+        self._messages = 0
+        self._bytes = 0
         self._recent: deque[tuple[float, int]] = deque()  # time and size of each message in the window
 
     @property

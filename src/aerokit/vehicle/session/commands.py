@@ -50,8 +50,11 @@ class CommandSender:
         acks_per_command: Mapping[int, int] = {},
     ) -> None:
         self._connection = connection
-        self._system_id, self._component_id = system_id, component_id
-        self._describe, self._round_trip_s = describe, round_trip_s
+        self._system_id = system_id
+        self._component_id = component_id
+        # Describes the link, for error texts.
+        self._describe = describe
+        self._round_trip_s = round_trip_s
         self._acks_per_command = acks_per_command
         self._locks: defaultdict[_Key, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
@@ -59,17 +62,18 @@ class CommandSender:
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
         # Acks of earlier commands that may still arrive: one entry for each ack, the time at which it was recorded.
         self._pending_acks: dict[_Key, list[float]] = {}
+        # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
         self._accepted_at: dict[_Key, float] = {}
         self._is_closed = False
-        self._detach = (
+        self._detach_callbacks = (
             connection.bus.attach(CommandAck, self._on_ack, system_id=system_id),
             connection.on_end(self._abort),
         )
 
     def close(self) -> None:
         """Stop receiving acks. Calls that wait for an ack, and later calls, raise ConnectionClosed."""
-        for detach in self._detach:
+        for detach in self._detach_callbacks:
             detach()
         self._is_closed = True
         self._abort(ConnectionClosed("the async with block of this vehicle was left"))
@@ -219,7 +223,8 @@ class CommandSender:
                 order_status=order_status,
                 is_sent=was_just_sent,
             )
-            run = self._runs[key] = ExchangeRun(self._connection, exchange)
+            run = ExchangeRun(self._connection, exchange)
+            self._runs[key] = run
             self._order_statuses[key] = order_status
             try:
                 return await run.result()
@@ -235,7 +240,8 @@ class CommandSender:
         """Abort the running command with this key if its order has ended, so that a newer command need not wait."""
         order_status = self._order_statuses.get(key)
         if order_status is not None and order_status.end:
-            text = f"no COMMAND_ACK for {command_name(key[1])} yet; not sent again: {order_status.end}"
+            _, command = key
+            text = f"no COMMAND_ACK for {command_name(command)} yet; not sent again: {order_status.end}"
             self._runs[key].abort(CommandTimeout(text))
 
     def _min_attempt_timeout_s(self) -> float:

@@ -62,6 +62,7 @@ class _Stream:
         # The rates that callers need. Each call of `MessageRates.request` has its own key.
         self.requests: dict[object, float] = {}
         self.is_optional = True
+        # The rate last requested; None if the needed rate must be requested again.
         self.requested_hz: float | None = None
         self.is_refused = False
         self.is_slow = False
@@ -87,10 +88,12 @@ class _Stream:
         return not self.is_refused and self.requested_hz != self.needed_hz
 
     def achieved_hz(self) -> float:
+        """Return the average rate in the window of the last checks."""
         received_in_window = self.received_at_checks[-1] - self.received_at_checks[0]
         return received_in_window / ((len(self.received_at_checks) - 1) * WATCH_PERIOD_S)
 
     def mark_requested(self, now: float, hz: float) -> None:
+        """Record that this rate was requested, and begin to measure the received rate anew."""
         self.requested_hz = hz
         self.received_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
         self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
@@ -116,9 +119,13 @@ class MessageRates:
         component_id: int,
         stream_groups: Mapping[int, int],
     ) -> None:
-        self._connection, self._commands = connection, commands
-        self._system_id, self._component_id = system_id, component_id
+        self._connection = connection
+        self._commands = commands
+        self._system_id = system_id
+        self._component_id = component_id
+        # Maps message ids to their groups in REQUEST_DATA_STREAM.
         self._group_of_message = stream_groups
+        # Maps message ids to the streams that were ever requested.
         self._streams: dict[int, _Stream] = {}
         self._has_due_streams = asyncio.Event()
         # True if the vehicle does not support SET_MESSAGE_INTERVAL, so that messages are requested in groups.
@@ -135,10 +142,12 @@ class MessageRates:
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
         if stream is None:
-            stream = self._streams[message_type.ID] = self._new_stream(message_type)
+            stream = self._new_stream(message_type)
+            self._streams[message_type.ID] = stream
         stream.is_optional = stream.is_optional and is_optional
         if stream.is_refused:  # The vehicle may accept another rate than the refused one.
-            stream.is_refused, stream.requested_hz = False, None
+            stream.is_refused = False
+            stream.requested_hz = None
         token = object()
         stream.requests[token] = hz
         self._has_due_streams.set()
@@ -152,9 +161,11 @@ class MessageRates:
     def request_again(self) -> None:
         """Request all messages again, because the vehicle may have lost the requests, for example by a reboot."""
         for stream in self._streams.values():
-            stream.requested_hz, stream.retry_interval_s = None, RETRY_INTERVAL_S
+            stream.requested_hz = None
             stream.is_refused = False
-            stream.failures, stream.next_attempt_at = 0, -math.inf
+            stream.retry_interval_s = RETRY_INTERVAL_S
+            stream.failures = 0
+            stream.next_attempt_at = -math.inf
         self._reset_count += 1
         self._has_due_streams.set()
 

@@ -161,8 +161,10 @@ class VehicleSession:
             send_command=self.commands.send_long,
         )
         self.is_closed: bool = False
+        # Cells that are not part of the telemetry.
         self._cells: list[StateCell[Any]] = [self.link_quality]
-        self._detach: list[Detach] = []
+        self._detach_callbacks: list[Detach] = []
+        # The error that ended the session; None while it runs.
         self._ended_by: Exception | None = None
         self.on_reboot: list[Callable[[], None]] = [
             self.rates.request_again,
@@ -175,6 +177,7 @@ class VehicleSession:
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         """Process the first heartbeat, request streams and constants, and start the background tasks."""
         self.telemetry.receive(heartbeat)
+        # A message with a default rate may be missing. A message that the program has named is reported if it is.
         are_default = rates is None
         requested_rates = self.telemetry.default_rates if rates is None else rates
         for message_type, hz in requested_rates.items():
@@ -187,7 +190,7 @@ class VehicleSession:
         self.is_closed = True
         self.transfers.is_closed = True
         self._on_end(ConnectionClosed("the async with block of this vehicle was left"))
-        for detach in self._detach:
+        for detach in self._detach_callbacks:
             detach()
         self.commands.close()
         self.watch.close()
@@ -196,7 +199,7 @@ class VehicleSession:
 
     def at_close(self, *functions: Detach) -> None:
         """Register callbacks for the end of the vehicle's `async with` block; after its end, call them at once."""
-        self._detach += functions
+        self._detach_callbacks += functions
         if self.is_closed:
             for function in functions:
                 function()
@@ -349,11 +352,11 @@ class VehicleSession:
                 detach = bus.attach_lazily(message_type, streams[message_id].receive, system_id=self.system_id)
             else:
                 detach = bus.attach(message_type, handler, system_id=self.system_id)
-            self._detach.append(detach)
+            self._detach_callbacks.append(detach)
         telemetry, publish = self.telemetry, self.publish
         self._attach_watched_streams()
         self.add_timeout_hint(*telemetry.cells.values(), self.link_quality, self.watch.link_state)
-        self._detach += [
+        self._detach_callbacks += [
             telemetry.mode.observe(
                 lambda before, mode: publish(ModeChanged, None if before is None else before.name, mode.name)
             ),
@@ -410,6 +413,7 @@ class VehicleSession:
             callback()
 
     def _on_end(self, error: Exception) -> None:
+        """End the background tasks and all waits for a state, because the connection or the session has ended."""
         self.background.cancel()
         self.watch.end(error)
         self.telemetry.close(error)

@@ -55,11 +55,15 @@ class ComponentSubscriber:
         register_cell: Callable[[StateCell[Any]], None],
         at_close: Callable[[Detach], None],
     ) -> None:
-        self._connection, self._rates = connection, rates
-        self._system_id, self._component_id = system_id, component_id
-        self._register_cell, self._at_close = register_cell, at_close
+        self._connection = connection
+        self._rates = rates
+        self._system_id = system_id
+        self._component_id = component_id
+        self._register_cell = register_cell
+        self._at_close = at_close
+        # The cell with the latest message of each type, and the function that releases the request for its rate.
         self._cells: dict[type[Message], StateCell[Any]] = {}
-        self._cell_rates: dict[type[Message], Detach] = {}
+        self._rate_releases: dict[type[Message], Detach] = {}
 
     def subscribe(
         self,
@@ -80,11 +84,11 @@ class ComponentSubscriber:
             for message_type in message_types:
                 check_rate(message_type, rate_hz)
 
-        # Called when the program enters the `with` block of the subscription.
         def attach(sink: Sink) -> list[Detach]:
+            """Attach the sink and request the rates, when the `with` block of the subscription is entered."""
             filtered_sink = sink if entire_system else self._of_component(sink)
             detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)
-            detach_callbacks.append(self._connection.on_end(subscription.close))
+            detach_callbacks.append(self._connection.on_end(subscription.close))  # `subscription` is assigned below.
             for message_type in message_types:
                 hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
                 if hz is not None:
@@ -103,12 +107,13 @@ class ComponentSubscriber:
         cell = self._cells.get(message_type)
         if cell is None:
             self._connection.check_types((message_type,))
-            cell = self._cells[message_type] = self._new_cell(message_type)
+            cell = self._new_cell(message_type)
+            self._cells[message_type] = cell
             self._register_cell(cell)
             rate_hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
         if rate_hz is not None:
-            release_previous = self._cell_rates.pop(message_type, None)
-            self._cell_rates[message_type] = self._rates.request(message_type, rate_hz)
+            release_previous = self._rate_releases.pop(message_type, None)
+            self._rate_releases[message_type] = self._rates.request(message_type, rate_hz)
             # The new request comes first: a message without any request returns to the autopilot's own rate.
             if release_previous is not None:
                 release_previous()
@@ -124,7 +129,8 @@ class ComponentSubscriber:
             self._at_close(bus.attach(message_type, self._of_component(callback), system_id=self._system_id))
 
     def _new_cell(self, message_type: type[Message]) -> StateCell[Any]:
-        arrived_at = math.nan
+        """Return a cell that is updated by each message of this type, with the time of its arrival."""
+        arrived_at = math.nan  # Time of the message in the cell. `store` sets it right before the message.
         cell: StateCell[Any] = StateCell(
             message_type.NAME, self._connection.now, message_type.NAME, stamp=lambda: arrived_at
         )
@@ -166,6 +172,7 @@ class WatchedStream:
 
     def __init__(self, cell: StateCell[Any], request: Callable[[], Detach | None]) -> None:
         self._cell, self._request = cell, request
+        # Releases the request; None while nothing is requested.
         self._release: Detach | None = None
 
     def catch_up(self) -> None:

@@ -73,9 +73,14 @@ class Transfers:
         self.round_trip: RoundTrip = RoundTrip()
         """Round-trip time: measured by TIMESYNC at first, and by transfers from the first one on."""
         self.is_closed: bool = False
+        # True once a component has not answered the request for its version.
         self._is_version_unavailable = False
-        self._send_command, self._request_version = send_command, request_version
-        self._version, self._describe, self._round_trip_s = version, describe, round_trip_s
+        self._send_command = send_command
+        self._request_version = request_version
+        self._version = version
+        # Describes the link, for error texts.
+        self._describe = describe
+        self._round_trip_s = round_trip_s
 
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import anyio
 
@@ -59,8 +59,12 @@ class VehicleWatch:
         component_id: int,
         on_reboot: Callable[[], None],
     ) -> None:
-        self._connection, self._system_id, self._component_id = connection, system_id, component_id
-        self._now, self._on_reboot = connection.now, on_reboot
+        self._connection = connection
+        self._system_id = system_id
+        self._component_id = component_id
+        self._now = connection.now
+        self._on_reboot = on_reboot
+        # Times at which the last HEARTBEAT arrived, and at which it was processed.
         self.last_heartbeat_at: float = connection.now()
         self._heartbeat_read_at = connection.now()
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
@@ -68,7 +72,9 @@ class VehicleWatch:
             self.link_state, connection.bus, system_id=system_id, component_id=component_id
         )
         self._state_tracker.record_activity(connection.now())
-        self._is_reported_silent = self._has_ended = False
+        # True from `VehicleSilent` to `VehicleRecovered`.
+        self._is_reported_silent = False
+        self._has_ended = False
         self.reboots: int = 0
         """Number of reboots detected."""
         # For each clock of the vehicle: its last reported time in milliseconds, and when the report was processed.
@@ -83,16 +89,16 @@ class VehicleWatch:
         # Our time when the last answer to a TIMESYNC request was processed, and the vehicle's time in it (ms).
         self._last_answer = (-math.inf, 0)
         attach = connection.bus.attach
-        self._detach: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
+        self._detach_callbacks: list[Detach] = [attach(Heartbeat, self._on_heartbeat, system_id=system_id)]
         attach_frames = connection.bus.attach_frames
         for message_type, handler in (
             (Attitude, self._on_boot_time),
             (GlobalPositionInt, self._on_boot_time),
             (SystemTime, self._on_system_time),
         ):
-            self._detach.append(attach_frames(message_type, handler, system_id=system_id))
-        self._detach.append(attach(Timesync, self._on_timesync, system_id=system_id))
-        self._detach.append(connection.bus.attach_event(LinkInterrupted, self._on_link_interrupted))
+            self._detach_callbacks.append(attach_frames(message_type, handler, system_id=system_id))
+        self._detach_callbacks.append(attach(Timesync, self._on_timesync, system_id=system_id))
+        self._detach_callbacks.append(connection.bus.attach_event(LinkInterrupted, self._on_link_interrupted))
 
     @property
     def is_silent(self) -> bool:
@@ -117,7 +123,7 @@ class VehicleWatch:
     def close(self) -> None:
         """Stop monitoring."""
         self._connection.boot_clocks.pop((self._system_id, self._component_id), None)
-        for detach in self._detach:
+        for detach in self._detach_callbacks:
             detach()
 
     def boot_time_ms(self, now: float) -> float | None:
@@ -127,7 +133,8 @@ class VehicleWatch:
         """
         if "time_boot_ms" not in self._last_times or self._first_time is None:
             return None
-        (last_ms, last_at), (first_ms, first_at) = self._last_times["time_boot_ms"], self._first_time
+        last_ms, last_at = self._last_times["time_boot_ms"]
+        first_ms, first_at = self._first_time
         span_s = last_at - first_at
         ms_per_second = (last_ms - first_ms) / span_s if span_s > CLOCK_SPAN_S else 1000.0
         return last_ms + ms_per_second * (now - last_at)
@@ -164,6 +171,7 @@ class VehicleWatch:
             self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
 
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
+        """Record a HEARTBEAT of the autopilot, and publish VehicleRecovered if it ends a reported silence."""
         frame = heartbeat.received_frame
         if frame is None or frame.component_id != self._component_id:
             return
@@ -223,6 +231,7 @@ class VehicleWatch:
         return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
+        """Restart the detection with the first time after the reboot, and report the reboot."""
         now = self._connection.now()
         # The times from before the reboot are discarded. Compared with them, later messages would show the same reboot
         # again.
@@ -234,6 +243,15 @@ class VehicleWatch:
         self.reboots += 1
         self._on_reboot()
         self._connection.bus.publish(VehicleRebooted(now, self._system_id))
+
+
+class _Counts(NamedTuple):
+    """Counters at one time: frames received from the vehicle, its frames that were lost, and bytes on the link."""
+
+    at: float
+    received: int
+    lost: int
+    total_bytes: int
 
 
 class LinkWatch:
@@ -250,11 +268,17 @@ class LinkWatch:
         on_report: Callable[[LinkReport], None],
         on_answer: Callable[[float, int], None],
     ) -> None:
-        self._connection, self._system_id, self._component_id = connection, system_id, component_id
-        self._on_report, self._on_answer = on_report, on_answer
+        self._connection = connection
+        self._system_id = system_id
+        self._component_id = component_id
+        self._on_report = on_report
+        # Called with each answer: our time of the request, and the vehicle's time in milliseconds.
+        self._on_answer = on_answer
         self._round_trip_s: float | None = None
+        # Times of the unanswered TIMESYNC requests in nanoseconds, which identify their answers.
         self._open_requests: deque[int] = deque(maxlen=MAX_OPEN_REQUESTS)
         self._next_request_at = connection.now()
+        # The counters at the last report.
         self._counts_before = self._count()
         self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
 
@@ -309,24 +333,23 @@ class LinkWatch:
 
     def _report(self) -> None:
         """Publish the link's quality since the last report."""
-        counts, counts_before = self._count(), self._counts_before
+        counts, before = self._count(), self._counts_before
         self._counts_before = counts
-        now, (received, lost), total_bytes = counts
-        reported_at, (received_before, lost_before), total_bytes_before = counts_before
-        seconds = max(now - reported_at, 1e-9)
-        frames, missing = max(0, received - received_before), max(0, lost - lost_before)
+        seconds = max(counts.at - before.at, 1e-9)
+        frames = max(0, counts.received - before.received)
+        missing = max(0, counts.lost - before.lost)
         report = LinkReport(
-            now,
+            counts.at,
             self._system_id,
             loss_percent=100 * missing / (frames + missing) if frames + missing else None,
             round_trip_s=self._round_trip_s,
             frames_per_s=frames / seconds,
-            bytes_per_s=(total_bytes - total_bytes_before) / seconds,
+            bytes_per_s=(counts.total_bytes - before.total_bytes) / seconds,
         )
         self._on_report(report)
         self._connection.bus.publish(report)
 
-    def _count(self) -> tuple[float, tuple[int, int], int]:
-        """Return the time, the numbers of frames received from the vehicle and lost, and of bytes on the link."""
+    def _count(self) -> _Counts:
         total_bytes = sum(statistics.bytes for statistics in self._connection.statistics())
-        return self._connection.now(), self._connection.counts(self._system_id), total_bytes
+        received, lost = self._connection.counts(self._system_id)
+        return _Counts(self._connection.now(), received, lost, total_bytes)

@@ -53,7 +53,8 @@ NORTH_CDEG = 36000
 # The MAV_SENSOR_ORIENTATION of a sensor that looks straight down (MAV_SENSOR_ROTATION_PITCH_270).
 LOOKING_DOWN = 25
 
-GPS_FIX_TYPE_3D = 3
+# The fix types from a 3D fix to PPP, the best one (GPS_FIX_TYPE).
+GPS_FIX_TYPE_3D, GPS_FIX_TYPE_PPP = 3, 8
 
 # Largest cell voltage in BATTERY_STATUS, in mV. The total of a pack above 65.5 V is reported as several "cells", whose
 # sum is the total: all of them except the last have this value.
@@ -104,7 +105,7 @@ class GpsReceiver(Snapshot):
     @property
     def has_3d_fix(self) -> bool:
         """True for a 3D fix or better."""
-        return GPS_FIX_TYPE_3D <= self.fix_type <= 8
+        return GPS_FIX_TYPE_3D <= self.fix_type <= GPS_FIX_TYPE_PPP
 
 
 class Battery(Snapshot):
@@ -172,7 +173,9 @@ def distance_sensors(message: messages.DistanceSensor, context: Context) -> tupl
 
 def range_finder(message: messages.Rangefinder, context: Context) -> tuple[RangeFinder, ...]:
     """Return all sensors reported so far, with the new reading in RANGEFINDER (older ArduPilot) as sensor 0."""
-    return _replaced(context.before, RangeFinder(0, finite(message.distance), LOOKING_DOWN), _id_of)
+    return _replaced(
+        context.before, RangeFinder(id=0, distance_m=finite(message.distance), orientation=LOOKING_DOWN), _id_of
+    )
 
 
 def first_gps(message: messages.GpsRawInt, context: Context) -> tuple[GpsReceiver, ...]:
@@ -186,6 +189,7 @@ def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
+    """Return the receiver of this message, without a position if it has no fix."""
     has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
     coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
     latitude, longitude = coordinates or (None, None)

@@ -195,10 +195,15 @@ class StreamedMessage:
         apply: Callable[[Frame, Message | None], None],
         lock: threading.RLock,
     ) -> None:
-        self._component_id, self._cells, self._apply, self._lock = component_id, cells, apply, lock
+        self._component_id = component_id
+        self._cells = cells
+        self._apply = apply
+        self._lock = lock
+        # Offset in `Frame.body` instead of in the payload; None if there is only one instance.
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
         # The first frame that arrives at or after this time is decoded at once.
         self._decode_from = -math.inf
+        # True while one of the cells has observers.
         self._is_watched = False
         self.pending: dict[int, Frame | Message] = {}
         """The latest frame of each instance, until it is decoded (or its message, until that is applied)."""

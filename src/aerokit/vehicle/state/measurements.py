@@ -146,6 +146,7 @@ def _scaled(factor: float, x: float, y: float, z: float) -> tuple[float, float, 
 
 
 def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
+    """Return the readings in HIGHRES_IMU, whose magnetic field has a unit that depends on the autopilot."""
     return Imu(
         acceleration_m_s2=(message.xacc, message.yacc, message.zacc),
         rate_deg_s=_scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),
@@ -168,6 +169,7 @@ def scaled_imu(message: messages.ScaledImu) -> Imu:
 
 
 def raw_imu(message: messages.RawImu) -> RawImu:
+    """Return the readings in RAW_IMU, of which only the temperature has a unit."""
     return RawImu(
         acceleration=(message.xacc, message.yacc, message.zacc),
         rate=(message.xgyro, message.ygyro, message.zgyro),
@@ -177,6 +179,7 @@ def raw_imu(message: messages.RawImu) -> RawImu:
 
 
 def odometry(message: messages.Odometry) -> Odometry:
+    """Return the pose and velocity in ODOMETRY, with rates in degrees per second."""
     w, x, y, z = message.q
     return Odometry(
         frame=enum_member(MavFrame, message.frame_id),
@@ -222,6 +225,7 @@ def simulation_state(message: messages.SimState) -> Position | None:
 
 
 def altitude(message: messages.Altitude) -> Altitude:
+    """Return the altitudes in ALTITUDE; None for those that the vehicle does not know."""
     terrain, clearance = finite(message.altitude_terrain), finite(message.bottom_clearance)
     return Altitude(
         monotonic_m=finite(message.altitude_monotonic),

@@ -26,6 +26,7 @@ MAX_OPEN = 16
 ELLIPSIS = "…"
 
 _Sender = tuple[int, int]
+"""System id and component id."""
 
 
 class StatusTextAssembler:
@@ -36,6 +37,7 @@ class StatusTextAssembler:
     """
 
     def __init__(self) -> None:
+        # Maps the sender and the id of a text to the chunks received so far.
         self._incomplete: dict[tuple[_Sender, int], _IncompleteText] = {}
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
@@ -100,14 +102,17 @@ class _IncompleteText:
 
     def __init__(self, severity: int) -> None:
         self.severity = severity
-        self.next_seq = 0
+        self.next_seq = 0  # the expected number of the next chunk
         self._parts: list[bytes] = []
 
     def add(self, seq: int, chunk: bytes, now: float) -> None:
+        """Append a chunk, after "…" if chunks before it are missing."""
         if seq > self.next_seq:
             self._parts.append(ELLIPSIS.encode())
         self._parts.append(chunk)
-        self.next_seq, self.last_chunk, self.last_chunk_at = seq + 1, chunk, now
+        self.next_seq = seq + 1
+        self.last_chunk = chunk
+        self.last_chunk_at = now
 
     def complete(self, now: float) -> StatusText:
         return StatusText(self.severity, _text(b"".join(self._parts)), now)

@@ -59,14 +59,18 @@ class Telemetry(States):
         self._knows_autopilot = autopilot is not None
         self._clock = clock
         self._lock = threading.RLock()  # Any thread may read a cell, and reading decodes pending frames.
+        # Arrival time of the message that is being processed; None if it has no frame, and between messages.
         self._arrived_at: float | None = None
         self._texts = StatusTextAssembler()
+        # Maps custom_mode to the name in AVAILABLE_MODES.
         self._mode_names: dict[int, str] = {}
+        # Additional input of the decoders, the same object for all of them.
         self._context = Context(self.autopilot, self._mode_names, lambda: self.home.is_known)
         self._cells: dict[str, StateCell[Any]] = {
             name: StateCell(name, clock, field.waits_for(self.autopilot), stamp=self._time_of_arrival)
             for name, field in STATES.items()
         }
+        # Messages are decoded on arrival, and frames when one of their values is read; see `handles` and `streams`.
         handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
         self._handlers = {MESSAGE_IDS[name]: self._receiver(name, handler) for name, handler in handlers.items()}
         self._streams = {MESSAGE_IDS[name]: self._streamed_message(name, handlers[name]) for name in LAZY}
@@ -285,12 +289,15 @@ class Telemetry(States):
         return True
 
     def _learn_autopilot(self, heartbeat: messages.Heartbeat) -> None:
-        self.autopilot = self._context.autopilot = autopilot_for(heartbeat)
+        """Use the autopilot of the first HEARTBEAT, which also decides which messages report a state."""
+        self.autopilot = autopilot_for(heartbeat)
+        self._context.autopilot = self.autopilot
         self._knows_autopilot = True
         for name, cell in self._cells.items():
             cell.waits_for = STATES[name].waits_for(self.autopilot)
 
     def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
+        """Store the name of a mode, unless the autopilot's own table has the mode or too many names are stored."""
         name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
         if name is not None and (message.custom_mode in self._mode_names or len(self._mode_names) < MAX_MODE_NAMES):
             self._mode_names[message.custom_mode] = name
@@ -298,8 +305,8 @@ class Telemetry(States):
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
         # A text gets the time of its processing, not of its arrival. Otherwise a text that explains a refusal could be
         # older than the refused command.
-        may_join = self.autopilot.has_status_text_id_0
-        self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=may_join), source)
+        joins_id_0 = self.autopilot.has_status_text_id_0
+        self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=joins_id_0), source)
 
     def _publish_texts(self, texts: Iterable[StatusText], source: Source) -> None:
         for text in texts:
