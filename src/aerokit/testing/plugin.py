@@ -167,8 +167,8 @@ def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[st
     marker = request.node.get_closest_marker(_MARKER)
     options = {} if marker is None else dict(marker.kwargs)
     options.setdefault("record", request.config.getoption(_PICTURES_OPTION) is not None)
-    has_kinds = marker is not None and marker.args
-    return marker.args if has_kinds else ("copter",), options
+    kinds = () if marker is None else marker.args
+    return kinds or ("copter",), options
 
 
 def _flight_fixtures(item: pytest.Item) -> list[Any]:

@@ -157,9 +157,9 @@ class ArduPilotMissionServer(MissionServer):
         self._warn_once(request, "got MISSION_REQUEST; use MISSION_REQUEST_INT!")
         return item_message_float(item, place, request.seq, client, kind, int(current))
 
-    def _refuse_size(self, count: m.MissionCount, channel: Channel) -> None:
-        super()._refuse_size(count, channel)
-        self._warn(f"Only {self.capacity(count.mission_type)} items are supported")
+    def _refuse_size(self, message: m.MissionCount, channel: Channel) -> None:
+        super()._refuse_size(message, channel)
+        self._warn(f"Only {self.capacity(message.mission_type)} items are supported")
 
     def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
         if isinstance(message, m.MissionCount):

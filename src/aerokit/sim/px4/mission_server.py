@@ -244,16 +244,16 @@ class Px4MissionServer(MissionServer):
         elif link.state is TransferState.GETTING and ack.type == Result.OPERATION_CANCELLED:
             self._drop(link)
 
-    def _on_count(self, count: m.MissionCount, channel: Channel) -> None:
+    def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
         """Start an upload. A repeated MISSION_COUNT is answered with the request of the first item again."""
-        link, sender = self._link(channel), sender_of(count)
+        link, sender = self._link(channel), sender_of(message)
         if link.state is TransferState.SENDING:
             self._warn("WPM: IGN MISSION_COUNT: Busy")
             self._answer(link, Result.ERROR, sender)
             return
         link.received_at = self._px4.now
         if link.state is TransferState.IDLE:
-            self._accept(link, count)
+            self._accept(link, message)
         elif sender != link.client:
             self._answer(link, Result.ERROR, sender)
         elif link.next > 0:

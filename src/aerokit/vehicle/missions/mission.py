@@ -76,10 +76,11 @@ class MissionEndDetector:
         self._ends_in_air = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         # Modes in which the vehicle may land: the mode of the last item if it is a landing or return, otherwise all.
-        purposes = [LANDING_PURPOSES[last_command]] if last_command in LANDING_PURPOSES else LANDING_PURPOSES.values()
-        self._landing_modes = tuple(
-            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol) for purpose in purposes
-        )
+        self._landing_modes = [
+            session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
+            for command, purpose in LANDING_PURPOSES.items()
+            if command == last_command or not self._is_last_item_landing
+        ]
         # HEARTBEAT may report the mission mode until this time.
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
