@@ -340,12 +340,12 @@ class Subscription(Generic[ItemT]):
         self.missed: int = 0
         """Number of items that were dropped because the reader was too slow."""
         self._attach = attach
-        self._detachers: list[Detach] = []
+        self._detachers: list[Detach] = []  # functions that end the subscription; empty before the `with` block
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._has_reader = False
+        self._has_reader = False  # True while a reader waits; a second one is refused
         self._waiter: asyncio.Future[None] | None = None  # set while a reader waits
-        self._error: Exception | None = None
+        self._error: Exception | None = None  # raised in the reader once the queue is empty
         self._closed = False
 
     def __enter__(self) -> Self:

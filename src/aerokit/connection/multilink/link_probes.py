@@ -53,10 +53,10 @@ class LinkProbes:
     ) -> None:
         self._names, self._choices, self._bus, self._send = names, choices, bus, send
         self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 of a probe → system id, link, send time
-        self._probed_at: dict[tuple[int, int], float] = {}
+        self._probed_at: dict[tuple[int, int], float] = {}  # (system id, link) → time of its last probe
         # Number of probes that may be sent now to systems without a vehicle object, and the time of its last refill.
         self._budget, self._budget_at = UNATTACHED_RATE_HZ, 0.0
-        self._reported: set[tuple[int, int]] = set()
+        self._reported: set[tuple[int, int]] = set()  # (system id, link) of the reported second vehicles
         bus.require_frames(m.Timesync, m.AutopilotVersion)
 
     def probe(
