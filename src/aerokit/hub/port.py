@@ -232,10 +232,10 @@ class Port:
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes = queue_above_bytes
-        self._may_queue = queue_above_bytes < UNLIMITED
+        self._may_queue = queue_above_bytes < UNLIMITED  # False if no number of unsent bytes makes frames wait
         self._on_drop = on_drop
-        self._queue = FrameQueue()
-        self._due: dict[int, float] = {}
+        self._queue = FrameQueue()  # frames that wait until the link drains
+        self._due: dict[int, float] = {}  # key of a rate-limited stream → time from which its next frame is forwarded
 
     @property
     def has_queued_frames(self) -> bool:

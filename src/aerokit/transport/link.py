@@ -197,9 +197,9 @@ class BaseLink(Link):
         self.dropped_writes: int = 0
         self._state = _State.NEW
         self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
-        self._keeps_peers = False
-        self._stalled_at: float | None = None
-        self._released = asyncio.Event()
+        self._keeps_peers = False  # True if the receiver decides which peers are remembered; see `PeerKeeper`
+        self._stalled_at: float | None = None  # time at which the link stalled; None while it drains
+        self._released = asyncio.Event()  # set while no socket is open
         self._released.set()
 
     async def open(self, receiver: Receiver) -> None:
@@ -280,6 +280,7 @@ class BaseLink(Link):
             raise BusyError(f"{self.address} is {self._state.value}; a link can be opened only once")
 
     def _abort_opening(self) -> None:
+        """Release the link after a failed opening, so that it can be opened again."""
         self._receiver = None
         self._release()
         if self._state is not _State.CLOSED:
@@ -347,9 +348,9 @@ class MemoryLink(BaseLink):
         super().__init__(address)
         self._latency_s = latency_s
         self._far: MemoryLink | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # None while the link is not open
         self._inbox: deque[tuple[float, bytes | None]] = deque()  # (due time, data); data is None if the far end closed
-        self._wake_up: asyncio.Handle | None = None
+        self._wake_up: asyncio.Handle | None = None  # pending call of `_arrive`
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. The far end receives the data in a later loop iteration."""
@@ -385,6 +386,7 @@ class MemoryLink(BaseLink):
             self._wake_up = loop.call_at(due, self._arrive) if self._latency_s else loop.call_soon(self._arrive)
 
     def _arrive(self) -> None:
+        """Deliver the data that is due, and schedule the delivery of the rest."""
         self._wake_up = None
         if self._loop is None or not self._inbox:
             return

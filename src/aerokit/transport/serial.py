@@ -58,8 +58,8 @@ class SerialLink(BaseLink):
         super().__init__(str(LinkAddress("serial", device=device, baud=baud, options=options)))
         self._device, self._baud, self._rtscts = device, baud, rtscts
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._port: Any = None
-        self._transport: Any = None
+        self._port: Any = None  # pyserial's port
+        self._transport: Any = None  # pyserial-asyncio's transport; None while the link is not open
         self._outbox: Outbox | None = None
 
     @property
@@ -131,6 +131,7 @@ class SerialLink(BaseLink):
             self._loop.call_soon(self._lose, f"the device failed: {error.strerror or error}", error)
 
     def _release(self) -> None:
+        """See `BaseLink._release`. Closes the port when the remaining data is sent, at the latest after `LINGER_S`."""
         transport, self._transport = self._transport, None
         outbox, self._outbox = self._outbox, None
         if transport is None or self._loop is None:
@@ -146,6 +147,7 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _close_when_sent(self, transport: Any, deadline: float) -> None:
+        """Close the port when all data is sent or the deadline has passed. Called repeatedly until then."""
         assert self._loop is not None
         if self._waiting_to_be_sent(transport) and self._loop.time() < deadline:
             self._loop.call_later(_LINGER_STEP_S, self._close_when_sent, transport, deadline)
@@ -153,11 +155,13 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _waiting_to_be_sent(self, transport: Any) -> int:
+        """Return the number of unsent bytes in the transport and the driver; 0 if the device is gone."""
         with contextlib.suppress(OSError):
             return int(transport.get_write_buffer_size() + self._port.out_waiting)
         return 0
 
     def _close_port(self, transport: Any) -> None:
+        """Close the port without waiting for unsent data."""
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # The loop may be closed.
             # `_release` has already called this, but a call before the transport's first loop iteration has no effect.
@@ -172,6 +176,8 @@ class SerialLink(BaseLink):
 
 
 class _SerialProtocol(asyncio.Protocol):
+    """Passes the callbacks of the transport to the link and its outbox."""
+
     def __init__(self, link: SerialLink) -> None:
         self._link = link
 
@@ -265,7 +271,7 @@ class PtyLink(BaseLink):
         self._path = path
         self._ends: tuple[int, ...] = ()  # file descriptors: our end, the other end
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._has_symlink = False
+        self._has_symlink = False  # True while `_path` is a symbolic link that this link has made
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. Data that does not fit into the kernel's buffer is dropped."""
@@ -280,6 +286,7 @@ class PtyLink(BaseLink):
             self._drop(1)
 
     async def _connect(self) -> None:
+        """Create the pseudo-terminal and the symbolic link to its other end."""
         if sys.platform == "win32":
             raise OSError(errno.ENOSYS, "Windows has no pseudo-terminals")
         import tty
@@ -316,6 +323,7 @@ class PtyLink(BaseLink):
         self._deliver(data)
 
     def _release(self) -> None:
+        """See `BaseLink._release`. Closes both ends at once."""
         ends, self._ends = self._ends, ()
         if self._loop is not None and ends and not self._loop.is_closed():
             our_end, _ = ends

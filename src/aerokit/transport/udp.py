@@ -53,11 +53,12 @@ class _UdpLink(BaseLink):
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # None before the opening
         self._socket: socket.socket | None = None
         self._transport: asyncio.DatagramTransport | None = None  # used only on loops without add_reader
-        self._transport_owns_socket = False
+        self._transport_owns_socket = False  # True if asyncio reads and closes the socket
         self._has_more: Callable[[], object] = lambda: False  # returns a true value if a datagram can be read
+        # The receiver, if it wants to know when a burst has been read.
         self._burst_listener: BurstListener | None = None
 
     @property
@@ -104,6 +105,7 @@ class _UdpLink(BaseLink):
         self._lose(f"the socket failed: {error}" if error else "the socket was closed", error)
 
     def _release(self) -> None:
+        """See `BaseLink._release`. On loops without ``add_reader``, asyncio closes the socket a moment later."""
         sock, self._socket = self._socket, None
         transport, self._transport = self._transport, None
         loop = None if self._loop is None or self._loop.is_closed() else self._loop
@@ -124,6 +126,7 @@ class _UdpLink(BaseLink):
             self._burst_listener.burst_ended()
 
     def _read_burst(self) -> None:
+        """Read the waiting datagrams, at most `MAX_BURST_DATAGRAMS`."""
         for _ in range(MAX_BURST_DATAGRAMS):
             if self._socket is None:  # The receiver has closed the link in its callback.
                 return

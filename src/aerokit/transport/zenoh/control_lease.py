@@ -115,7 +115,7 @@ class ControlLease:
 
     def __init__(self) -> None:
         self._holder: str | None = None
-        self._received_at = 0.0
+        self._received_at = 0.0  # time of the last data of the holder
 
     def holder(self, now: float) -> str | None:
         if self._holder is not None and now - self._received_at > LEASE_TIMEOUT_S:
@@ -151,6 +151,7 @@ class ClientFilter:
         """Time of the last data of the client; set by the link that owns this filter."""
         self._client, self._lease = client, lease
         self._framer = _framer()
+        # Nonce of the program that uses this client name; None before its first datagram.
         self._nonce: int | None = None  # nonce of the program that uses this client name
         self._nonce_at = 0.0  # time of the last datagram from that program
         # Message name → time of the last notice, and the number of refused messages since then.

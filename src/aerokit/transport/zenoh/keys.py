@@ -177,6 +177,7 @@ class RefusalNotice(Snapshot):
 
     @classmethod
     def decode(cls, data: bytes) -> RefusalNotice | None:
+        """Decode a notice; return None if the data is not a valid one."""
         fields = _decode_object(data)
         if fields.get("event") != "order_refused":
             return None

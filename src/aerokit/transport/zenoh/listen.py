@@ -68,11 +68,12 @@ class ZenohListen(NetworkLink):
         self._lease = ControlLease()
         self._clients: dict[Peer, ClientFilter] = {}
         self._refused = 0  # number of frames refused from clients that have left
-        self._zenoh: Any = None
-        self._publisher: Any = None
-        self._may_have_rival = self._is_serving = False
+        self._zenoh: Any = None  # the imported module; None before the opening
+        self._publisher: Any = None  # sends to all clients; None while the link is not open
+        self._may_have_rival = False  # True if a liveliness token shows that the name may be in use
+        self._is_serving = False  # True from the end of the opening on
         self._rival_found = asyncio.Event()  # set when another vehicle side sends a beacon under this name
-        self._beacon_at = 0.0
+        self._beacon_at = 0.0  # time of the last own beacon
 
     @property
     def peers(self) -> tuple[Peer, ...]:
@@ -112,6 +113,7 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
+        """Open the session, and serve clients unless another program already serves this name."""
         self._queue = LoopQueue(call)
         self._session = await open_session(self.address, self._options, partial(self._find_rivals, self._queue))
         self._released.clear()
@@ -125,8 +127,12 @@ class ZenohListen(NetworkLink):
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # This function runs on a thread of its own. A liveliness token alone does not prove that the name is in use,
-        # because the token of a killed program remains for a while. A beacon proves it.
+        """Find out whether the name may be in use, and subscribe to beacons. Runs on a thread of its own.
+
+        A liveliness token alone does not prove that the name is in use, because the token of a killed program remains
+        for a while. A beacon proves it.
+        """
+
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -177,7 +183,9 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- receiving
 
     def _on_datagram(self, name: str, data: bytes, attachment: bytes) -> None:
-        client, now = self._add_client(name), self._now()
+        """Deliver the frames of a client that may be sent, and notify the client of refused ones."""
+        now = self._now()
+        client = self._add_client(name)
         if client is None:
             return
         client.received_at = now
@@ -197,6 +205,7 @@ class ZenohListen(NetworkLink):
             self._deliver(accepted, name)
 
     def _add_client(self, name: str) -> ClientFilter | None:
+        """Return the client of this name, new or known; None if there are too many."""
         client = self._clients.get(name)
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
@@ -207,7 +216,10 @@ class ZenohListen(NetworkLink):
         return client
 
     def _remove_silent_client(self) -> None:
-        # New clients must not be blocked by a client that has left without a notice of its liveliness token.
+        """Remove the client that has been silent longest, if this is long enough.
+
+        New clients must not be blocked by a client that has left without a notice of its liveliness token.
+        """
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
