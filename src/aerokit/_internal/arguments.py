@@ -110,6 +110,7 @@ class _Rules:
         self._var_positional = ""
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+        """Raise InvalidArgument if a value in a call of the function is not allowed."""
         rules = self._compute() if self._by_name is None else self._by_name
         names = self._positional
         if self._var_positional:

@@ -25,6 +25,7 @@ class _SnapshotType(type):
     """Turns annotated names into slots and generates ``__init__``. Needs ``from __future__ import annotations``."""
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
+        """Create the class. Its fields are those of its bases, followed by its own."""
         annotations: dict[str, str] = namespace.get("__annotations__", {})
         own_fields = tuple(field for field, annotation in annotations.items() if not annotation.startswith("ClassVar"))
         defaults = {field: value for base in bases for field, value in getattr(base, "_defaults", {}).items()}

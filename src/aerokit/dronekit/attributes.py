@@ -132,8 +132,8 @@ class VehicleAttributes(VehicleCore):
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
         core = self._dk
-        # Core.on() and Core.announce() return an object that holds the latest message of the type.
         self._location = Locations(self)
+        # Core.on() and Core.announce() return an object that holds the latest message of the type.
         core.on(m.Heartbeat, self._dk_on_heartbeat)
         self._dk_position = core.announce(m.GlobalPositionInt, "velocity")
         self._dk_vfr_hud = core.announce(m.VfrHud, "heading", "airspeed", "groundspeed")

@@ -137,6 +137,7 @@ class FlightMethods(VehicleAttributes):
             self._dk_take_off(float(alt))
 
     def _dk_take_off(self, altitude: float) -> BackgroundCall:
+        """Start the take-off order of this autopilot. ``altitude`` is in metres above home."""
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()

@@ -175,6 +175,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
+    """Return the parser for the command's own arguments, which end with the program."""
     parser = _Parser(
         prog=prog,
         usage=f"{prog} [-h] [--sim [OPTION ...]] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",
@@ -275,11 +276,12 @@ def _run_module(name: str, arguments: Sequence[str]) -> None:
 
 
 def _run_file(path: str, arguments: Sequence[str]) -> None:
+    """Run a program as ``python PATH ARGUMENTS`` does, and return when its main program has ended."""
     sys.argv[:] = [path, *arguments]
     if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
         runpy.run_path(path, run_name="__main__")
         return
-    # Does not use runpy, which removes the module `__main__` at the end, although threads may still need it.
+    # A file is not run by runpy, which removes the module `__main__` at the end, although threads may still need it.
     path = os.path.abspath(path)
     with io.open_code(path) as file:
         source = file.read()

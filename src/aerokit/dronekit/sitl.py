@@ -48,9 +48,10 @@ class ServedVehicle:
         self.speedup: float = speedup
         self.addresses: tuple[str, ...] = ()
         """Addresses in the simulator's form, such as ``tcpin:127.0.0.1:5760``."""
+        # Everything below is used by the thread, so the thread is started last.
         self._vehicle = simulated(kind, home=home)
         self._requested_addresses = tuple(addresses)
-        self._error: Exception | None = None
+        self._error: Exception | None = None  # error that ended the thread
         self._startup_ended = threading.Event()  # set when the vehicle is served, or when the start has failed
         self._loop = asyncio.new_event_loop()
         self._stop_requested = asyncio.Event()

@@ -74,6 +74,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
+        # None before initialize().
         self._dk_context: OpenContext[AsyncVehicle] | None = None
         self._dk_sync: sync.Vehicle | None = None
         self._dk_initializing = threading.Lock()

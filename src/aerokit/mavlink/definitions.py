@@ -278,6 +278,7 @@ def _parse_message(node: Element, origin: str) -> MessageDefinition:
 
 
 def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinition:
+    """Read one ``<field>`` element of a message. ``extension``: it is below ``<extensions/>``."""
     # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
@@ -303,6 +304,7 @@ def carries_bytes(message: str, field_name: str, kind: str) -> bool:
 
 
 def _parse_enum(node: Element, origin: str) -> EnumDefinition:
+    """Read one ``<enum>`` element. ``origin`` is the file that contains it."""
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):

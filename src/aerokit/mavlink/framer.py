@@ -72,12 +72,12 @@ class PythonFramer:
         """Frames of the last `receive` call that arrived after newer frames of their sender, and repeated frames."""
         self.foreign: list[Frame] = []
         """Frames of the last `receive` call that came from a second sender with the same ids."""
-        self._rest = b""
-        self._scan = _NEW_SCAN
-        self._unknown: list[bytes] = []
+        self._rest = b""  # data kept for the next call, because a frame may begin in it
+        self._scan = _NEW_SCAN  # what `_search` has found in `_rest` so far
+        self._unknown: list[bytes] = []  # frames of unknown messages, until `receive` returns them
         self._rows = dialect.rows
         self._extras = dialect.extras
-        self._limit = SourceLimit(MAX_SOURCES) if limit is None else limit
+        self._limit = SourceLimit(MAX_SOURCES) if limit is None else limit  # bounds the number of senders with counters
         self._limit.join(self.statistics)
         self._sources = self.statistics.by_key
 
@@ -273,7 +273,7 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        # An unknown frame was received, so its sequence number must not count as lost.
+        """Count a frame of an unknown message, and keep it if it is wanted."""
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -283,7 +283,7 @@ class PythonFramer:
         self.statistics.count_unknown(message_id & 0xFFFFFF)
         source = self._sources.get(key)
         if source is not None and source.expected & 0xFF == sequence:
-            source.skip(1)
+            source.skip(1)  # The frame was received, so its sequence number must not count as lost.
 
     def _count_skipped(self, begin: int, end: int, bad_crcs: list[int]) -> None:
         # Bytes outside frames are counted. Bytes that are kept are not counted yet, because they may become a frame.

@@ -244,6 +244,7 @@ def _dialects(preferred: ModuleType | None) -> Any:
 
 
 def _decoder_for(message_class: Any) -> Decoder:
+    """Return the function that decodes frames of one message to objects of pymavlink. Made once for each message."""
     received = _received_class(message_class)
     unpack = message_class.unpacker.unpack_from
     length = HEADER_LENGTH + message_class.unpacker.size

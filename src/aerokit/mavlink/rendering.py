@@ -84,6 +84,7 @@ def _enum_doc(enum: EnumDefinition) -> list[str]:
 
 
 def _field_doc(field: FieldDefinition) -> str:
+    """Return the docstring of a field: its description, followed by type, unit and values."""
     parts = [_sentence(field.description)] if field.description else []
     if field.array_length:
         parts.append(f"Type: {field.type}[{field.array_length}].")
@@ -115,6 +116,7 @@ def _sentence(text: str) -> str:
 
 
 def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
+    """Return the lines of a docstring with these paragraphs."""
     texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
     if texts and texts[-1].endswith('"'):  # Without a space, this quotation mark would join the closing quotes.
         texts[-1] += " "
@@ -202,6 +204,7 @@ def _default(field: FieldDefinition) -> str:
 
 
 def _render_init(message: MessageDefinition) -> list[str]:
+    """Return the lines of a message's ``__init__`` method."""
     # A parameter without a default that follows one with a default must be keyword-only in Python, i.e. follow a "*".
     arguments: list[str] = []
     optional = False
@@ -268,6 +271,7 @@ def _text_expression(value: str) -> str:
 
 
 def _render_encode(message: MessageDefinition) -> list[str]:
+    """Return the lines of a message's ``encode`` method."""
     arguments: list[str] = []
     for field in message.wire_fields:
         value = f"self.{field.attribute}"

@@ -220,7 +220,10 @@ def _return_item(place: Position) -> MissionItem:
 
 
 def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
-    # On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
+    """Return the polygon whose vertices begin at item ``first``. RemoteProtocolError if vertices are missing.
+
+    On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
+    """
     item = items[first]
     count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0  # A polygon has at least 3 vertices.
     vertices = items[first : first + count]

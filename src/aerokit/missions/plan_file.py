@@ -193,6 +193,7 @@ def _read_mission(value: JsonValue) -> Mission:
 
 
 def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
+    """Return firmware type, vehicle type, cruise speed and hover speed. Missing values get their defaults."""
     defaults = _numbers(Plan())
     default_firmware, default_vehicle, default_cruise, default_hover = defaults
     if mission is None:
@@ -299,6 +300,7 @@ def _numbers(plan: Plan) -> tuple[int, int, float, float]:
 
 
 def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> None:
+    """Write the mission of a plan into a document. Members that are unchanged since ``old`` are kept as they are."""
     mission = document.setdefault("mission", {})
     if not mission:
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
@@ -316,6 +318,7 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
 
 
 def _fence_members(fence: Fence) -> dict[str, Any]:
+    """Return the members of ``geoFence``. InvalidArgument if the return point's altitude cannot be stored."""
     members: dict[str, Any] = {
         "version": 2,
         "circles": [

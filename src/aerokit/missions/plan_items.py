@@ -198,6 +198,7 @@ def _jump_ids(
 
 
 def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
+    """Read one simple item. ``ids`` maps the file's jump ids to indices of items."""
     command, frame = value["command"].integer(0, 0xFFFF), value["frame"].integer(0, 0xFF)
     params = value["params"].elements(7)
     param1, param2, param3, param4, latitude, longitude, z = (param.number(null=True) for param in params)

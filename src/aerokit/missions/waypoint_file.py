@@ -128,6 +128,7 @@ class _Row:
         return Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None
 
     def item(self) -> MissionItem:
+        """Return the item in this line. FileFormatError for values that are invalid or out of range."""
         has_degrees = xy_scale(self.command, self.frame) == DEGREE_SCALE
         latitude = self._number("latitude", 90.0 if has_degrees else math.inf, may_be_nan=True)
         longitude = self._number("longitude", 180.0 if has_degrees else math.inf, may_be_nan=True)
@@ -174,6 +175,7 @@ def _home_row(home: Position | None) -> str:
 
 
 def _item_row(item: MissionItem, index: int) -> str:
+    """Return the line for one item. InvalidArgument for numbers that the file cannot store."""
     integers = (index, 0, int(item.frame), int(item.command))
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):

@@ -201,6 +201,7 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
+    """Yield the parameters in a downloaded file. ``index`` is the index of the first one."""
     position = _skip_padding(data, HEADER.size)
     previous_name = b""
     while position < len(data):

@@ -163,7 +163,7 @@ class _Parser:
         self.text = text
 
     def parse(self) -> LinkAddress:
-        """Parse the whole text: an address with a scheme, a pseudo-terminal, or a bare device, path or host and port."""
+        """Parse the whole text: an address with a scheme, ``pty``, or a bare device, path, or host and port."""
         text = self.text.strip()
         if not text:
             raise self.error("it is empty")
