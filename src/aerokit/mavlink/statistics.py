@@ -112,7 +112,7 @@ class SourceStatistics(SourceFields):
         if ahead < _HALF:
             self._on_gap(ahead, sequence, now)
             return IN_ORDER
-        if self._was_missing(256 - ahead):  # A frame that counted as lost has arrived late.
+        if self._consume_missing(256 - ahead):  # A frame that counted as lost has arrived late.
             self._unreceived -= 1
             self.lost -= 1
             return LATE
@@ -148,7 +148,7 @@ class SourceStatistics(SourceFields):
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
-    def _was_missing(self, behind: int) -> bool:
+    def _consume_missing(self, behind: int) -> bool:
         """Return True if the frame ``behind`` numbers before `expected` counted as lost, and no longer count it so."""
         self._missing, self._missing_base = self._shifted(0), self.expected
         bit = 1 << behind - 1
@@ -206,7 +206,7 @@ class SourceStatistics(SourceFields):
             other_count = self._other_count if is_other_longer else 0
             self._swap(sequence, now, count, other_count)
             return IN_ORDER
-        if is_other_longer and self._was_missing((self.expected - sequence) & 0xFF or 256):
+        if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
             # The frame is in the gap before the current stream, which was counted as lost.
             self.lost -= 1
             self._skipped_over -= 1

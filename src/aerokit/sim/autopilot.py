@@ -119,6 +119,7 @@ class ReceivedCorrections:
         return self._vehicle.now - self._received_at < _CORRECTIONS_MAX_AGE_S
 
     def _on_fragment(self, message: GpsRtcmData) -> None:
+        """Store a fragment of an RTCM message, and assemble the message when all fragments are there."""
         data = bytes(message.data[: message.len])
         is_fragmented = message.flags & 1
         fragment_id = message.flags >> 1 & 3

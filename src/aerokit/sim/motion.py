@@ -181,14 +181,16 @@ class Motion:
         self.yaw_rate: float = 0.0
         self.impact_speed_m_s: float = 0.0
         """Vertical speed at the last touchdown."""
-        self._gust_north = self._gust_east = 0.0
-        self._jerk_m_s3 = math.inf
+        # Present wind in addition to the mean wind, in m/s.
+        self._gust_north = 0.0
+        self._gust_east = 0.0
+        self._jerk_m_s3 = math.inf  # present change of the acceleration; infinite before the first step
         # The target velocity (north, east, down), or the target acceleration if `_target_is_acceleration` is True.
         self._target = (0.0, 0.0, 0.0)
         self._target_is_acceleration = False
         # The target roll and pitch, which replace the horizontal components of `_target`; None without such a target.
         self._target_lean: tuple[float, float] | None = None
-        self._wanted_yaw: float | None = None
+        self._wanted_yaw: float | None = None  # None: turn with `_wanted_yaw_rate`
         self._wanted_yaw_rate = 0.0
 
     @property

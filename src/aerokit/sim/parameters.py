@@ -252,7 +252,7 @@ class _Reader(FileHandle):
         self._block = block or 0  # The block size; 0 means that the first read determines the size.
         # Only PX4 has a fixed block size. PX4 does not divide a value and its default between two blocks.
         self._whole_defaults = block is not None
-        self._content: bytes | None = None
+        self._content: bytes | None = None  # the whole file; None before the first read
 
     @property
     def content(self) -> bytes:
@@ -262,6 +262,7 @@ class _Reader(FileHandle):
         return self._content
 
     def _packed(self) -> bytes:
+        """Encode the file, as far as the path requests it."""
         try:
             return pack_for_download(
                 (self._parameters.row(name).as_parameter() for name in self._parameters.names),

@@ -69,19 +69,19 @@ class SimulatorServer:
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
         self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # None before the `async with` block
         # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
         self._end_source: Callable[[], None] | None = None
-        self._started_at = 0.0
-        self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
+        self._started_at = 0.0  # loop time at the start
+        self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)  # simulated time at the start
         self._ports: list[_Port] = []
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.TimerHandle | None = None  # None while no event is scheduled
         self._timer_due = 0.0  # simulated time of the event that the timer is for
         self._timer_at = 0.0  # loop time at which the timer fires
-        self._exit = AsyncExitStack()
+        self._exit = AsyncExitStack()  # closes the links at the end of the block
         # The task that entered the `async with` block. A failing vehicle cancels this task.
         self._owner: asyncio.Task[Any] | None = None
-        self._cancels_owner = False
+        self._cancels_owner = False  # True if the owner was cancelled because of `failure`
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
         """Called with every datagram: simulated time, bytes, and True if a vehicle has sent the datagram."""
         self.failure: Exception | None = None
@@ -100,6 +100,7 @@ class SimulatorServer:
         return self._now_at_start + (self._loop.time() - self._started_at) * self._speedup
 
     async def __aenter__(self) -> Self:
+        """Open the links and run the vehicles until the present time. The links are closed again if a step fails."""
         if self._loop is not None:
             raise BusyError("this SimulatorServer was already started once; create a new SimulatorServer")
         self._loop = asyncio.get_running_loop()
@@ -114,7 +115,7 @@ class SimulatorServer:
                 if add_source is not None:
                     self._end_source = add_source(self._next_loop_time, self._on_due)
                 self._run(self.now)
-                self._exit = opening.pop_all()
+                self._exit = opening.pop_all()  # From now on, `__aexit__` closes the links instead of this block.
         except BaseException as error:
             self._end(error)
             raise
@@ -233,6 +234,7 @@ class SimulatorServer:
             port.hang_up()
 
     def _schedule(self) -> None:
+        """Set the timer for the next event of any vehicle, unless it is set already."""
         loop = self._loop
         if loop is None or self._end_source is not None:  # An event source needs no timer.
             return

@@ -101,11 +101,11 @@ class CompassCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turns_s: float = 30.0
-        self._compass_mask = 0
-        self._started_at = math.inf
-        self._saves_at_once = False
-        self._progress_compass = 0
-        self._reported_compass = 0
+        self._compass_mask = 0  # bit for each compass that is calibrated; 0: none
+        self._started_at = math.inf  # infinite: not started
+        self._saves_at_once = False  # True if the result needs no DO_ACCEPT_MAG_CAL
+        self._progress_compass = 0  # compass of the last progress message
+        self._reported_compass = 0  # compass of the last result message
 
     def reset(self) -> None:
         self._compass_mask = 0
@@ -229,6 +229,7 @@ class Calibrations:
         }
 
     def _calibrate(self, command: ReceivedCommand) -> int | CommandProgress:
+        """Handle PREFLIGHT_CALIBRATION. Only one kind of calibration is done, even if several are requested."""
         vehicle = self._vehicle
         if vehicle.motors.is_armed:
             vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
@@ -245,6 +246,7 @@ class Calibrations:
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
+        """Calibrate the accelerometers, or accept the present values, as parameter 5 (``command.x``) says."""
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")

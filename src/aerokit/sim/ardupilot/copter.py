@@ -184,6 +184,7 @@ class SimulatedCopter(CopterHost):
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = CopterFence
 
     def make_commands(self) -> dict[int, CommandHandler]:
+        """Return the handlers of the commands that ArduCopter knows."""
         return {
             **common_commands(self),
             MavCmd.NAV_TAKEOFF: self._take_off,
@@ -229,6 +230,7 @@ class SimulatedCopter(CopterHost):
         return flags
 
     def move(self, dt: float) -> None:
+        """Move by ``dt`` seconds, and detect the landing."""
         motion = self.motion
         was_on_ground = motion.is_on_ground
         motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
@@ -260,6 +262,7 @@ class SimulatedCopter(CopterHost):
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
+        """Handle DO_CHANGE_SPEED, which sets a speed limit of the present mode."""
         mode = self.mode
         speed = command.param2
         if not speed > 0:  # also refuses NaN

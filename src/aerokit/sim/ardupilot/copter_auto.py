@@ -64,10 +64,10 @@ class _CircleLeg:
         self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0  # 0 selects the parameter.
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - self._centre_north, motion.east - self._centre_east
-        self._angle = math.atan2(east, north)
-        self._turned_rad = 0.0
+        self._angle = math.atan2(east, north)  # bearing of the point to follow, seen from the centre
+        self._turned_rad = 0.0  # angle flown so far, in both directions positive
         self._reported_turns = -1  # Not even turn 0 is reported yet.
-        self._approach: _FlyLeg | None = None
+        self._approach: _FlyLeg | None = None  # None once the copter is on the circle
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
         if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - self._centre_down) > _ON_CIRCLE_M:
             self._approach = _FlyLeg(auto, self._point(), stops=True)
@@ -77,6 +77,7 @@ class _CircleLeg:
         return self._approach is None and self._turned_rad / math.tau >= self._turns
 
     def update(self, dt: float) -> None:
+        """Fly by ``dt`` seconds: first to the circle, then around it."""
         if self._approach is not None:
             self._approach.update(dt)
             if self._approach.is_complete:
@@ -178,10 +179,12 @@ class CopterAuto(MissionMode):
         self.climb: float = 0.0  # Maximum climb rate in m/s.
         self.descent: float = 0.0  # Maximum sink rate in m/s.
         self._leg: _Leg | None = None  # None: hold the position.
-        self._last_reached = 0
+        self._last_reached = 0  # index of the command to report in MISSION_ITEM_REACHED; 0: none
         self._reached_at: float | None = None  # None until the copter reaches the waypoint.
-        self._condition_started_at = self._delay_until = 0.0
-        self._list_version = -1
+        self._condition_started_at = 0.0
+        self._delay_until = 0.0
+        self._list_version = -1  # version of the command list from which `_upcoming` was read
+        # The next navigation commands, which decide how the current leg ends.
         self._upcoming: tuple[MissionCommand, ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys(_TAKE_OFFS, self._take_off),
@@ -250,6 +253,7 @@ class CopterAuto(MissionMode):
         self._check_upcoming()  # records the commands that the next call compares
 
     def update(self, dt: float) -> None:
+        """Continue the mission, and fly the leg of the current command for ``dt`` seconds."""
         self.start_if_waiting()
         if not self.is_waiting:
             if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
@@ -308,6 +312,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.hold()
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
+        """Return True if a running command is complete. Called at each tick."""
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
             return self._has_stayed(index, item.param1)

@@ -229,6 +229,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self._lose_estimator()
 
     def _lose_estimator(self) -> None:
+        """Start the failsafe of the estimator: an armed copter lands, unless its mode needs no position."""
         copter = self.vehicle
         self.warn("EKF variance", MavSeverity.CRITICAL)
         self.has_estimator_failed: bool = True
@@ -271,6 +272,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return True
 
     def _execute(self, action: int) -> None:
+        """Execute a failsafe action: try its modes in order, until the copter accepts one."""
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
         if action == _AUTO:  # Landing sequences are not simulated, so the search of the firmware fails.

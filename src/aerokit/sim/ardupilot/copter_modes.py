@@ -191,6 +191,7 @@ class CopterTakeOff:
         self.is_complete: bool = False
 
     def update(self, climb_m_s: float) -> None:
+        """Climb for one tick. The take-off is complete when the copter hovers at the target."""
         copter, motion = self._copter, self._copter.motion
         _, _, target_down = self.target
         copter.motors.spool_up_requested = True
@@ -238,6 +239,7 @@ class CopterPilotedMode(CopterModeBase):
         return math.copysign(min(1.0, share) * self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0, stick)
 
     def update(self, dt: float) -> None:
+        """Continue a take-off, or follow the sticks."""
         copter = self.vehicle
         if self._take_off is not None:
             self._take_off.update(copter.speed_limit("PILOT_SPEED_UP"))
@@ -327,6 +329,7 @@ class CopterRtl(CopterModeBase):
         self.speed: float = 0.0
 
     def enter(self, *, force: bool) -> bool:
+        """Start the return with a climb. Never refused."""
         copter = self.vehicle
         self._phase = "climb"
         self.is_landing = False
@@ -422,6 +425,7 @@ class CopterSmartRtl(CopterModeBase):
         return self._way_back[0] if self._way_back else None
 
     def update(self, dt: float) -> None:
+        """Fly to the next point of the way back, or land at its end."""
         copter = self.vehicle
         if copter.is_landed or not self._way_back:
             self.is_landing: bool = True

@@ -268,6 +268,7 @@ class ArduPilotArming(Generic[HostT]):
         return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
 
     def _check(self) -> None:
+        """Run the arming checks, and report failures if a report is due. Called once a second."""
         self._apply_requirement()
         vehicle = self.vehicle
         if vehicle.motors.is_armed:  # The checks run only while disarmed.

@@ -152,10 +152,11 @@ class ArduPilotFence(Generic[HostT]):
         # True if the last command about the lower limit enabled the limit, False if it disabled it; None without a
         # command.
         self._floor_enabled_by_command: bool | None = None
-        self._recovering_since = -math.inf
-        self._reported_at = self._checked_at = -math.inf
+        self._recovering_since = -math.inf  # time of the last `recover_by_hand`
+        self._reported_at = -math.inf  # time of the last FENCE_STATUS about a breach
+        self._checked_at = -math.inf
         self._zones = FenceZones((), vehicle.frame)
-        self._zone_items: list[object] = []
+        self._zone_items: list[object] = []  # the items from which `_zones` was made
 
     @property
     def configured(self) -> int:
@@ -313,6 +314,7 @@ class ArduPilotFence(Generic[HostT]):
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
     def _record_breach(self, kind: int) -> None:
+        """Count a new breach of this kind of fence. FENCE_STATUS reports the first of several."""
         vehicle = self.vehicle
         self.breach_count += 1
         was_any_breached = self.breached != 0

@@ -104,6 +104,7 @@ class ArduPilotGimbal:
 
     @property
     def target(self) -> MountTarget:
+        """The direction that the present mode commands."""
         if self.mode == MavMountMode.RC_TARGETING:  # The gimbal's sticks always rest in the middle.
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
@@ -243,6 +244,7 @@ class ArduPilotGimbal:
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
+        """Return GIMBAL_DEVICE_ATTITUDE_STATUS; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         roll, pitch, yaw = map(math.radians, self.angles)
@@ -272,6 +274,7 @@ class ArduPilotGimbal:
         return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
     def manager_status(self) -> m.GimbalManagerStatus | None:
+        """Return GIMBAL_MANAGER_STATUS; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK

@@ -144,6 +144,7 @@ class ArduPilotMissionServer(MissionServer):
         return self._lists[mission_type].item(seq)
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
+        """Return the message that answers a request: MISSION_ITEM_INT or MISSION_ITEM."""
         client, kind = sender_of(request), request.mission_type
         # Reproduces a bug of the firmware, which compares the command of the item (instead of its index) with the index
         # of the current item.
@@ -167,6 +168,7 @@ class ArduPilotMissionServer(MissionServer):
         return super()._begin(message, channel, first, end)
 
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
+        """Start the upload of some items of a list."""
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
         # `end` may be equal to the number of items, because the item with this index is appended to the list.
@@ -198,6 +200,7 @@ class ArduPilotMissionServer(MissionServer):
         super()._time_out(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
+        """Handle an item of an upload, or one that is a target in GUIDED."""
         item = _with_integer_position(message)
         kind = message.mission_type
         if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
@@ -230,6 +233,7 @@ class ArduPilotMissionServer(MissionServer):
         """Do nothing: ArduPilot ignores this message."""
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
+        """Handle MISSION_CLEAR_ALL. A list that another client uploads is not cleared."""
         kind, client = request.mission_type, sender_of(request)
         upload = self._uploads.get(kind)
         result: int = Result.UNSUPPORTED

@@ -269,12 +269,13 @@ class SmartPath:
 
     def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
         self._vehicle = vehicle
-        self._only_armed = only_armed
+        self._only_armed = only_armed  # True: record only while the vehicle is armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
-        # Times of the last good position, the last recorded point and the last warning.
-        self._good_at = self._saved_at = self._warned_at = -math.inf
-        self._is_started = False
+        self._good_at = -math.inf  # time of the last good position
+        self._saved_at = -math.inf  # time of the last recorded point
+        self._warned_at = -math.inf
+        self._is_started = False  # True after the first `reset`
         self.is_active: bool = False  # True while SMART_RTL is possible.
 
     def __len__(self) -> int:

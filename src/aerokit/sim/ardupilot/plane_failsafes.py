@@ -103,6 +103,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._end_short()
 
     def _start_short(self, action: int) -> None:
+        """Start the short failsafe of the radio. Some modes continue, depending on the action."""
         plane = self.vehicle
         self.state, self._short_since = _SHORT, plane.now
         mode = self._mode_before = plane.mode.number
@@ -124,6 +125,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn(f"Flight mode {plane.mode.name} restored", MavSeverity.INFO)
 
     def _check_long(self) -> None:
+        """Start the long failsafe if the radio or the ground station is lost long enough, or end it."""
         if self.state in (_LONG, _GCS):
             self._check_end_of_long()
             return
@@ -250,6 +252,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             self.caused_mode = False
 
     def act(self, new_breaches: int) -> None:
+        """Execute FENCE_ACTION after a new breach."""
         plane = self.vehicle
         if self.caused_mode:  # The plane already returns from an earlier breach.
             return

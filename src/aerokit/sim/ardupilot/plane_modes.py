@@ -84,8 +84,9 @@ class PlaneLanding:
         self.point: Ned = point
         self._fly_to_first = start  # Place to fly to before the approach; None once the approach has begun.
         self._approach_start: Ned = plane.wing.place
-        self._is_flaring = self._is_distance_reported = False
-        self._stopped_at = math.nan
+        self._is_flaring = False
+        self._is_distance_reported = False
+        self._stopped_at = math.nan  # NaN until the plane has stopped after the landing
 
     def update(self, dt: float) -> None:
         plane, wing = self._plane, self._plane.wing
@@ -187,6 +188,7 @@ class PlanePilotedMode(PlaneModeBase):
     has_manual_throttle = True
 
     def update(self, dt: float) -> None:
+        """Follow the sticks. On the ground, the plane rolls out with a low throttle, and takes off otherwise."""
         plane, wing = self.vehicle, self.vehicle.wing
         limits = wing.wing_limits
         throttle_pulse = plane.rc[RC_THROTTLE]
@@ -368,6 +370,7 @@ class PlaneAutoland(PlaneNavigatingMode):
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
+        """Plan the landing. Refused on the ground, or if the direction of the take-off is unknown."""
         plane = self.vehicle
         if plane.mode is self and plane.is_landed:  # Arming enters the current mode again.
             return True

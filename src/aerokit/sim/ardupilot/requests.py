@@ -142,6 +142,7 @@ class ArduPilotMessageRequests:
         channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)
 
     def _on_group(self, request: m.RequestDataStream, channel: Channel) -> None:
+        """Handle REQUEST_DATA_STREAM for one group of messages or for all groups."""
         if request.start_stop not in (0, 1):
             return
         rate = request.req_message_rate if request.start_stop else 0

@@ -170,6 +170,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.change_to(*_MODES.get(action, ()))
 
     def _check_estimator(self) -> None:
+        """Act if an armed rover has had no position for a while, and report when the position is back."""
         rover = self.vehicle
         is_lost = rover.is_armed and not rover.navigation.has_position
         lost_for = self._position_lost.seconds(is_lost, rover.now)

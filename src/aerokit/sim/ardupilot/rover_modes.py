@@ -106,6 +106,7 @@ class _Rtl(_Mode):
         return self._path[0] if self._path else None
 
     def update(self, dt: float) -> None:
+        """Drive to the next place, or stay at the last one."""
         rover = self.vehicle
         if not self._path:
             rover.motion.stop()
@@ -217,6 +218,7 @@ class RoverGuided(_Mode):
         self._target_at = self.vehicle.now
 
     def update(self, dt: float) -> None:
+        """Drive to the place or follow the velocity that was commanded last; otherwise stop."""
         rover, target = self.vehicle, self._target
         if self._place is not None:
             self._drive_to(self._place)
@@ -241,6 +243,7 @@ class RoverGuided(_Mode):
             rover.motion.drive_to(north, east, speed=self.speed)
 
     def _follow(self, target: GuidedTarget) -> None:
+        """Drive with the commanded speed and turn rate, or in the commanded direction."""
         north, east, _ = target.velocity or (0.0, 0.0, 0.0)
         motion = self.vehicle.motion
         speed = min(self.vehicle.waypoint_speed, math.hypot(north, east))

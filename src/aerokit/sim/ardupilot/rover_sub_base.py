@@ -95,6 +95,10 @@ class GuidedSetpoints:
             self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
 
     def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
+        """Convert a set-point to a target of GUIDED. ``point`` is its position in the world frame.
+
+        Set-points with an acceleration, with a number that is not finite, or with too few parts are ignored.
+        """
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
             return
@@ -259,6 +263,7 @@ class RoverSubAuto(MissionMode):
         self.finish()
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
+        """Return True if a running command is complete. Called at each tick."""
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
             # NAV_LOITER_UNLIM never ends, but its arrival is reported.
@@ -286,6 +291,7 @@ class RoverSubAuto(MissionMode):
         return now - self._reached_at >= delay_s
 
     def _go(self, item: MissionItem) -> None:
+        """Travel to the position of a command. The vehicle stops there unless another waypoint follows."""
         vehicle = self.vehicle
         current: Ned = self._place or vehicle.motion.place
         self._reached_at = None

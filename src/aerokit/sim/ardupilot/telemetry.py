@@ -197,6 +197,7 @@ def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
 
 
 def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
+    """Build BATTERY_STATUS."""
     battery = vehicle.battery
     voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)  # The first cell has the whole voltage.
     charge = MavBatteryChargeState.LOW if vehicle.failsafes.battery_is_low else MavBatteryChargeState.OK
@@ -242,6 +243,7 @@ _FULL_THROTTLE_RPM, _ESC_PACKETS_PER_S, _ESC_TEMPERATURE_C = 15000, 100, 32
 
 
 def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
+    """Build ESC_TELEMETRY_1_TO_4. Outputs without a motor report zeros."""
     has_motor = [index in _MOTORS[vehicle.KIND] for index in range(4)]
 
     def per_motor(value: int) -> list[int]:

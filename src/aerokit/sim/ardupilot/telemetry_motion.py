@@ -113,6 +113,7 @@ def _int16(value: float) -> int:
 
 
 def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
+    """Build HIGHRES_IMU."""
     motion = vehicle.motion
     x, y, z = (value * (GRAVITY_M_S2 / 1000.0) for value in _acceleration(vehicle))
     # The firmware multiplies milligauss by 1000, although the fields are in gauss (GCS_Common.cpp).
@@ -156,6 +157,7 @@ _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which th
 
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
+    """Build GLOBAL_POSITION_INT. Latitude and longitude are 0 before the first position, as in the firmware."""
     motion, nav = vehicle.motion, vehicle.navigation
     time = vehicle.time_boot_ms
     place = nav.position  # None until the estimator knows the position
@@ -180,6 +182,7 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
 
 
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
+    """Build GPS_RAW_INT."""
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
         return _gps_without_fix(GpsFixType.NO_GPS, dilution=65535, satellites=0)  # 65535: unknown
@@ -266,6 +269,7 @@ def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
 
 
 def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
+    """Build NAV_CONTROLLER_OUTPUT, which is sent only in modes that navigate."""
     if not _is_navigating(vehicle):
         return None
     motion, target = vehicle.motion, vehicle.mode.destination

@@ -133,6 +133,7 @@ class Px4Vehicle(Px4Host):
         return Px4Mission(self)
 
     def _reset(self) -> None:
+        """Set the state after a power-on."""
         self.is_ready: bool = False
         self.is_armed: bool = False
         self.is_landed: bool = True
@@ -160,6 +161,7 @@ class Px4Vehicle(Px4Host):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
+        """Create the parts that receive messages. They exist once, also after a reboot."""
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
         self.external: Px4External = Px4External(self)
@@ -250,6 +252,7 @@ class Px4Vehicle(Px4Host):
         self.text_links.send(chunks)
 
     def on_armed(self) -> None:
+        """Start the mode that was entered while disarmed, and set home."""
         self.is_armed = True
         self._has_flown = False
         self._landed_at = math.nan

@@ -49,6 +49,7 @@ _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
+    """Return the handlers of the commands that have no object of their own."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None: send no acknowledgement.
     handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
@@ -109,6 +110,7 @@ _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
+    """Return the handlers of all commands."""
     flight = _Flight(px4)
     return {
         **message_requests(px4),
@@ -151,6 +153,7 @@ def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | N
 
 
 def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
+    """Enter a mode, given as MAV_MODE_FLAG bits and PX4's main and sub mode. Return a MAV_RESULT."""
     if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
         px4.send_text(MavSeverity.CRITICAL, "Unsupported base mode")
         return MavResult.TEMPORARILY_REJECTED
@@ -227,6 +230,7 @@ class _Flight:
         return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
+        """Handle MISSION_START: select the first item, enter MISSION, and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
@@ -339,6 +343,7 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def set_home(self, command: ReceivedCommand) -> int:
+        """Handle DO_SET_HOME, for the current place or the place in the command."""
         px4, motion = self._px4, self._px4.motion
         uses_current_place = command.param1 > 0.5
         if uses_current_place:
@@ -406,6 +411,7 @@ class _Requests:
         return MavResult.ACCEPTED
 
     def request_message(self, command: ReceivedCommand) -> int:
+        """Handle REQUEST_MESSAGE. Some messages have a second parameter."""
         message_id = _number(command.param1)
         if message_id == m.MessageInterval.ID:
             return self._send_interval(_number(command.param2), command)

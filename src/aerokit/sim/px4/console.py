@@ -64,9 +64,12 @@ class Px4LogStream:
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4
+        # (system id, component id) of the client; None while no log is streamed.
         self._station: tuple[int, int] | None = None
         self._channel: Channel | None = None
-        self._sequence = self._tries = self._acknowledged = 0
+        self._sequence = 0  # number of the next block
+        self._tries = 0  # how often this block was sent
+        self._acknowledged = 0  # number of definition blocks that were acknowledged
         px4.on(m.LoggingAck, self._on_ack)
 
     def start(self, command: ReceivedCommand) -> int:

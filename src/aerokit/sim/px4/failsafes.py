@@ -163,16 +163,16 @@ class Px4Failsafes:
         self.battery_state = MavBatteryChargeState.OK
         """MAV_BATTERY_CHARGE_STATE, which never improves while the vehicle is armed."""
         self.has_station: bool = False  # True while heartbeats of a ground station are received.
-        self._station_at = -math.inf
-        self._had_manual_control = False
+        self._station_at = -math.inf  # time of the last heartbeat of a ground station
+        self._had_manual_control = False  # True once sticks were received since arming
         self._position_at = -math.inf  # Time at which the estimator had a position last.
         self._battery_at_arming = MavBatteryChargeState.OK
         self._reported_battery_level = MavBatteryChargeState.OK
-        self._breaches: list[str] = []
+        self._breaches: list[str] = []  # texts of the present breaches of the fence
         # Actions by cause. A cause that has ended stays in this dictionary while its action lasts.
         self._active: dict[str, FailsafeAction] = {}
         self._failing: frozenset[str] = frozenset()  # The causes that exist at present.
-        self._holds_until = -math.inf
+        self._holds_until = -math.inf  # end of the delay in which the vehicle holds instead of returning or landing
         self._is_overridden = False  # True after the user has changed the mode during a failsafe.
 
     def listen(self) -> None:
@@ -372,6 +372,7 @@ class Px4Failsafes:
         return worst
 
     def _execute(self, action: FailsafeAction) -> None:
+        """Start an action that differs from the present one, or end the failsafe (`Action.NONE`)."""
         if action == self.action:
             return
         px4, previous, self.action = self._px4, self.action, action

@@ -40,6 +40,7 @@ class Px4Orbit:
         return True
 
     def update(self) -> None:
+        """Fly along the circle for one tick, and back to it if the vehicle is off the circle."""
         motion = self._px4.motion
         middle_north, middle_east = self.middle
         north, east = motion.north - middle_north, motion.east - middle_east
@@ -138,6 +139,7 @@ class Px4Flight:
         self.target = motion.place
 
     def update(self) -> None:
+        """Fly for one tick as the present mode commands."""
         vehicle = self._vehicle
         mode = vehicle.mode
         self.lifts_off = (
@@ -177,6 +179,7 @@ class Px4Flight:
             vehicle.leave_ground()
 
     def _take_off(self) -> None:
+        """Climb to the target, with a rate that grows at first. Afterwards, hold there."""
         vehicle = self._vehicle
         ramp_duration_s = max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])  # The parameter may be 0.
         ramp = (vehicle.now - self._ramp_began_at) / ramp_duration_s
@@ -252,6 +255,7 @@ class Px4Flight:
         vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after the text of the command.
 
     def _return(self) -> None:
+        """Continue the phase of the return: climb, fly to the destination, land."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         if self._phase == "land":
             self.descend()

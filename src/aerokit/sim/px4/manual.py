@@ -64,6 +64,7 @@ class Px4Sticks:
             self._move(roll, pitch, yaw, throttle)
 
     def _move(self, roll: float, pitch: float, yaw: float, throttle: float) -> None:
+        """Store new stick positions, and report how far the sticks have moved."""
         previous = (self.roll, self.pitch, self.yaw, self.throttle)
         were_fresh = self.are_fresh
         self.roll = roll
@@ -127,6 +128,7 @@ class Px4ManualFlight:
         return self._thrust > 1.0
 
     def update(self) -> None:
+        """Follow the sticks for one tick, as the present manual mode interprets them."""
         px4, sticks = self._px4, self._px4.sticks
         max_rate = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
         px4.motion.limits.turn_rate_rad_s = max_rate

@@ -156,6 +156,7 @@ class Px4MissionServer(MissionServer):
         self._px4.send(m.MissionCount(*link.client, link.end, kind, self.id(kind)), link.channel)
 
     def _send_item(self, link: _Link, seq: int) -> None:
+        """Send the item ``seq`` to the client of a link, in the kind of message that it requested."""
         item = self.item(link.mission_type, seq)
         assert item is not None
         link.requested_at = self._px4.now
@@ -303,6 +304,7 @@ class Px4MissionServer(MissionServer):
             self._answer(link, Result.ERROR)
 
     def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
+        """Store an item of an upload. Return a MAV_MISSION_RESULT."""
         link = self._link(upload.channel)
         item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)

@@ -43,12 +43,15 @@ class Px4Offboard:
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
         self.updated_at: float = -math.inf
+        # A component that is not commanded is NaN.
         self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3
-        self._yaw = self._yaw_rate = math.nan
+        self._yaw = math.nan
+        self._yaw_rate = math.nan
+        # Target attitude and body rates of SET_ATTITUDE_TARGET; None without such a target.
         self._attitude: tuple[float, float, float] | None = None
         self._body_rates: tuple[float, float, float] | None = None
-        self._flown_at = 0.0
-        self._thrust = 0.0
+        self._flown_at = 0.0  # time of the last call of `fly`
+        self._thrust = 0.0  # 0 to 1, with `_attitude`
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
@@ -86,6 +89,7 @@ class Px4Offboard:
             self._warn("SET_POSITION_TARGET_LOCAL_NED invalid")
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_GLOBAL_INT."""
         if target.coordinate_frame not in _GLOBAL_FRAMES:
             frame = target.coordinate_frame
             self._warn(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
@@ -118,6 +122,7 @@ class Px4Offboard:
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
+        """Handle SET_ATTITUDE_TARGET, which contains an attitude or body rates."""
         motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
             if self._attitude is None or self._body_rates is None:  # Rates start from the present attitude.
@@ -156,6 +161,7 @@ class Px4Offboard:
             vehicle.switch_to(OFFBOARD)
 
     def fly(self) -> None:
+        """Follow the latest set-point for one tick."""
         motion = self._vehicle.motion
         # `fly` is called only in OFFBOARD. If the last call was before another mode, the elapsed time is limited to
         # MAX_TICK_S.

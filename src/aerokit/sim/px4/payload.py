@@ -52,9 +52,9 @@ class Px4Gimbal:
         # At the time `_target_at`, the set-point was `_target`. From then on, it turns at `_rates`.
         self._target = self._rates = _NEUTRAL
         self._target_at = 0.0
-        self._flags = 0
-        self._place: tuple[int, int, float] | None = None
-        self._was_returning = False
+        self._flags = 0  # GIMBAL_MANAGER_FLAGS
+        self._place: tuple[int, int, float] | None = None  # region of interest; None: follow the set-point
+        self._was_returning = False  # True if the vehicle was returning at the last check
         self.is_fitted: bool = False  # True if MNT_MODE_IN enabled the gimbal at power-on.
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
@@ -332,6 +332,7 @@ class Px4CameraTrigger:
             px4.call_later(_GEOTAG_DELAY_S, lambda: self._send_captured(number))
 
     def _send_captured(self, number: int) -> None:
+        """Send CAMERA_IMAGE_CAPTURED for an image; nothing while the position is unknown."""
         px4, pose = self._px4, pose_of(self._px4)
         if pose is None:
             return

@@ -78,6 +78,7 @@ def _state(px4: Px4Vehicle) -> MavState:
 
 
 def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
+    """Build SYS_STATUS."""
     health = _HEALTHY if px4.is_ready else _BOOTING
     if not px4.is_armed and not px4.arming.is_possible:
         health &= ~_PREARM_BIT
@@ -101,6 +102,7 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
 
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
+    """Build ESTIMATOR_STATUS."""
     flags = _ALL_BUT_STILL
     if not px4.is_armed:
         flags |= Ekf.CONST_POS_MODE
@@ -128,6 +130,7 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
 
 
 def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
+    """Build BATTERY_STATUS."""
     battery = px4.battery
     voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)  # 0xFFFF: there is no such cell.
     return m.BatteryStatus(
@@ -208,6 +211,7 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
 
 
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
+    """Build GPS_RAW_INT."""
     motion = px4.motion
     if px4.faults.gps_lost:
         worst, unknown = 9999, 65535

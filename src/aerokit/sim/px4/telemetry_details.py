@@ -71,6 +71,7 @@ _BROADCAST_ID = bytes(20)
 
 
 def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
+    """Build OPEN_DRONE_ID_LOCATION; None while the position is unknown."""
     if not px4.has_position:
         return None
     motion = px4.motion
@@ -89,6 +90,7 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
 
 
 def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
+    """Build OPEN_DRONE_ID_SYSTEM; None while the vehicle boots."""
     if not px4.is_ready:
         return None
     home = px4.frame.to_global(*px4.home)
