@@ -159,6 +159,7 @@ class VideoStream:
         self._changed.set()
 
     def _on_frame(self, picture: object, stream_s: float | None) -> None:
+        """Replace the frame to read next. Called for each decoded frame."""
         if self._latest is not None:
             self.missed += 1
         vehicle = self._vehicle

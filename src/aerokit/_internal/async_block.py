@@ -34,6 +34,8 @@ def async_block(
 
 
 class _Block(AbstractAsyncContextManager[T]):
+    """Context manager that forwards to ``block``, and raises helpful errors when it is misused."""
+
     def __init__(self, name: str, block: AbstractAsyncContextManager[T]) -> None:
         self._name, self._block = name, block
 

@@ -407,6 +407,7 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
+        """Queue an item and wake the reader. Called with each item of the subscribed types."""
         if self._closed:  # An earlier sink of the same delivery has closed this subscription.
             return
         if len(self._queue) < self._capacity:
@@ -425,6 +426,7 @@ class Subscription(Generic[ItemT]):
             self.close(SubscriptionOverflow(f"the reader was too slow: {self._capacity} items are already queued"))
 
     async def _wait(self) -> None:
+        """Wait until an item is queued or the subscription is closed. BusyError if another reader waits."""
         if self._has_reader:
             raise BusyError("another task already reads this subscription; open a second one for another reader")
         self._has_reader, self._waiter = True, asyncio.get_running_loop().create_future()

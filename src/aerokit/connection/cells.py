@@ -459,6 +459,7 @@ class _Waiter(_Sink[T]):
             self._seen.append(value)
 
     def _timeout_text(self, timeout: float, description: str) -> str:
+        """Return the text of the time-out error: the condition, the last values, and why no values arrive."""
         text = f"{description or self._cell.name}: not reached within {timeout:g} s; {self._cell._describe()}"
         if self._held_for > 0:
             text += f"; the condition had to be true for {self._held_for:g} s without a break"

@@ -282,8 +282,11 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
-        # it as a replay.
+        """Return True if the signature check admits a frame.
+
+        Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
+        it as a replay.
+        """
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)

@@ -175,7 +175,7 @@ class Routes:
         self._boot_clocks = {} if boot_clocks is None else boot_clocks
         self._may_move = may_move  # True: a silent system may move to any host
         self._routes: dict[ComponentId, _Route] = {}
-        self._claims: dict[tuple[ComponentId, Peer], RouteClaim] = {}
+        self._claims: dict[tuple[ComponentId, Peer], RouteClaim] = {}  # by component and claiming peer
         self._swept_at = 0.0  # time of the last removal of expired routes
 
     def record_heartbeat(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:

@@ -219,7 +219,8 @@ class CommandSequence:
         """
         self._require_downloaded()
         added = _command_from(cmd)
-        cmd.target_system = added.target_system = self._core.target_system
+        added.target_system = self._core.target_system
+        cmd.target_system = added.target_system
         if self._append(added) == 0:
             self._core.logger.info("the first command is home, as in a waypoint file: %s", added)
 

@@ -43,7 +43,7 @@ class Readiness:
         self.names: set[str] = set()
         self.fetchers: dict[str, Callable[[], None]] = {}
         """Maps attributes to functions that request the value; called repeatedly while a program waits for it."""
-        self._failures: dict[str, APIException] = {}
+        self._failures: dict[str, APIException] = {}  # errors with which reading an attribute has failed
         self._changed = threading.Condition()
 
     def mark(self, name: str) -> None:

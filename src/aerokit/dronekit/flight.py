@@ -90,7 +90,8 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
-        self._dk_arming = order = self._dk.order(_armed_order_kind(value), flight_orders.change_armed, aio, value)
+        order = self._dk.order(_armed_order_kind(value), flight_orders.change_armed, aio, value)
+        self._dk_arming = order
         return order
 
     def _dk_is_changing_to(self, value: bool) -> bool:

@@ -188,7 +188,7 @@ class MessageListeners(Listeners):
     def __init__(self, owner: object, handler: ClassicConnection) -> None:
         super().__init__(owner, handler.listener_thread)
         self._handler = handler
-        self._detach_by_name: dict[str, Detach] = {}
+        self._detach_by_name: dict[str, Detach] = {}  # functions that end the subscription of each name
         self._is_started = False
 
     def add(self, name: str, listener: AttributeListener) -> None:

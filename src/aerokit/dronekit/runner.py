@@ -93,6 +93,8 @@ class _SubmoduleFinder(MetaPathFinder):
 
 
 class _SubmoduleLoader(Loader):
+    """Loader that returns the aerokit module for an alias, and keeps the spec of that module."""
+
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         module = importlib.import_module(_own_name(spec.name) or spec.name)
         self._own_spec = module.__spec__
@@ -300,11 +302,16 @@ def _prepend_path(folder: str) -> None:
 
 @contextlib.contextmanager
 def _restored_sys() -> Iterator[None]:
-    argv, path, main = sys.argv[:], sys.path[:], sys.modules["__main__"]
+    """Restore the arguments, the search path and the main module at the end of the block."""
+    argv = sys.argv[:]
+    path = sys.path[:]
+    main = sys.modules["__main__"]
     try:
         yield
     finally:
-        sys.argv[:], sys.path[:], sys.modules["__main__"] = argv, path, main
+        sys.argv[:] = argv
+        sys.path[:] = path
+        sys.modules["__main__"] = main
 
 
 def _print_program_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:

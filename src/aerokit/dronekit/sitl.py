@@ -126,8 +126,8 @@ class SITL:
             instance = _next_instance
             _next_instance += 1
         self.instance: int = instance
-        self._kind: str | None = None
-        self._served: ServedVehicle | None = None
+        self._kind: str | None = None  # None: the vehicle of --sim, or a copter
+        self._served: ServedVehicle | None = None  # None before launch()
 
     def download(self, system: str, version: str, target: str | None = None, verbose: bool = False) -> None:
         """Select the kind of vehicle. Downloads nothing; ``version`` is ignored."""

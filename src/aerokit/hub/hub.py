@@ -81,7 +81,7 @@ class Hub:
         self._attachments: dict[str, Attachment] = {}  # by name
         self._listeners: list[Callable[[HubEvent], object]] = []
         self._switch: Switch | None = None  # None while the hub is not open
-        self._background: BackgroundTasks | None = None
+        self._background: BackgroundTasks | None = None  # None while the hub is not open
         self._is_closed = False
 
     async def __aenter__(self) -> Self:
@@ -259,6 +259,7 @@ class Hub:
         return self._switch
 
     def _report(self, attachment: Attachment, kind: HubEventKind, text: str) -> None:
+        """Log an event of an endpoint, and pass it to the listeners."""
         logger.log(logging.INFO if kind in _INFO_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text)
         event = HubEvent(asyncio.get_running_loop().time(), attachment.name, kind, text)
         for listener in tuple(self._listeners):

@@ -47,8 +47,9 @@ class FrameQueue:
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._last_key = 0  # the negative key that was used last
-        # Numbers of queued commands and of queued telemetry frames. If there are none, the queue is not searched.
-        self._order_count = self._telemetry_count = 0
+        # If there are no commands or no telemetry frames, the queue is not searched for them.
+        self._order_count = 0
+        self._telemetry_count = 0
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -254,6 +255,7 @@ class Port:
         return self._may_queue and (bool(self._queue) or self._is_full())
 
     def enqueue(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        """Queue a frame, because the link does not drain. A full queue drops frames."""
         message_type = self._dialect.get(plan.message_id)
         kind = MessageKind.TRANSFER  # An unknown message may be part of a transfer, so it is never replaced.
         if message_type is not None:

@@ -366,10 +366,13 @@ def _remarks(node: Element) -> tuple[str, ...]:
     remarks: list[str] = []
     for child in node:
         if child.tag in ("deprecated", "superseded"):
-            since, replacement, reason = child.get("since", ""), child.get("replaced_by", ""), _text(child)
-            remark = child.tag.capitalize() + (f" since {since}" if since else "")
-            remark += f", replaced by {replacement}." if replacement else "."
-            remarks.append(f"{remark} {reason}".strip())
+            since, replacement = child.get("since", ""), child.get("replaced_by", "")
+            remark = child.tag.capitalize()
+            if since:
+                remark += f" since {since}"
+            if replacement:
+                remark += f", replaced by {replacement}"
+            remarks.append(f"{remark}. {_text(child)}".strip())
         elif child.tag == "wip":
             remarks.append("Work in progress: may change.")
     return tuple(remarks)
@@ -399,6 +402,7 @@ def _common_prefix(enum: str, names: list[str]) -> str:
 
 
 def _member_name(enum: str, prefix: str, name: str) -> str:
+    """Return the Python name of an enum entry: its name without the prefix of the entries."""
     if not name.startswith(prefix):  # Some entries begin with the last words of the enum's name only.
         words = enum.split("_")
         shorter_prefixes = ("_".join(words[i:]) + "_" for i in range(1, len(words)))

@@ -156,6 +156,8 @@ class _Standard(Dialect):
 
 
 class _Extended(Dialect):
+    """The messages and enums of two dialects. If both have a message, that of the first one is used."""
+
     def __init__(self, first: Dialect, second: Dialect) -> None:
         super().__init__(f"{first.name}+{second.name}", ())
         self._parts = (first, second)

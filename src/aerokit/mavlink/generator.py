@@ -90,6 +90,7 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
 
 
 def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
+    """Return the fields of both definitions. An added field keeps the type of an existing one."""
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:
         existing_field = fields.get(field.name)
@@ -109,7 +110,7 @@ def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[En
 
 
 def _merged_entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
-    # Added params replace existing params with the same number.
+    """Return an entry with the params of both definitions. An added param replaces one with the same number."""
     params = {number: (number, label, units, text) for number, label, units, text in (*existing.params, *added.params)}
     return replace(
         existing,
@@ -370,6 +371,7 @@ def _other_files(stems: Sequence[str]) -> str:
 
 
 def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
+    """Render one module of message classes."""
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
     stems = MODULES.get(module, MODULES["common"])  # COMMON_MORE has messages of the same files as common.
@@ -380,6 +382,7 @@ def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
 
 
 def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
+    """Render ``messages/__init__.py`` and its stub."""
     rows = ""
     for message in sorted(messages, key=lambda message: message.id):
         numbers = f"{message.crc_extra}, {message.base_length}, {message.length}"

@@ -58,6 +58,7 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
 
 
 def _class_of(message: Any) -> type[Message]:
+    """Return aerokit's class for a message of pymavlink, or of a similar library."""
     message_type: Any = type(message)
     # Classes of pymavlink have these attributes. For any other object, the message's name must be in the standard.
     if hasattr(message_type, "ordered_fieldnames") and hasattr(message_type, "crc_extra"):

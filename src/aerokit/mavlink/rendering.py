@@ -42,7 +42,8 @@ def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
     ]
     for field in message.fields:
         lines += ["", f"    {field.attribute}: {_annotation(field)}"]
-        lines += _docstring([_field_doc(field)], "    ") if docs else []
+        if docs:
+            lines += _docstring([_field_doc(field)], "    ")
     lines += ["", *_render_init(message), "", *_render_decode(message), "", *_render_encode(message)]
     return "\n".join(lines) + "\n"
 
@@ -62,7 +63,8 @@ def render_enum_stub(enum: EnumDefinition) -> str:
     for name, entry in enum.members():
         lines.append(f"    {name} = {entry.value}")
         doc = _entry_doc(entry)
-        lines += _docstring(doc, "    ") if doc else []
+        if doc:
+            lines += _docstring(doc, "    ")
     return "\n".join(lines) + "\n"
 
 
@@ -102,6 +104,7 @@ def _field_doc(field: FieldDefinition) -> str:
 
 
 def _entry_doc(entry: EntryDefinition) -> list[str]:
+    """Return the paragraphs of an enum entry's docstring."""
     paragraphs = [_sentence(entry.description)] if entry.description else []
     paragraphs += entry.remarks
     for index, label, units, text in entry.params:

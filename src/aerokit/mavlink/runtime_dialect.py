@@ -139,6 +139,7 @@ def _standard_class(definition: MessageDefinition, standard: Standard) -> type[M
 
 # -------------------------------------------------------------------------------- pymavlink modules
 def _import(name: str) -> ModuleType:
+    """Import a dialect of pymavlink by its short name or its module's name."""
     candidates = [name] if "." in name else [f"pymavlink.dialects.v20.{name}", name]
     for candidate in candidates:
         try:

@@ -208,6 +208,7 @@ def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
 
 
 def _read_fence(value: JsonValue) -> Fence:
+    """Read the member ``geoFence``."""
     if _check_version(value, "polygon", "polygons", "circles") == 1:  # Version 1 is allowed only for empty fences.
         return Fence()
     polygons, circles = (value.child(key) for key in ("polygons", "circles"))
@@ -239,6 +240,7 @@ def _read_polygon(value: JsonValue) -> FencePolygon:
 
 
 def _read_circle(value: JsonValue) -> FenceCircle:
+    """Read one circle of the fence."""
     circle = value["circle"]
     radius = circle["radius"]
     center = _required_place(circle["center"])

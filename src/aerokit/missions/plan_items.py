@@ -122,7 +122,8 @@ def merged_entries(
         group = groups[head_end]
         if not _matches(group, items[first_new : first_new + len(group)]):
             break
-        head_end, first_new = head_end + 1, first_new + len(group)
+        head_end += 1
+        first_new += len(group)
     # Keep the entries from `tail_start` on, which contain the items from `end_new` on.
     tail_start, end_new = len(groups), len(items)
     while tail_start > head_end:
@@ -130,9 +131,11 @@ def merged_entries(
         start = end_new - len(group)
         if start < first_new or not _matches(group, items[start:end_new]):
             break
-        tail_start, end_new = tail_start - 1, start
+        tail_start -= 1
+        end_new = start
     new_entries = [simple_entry(item) for item in items[first_new:end_new]]
-    head, tail = copy.deepcopy(list(entries[:head_end])), copy.deepcopy(list(entries[tail_start:]))
+    head = copy.deepcopy(list(entries[:head_end]))
+    tail = copy.deepcopy(list(entries[tail_start:]))
     merged = [*head, *new_entries, *tail]
     sizes = [*map(len, groups[:head_end]), *(1 for _ in new_entries), *map(len, groups[tail_start:])]
     _set_jump_ids(merged, sizes, items)
@@ -233,8 +236,10 @@ def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
 
 def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
     """Return True if the items are equal. Jump targets are ignored, because they are always rewritten."""
-    if len(group) == len(items) == 1 and group[0].command == items[0].command == MavCmd.DO_JUMP:
-        return group[0].replace(param1=0.0) == items[0].replace(param1=0.0)
+    if len(group) == len(items) == 1:
+        old, new = group[0], items[0]
+        if old.command == new.command == MavCmd.DO_JUMP:
+            return old.replace(param1=0.0) == new.replace(param1=0.0)
     return tuple(group) == tuple(items)
 
 

@@ -154,6 +154,7 @@ class _Row:
         return int(text)
 
     def _number(self, column: str, limit: float = math.inf, *, may_be_nan: bool = False) -> float:
+        """Return the number in a column. FileFormatError if it is not a finite number within ``limit``."""
         text = self.texts[_COLUMNS.index(column)]
         try:
             value = float(text) if "_" not in text else math.inf  # float() would accept 1_000.

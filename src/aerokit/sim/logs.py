@@ -160,6 +160,7 @@ class ArduPilotLogServer(LogServer):
         self._has_warned = False
 
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:
+        """Handle LOG_REQUEST_LIST: send an entry for each log in the requested range."""
         if self._refuses():
             return
         if self.is_busy:

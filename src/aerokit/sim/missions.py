@@ -65,7 +65,7 @@ class MissionMount(Mount):
 
     def __init__(self, store: MissionStore) -> None:
         self._store = store
-        self._writer: _Writer | None = None
+        self._writer: _Writer | None = None  # the upload that is open; None without one
 
     def size(self, path: str) -> int:
         _type_of(path)

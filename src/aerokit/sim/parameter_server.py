@@ -71,8 +71,8 @@ class ArduPilotParameterServer(ParameterServer):
     ) -> None:
         super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz, errors=errors)
         self._send_banner = send_banner
-        self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()
-        self._is_reading = False
+        self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()  # read requests that wait for their answer
+        self._is_reading = False  # True while a call of `_read_next` is pending
 
     def restart(self) -> None:
         super().restart()
@@ -208,6 +208,7 @@ class Px4ParameterServer(ParameterServer):
             self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 
     def _error_for(self, name: str, type_: int) -> int | None:
+        """Return the MAV_PARAM_ERROR of a wrong PARAM_SET; None if it is right."""
         if name == HASH_NAME:
             return MavParamError.READ_ONLY
         if name not in self._parameters:

@@ -122,6 +122,7 @@ class SimulatorServer:
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
+        """Open each link, with a channel of each of its vehicles. ``opening`` closes them again."""
         connected: set[int] = set()
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
@@ -164,6 +165,7 @@ class SimulatorServer:
             raise
 
     def _on_due(self) -> None:
+        """Run what is due. Called by the timer or the event source."""
         self._skip_lateness()
         self._timer = None
         try:
@@ -194,11 +196,13 @@ class SimulatorServer:
         self._ports.clear()
 
     def _run(self, now: float) -> None:
+        """Run what is due at the simulated time ``now``, send the output, and set the timer."""
         self._step(now)
         self._flush()
         self._schedule()
 
     def _step(self, now: float) -> None:
+        """Advance the vehicles that have an event until ``now``."""
         dues = self._dues
         for number, due in enumerate(dues):
             if due <= now:
@@ -226,6 +230,7 @@ class SimulatorServer:
             self._fail(error)
 
     def _flush(self) -> None:
+        """Write the datagrams of all vehicles to their links."""
         for port in self._ports:
             for datagram in port.take_datagrams(together=self._end_source is None):
                 port.link.write(datagram)
@@ -295,8 +300,11 @@ class _Port:
 
     def hang_up(self) -> None:
         """Disconnect the clients of a TCP port whose only vehicle reboots."""
-        if len(self.channels) == 1 and self.channels[0].closes_clients:
-            self.channels[0].closes_clients = False
+        if len(self.channels) != 1:
+            return
+        (channel,) = self.channels
+        if channel.closes_clients:
+            channel.closes_clients = False
             if isinstance(self.link, TcpListen):
                 self.link.close_clients()
 

@@ -304,6 +304,7 @@ class SimulatedVehicle:
             self._schedule_tick(_STEADY_TICKS if self.is_steady else 1)
 
     def _run_due(self, due: float) -> None:
+        """Run everything that is due at this time: ticks, timers, and messages of the streams."""
         self._tick_until(due)
         while self._timers and self._timers[0][0] <= due:
             _, _, action = heappop(self._timers)

@@ -159,6 +159,8 @@ _YES_AND_NO = {
 
 
 class _Parser:
+    """Parses one connection string. Its errors name the whole string and the reason."""
+
     def __init__(self, text: str) -> None:
         self.text = text
 

@@ -203,6 +203,7 @@ class BaseLink(Link):
         self._released.set()
 
     async def open(self, receiver: Receiver) -> None:
+        """See `Link.open`. After a failure, the link can be opened again."""
         self._check_may_open()
         self._state, self._receiver = _State.OPENING, receiver
         self._keeps_peers = keeps_peers(receiver)
@@ -297,6 +298,7 @@ def link_open_error(address: str, cause: OSError, hint: str = "") -> LinkOpenErr
 
 
 def _hint(address: str, cause: OSError) -> str:
+    """Return what the user can do about an error of opening a link; "" if unknown."""
     if isinstance(cause, socket.gaierror):
         return "unknown host name; check the spelling or use the IP address"
     if cause.errno == errno.EADDRNOTAVAIL and address.startswith(("udpin", "tcpin")):
@@ -347,7 +349,7 @@ class MemoryLink(BaseLink):
     def __init__(self, address: str, latency_s: float = 0.0) -> None:
         super().__init__(address)
         self._latency_s = latency_s
-        self._far: MemoryLink | None = None
+        self._far: MemoryLink | None = None  # the other end, set by `memory_link_pair`
         self._loop: asyncio.AbstractEventLoop | None = None  # None while the link is not open
         self._inbox: deque[tuple[float, bytes | None]] = deque()  # (due time, data); data is None if the far end closed
         self._wake_up: asyncio.Handle | None = None  # pending call of `_arrive`
@@ -361,6 +363,7 @@ class MemoryLink(BaseLink):
         self._loop = asyncio.get_running_loop()
 
     def _release(self) -> None:
+        """See `BaseLink._release`. Drops received data that was not delivered yet."""
         if self._wake_up is not None:
             self._wake_up.cancel()
         self._wake_up = None

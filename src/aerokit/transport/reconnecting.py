@@ -214,6 +214,7 @@ class ReconnectingLink(Link):
     # ----------------------------------------------------------------------- reopening
 
     async def _reopen(self) -> None:
+        """Try to open a new link until one is open. Runs as a task, from each loss on."""
         try:
             while not await self._try_to_open():
                 pass

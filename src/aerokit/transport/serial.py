@@ -60,7 +60,7 @@ class SerialLink(BaseLink):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._port: Any = None  # pyserial's port
         self._transport: Any = None  # pyserial-asyncio's transport; None while the link is not open
-        self._outbox: Outbox | None = None
+        self._outbox: Outbox | None = None  # None while the link is not open
 
     @property
     def unsent_bytes(self) -> int:
@@ -115,6 +115,7 @@ class SerialLink(BaseLink):
             raise _open_error(self.address, error) from None
 
     def _open_device(self) -> Any:
+        """Open the port with pyserial. Raises OSError, or ValueError for an unsupported baud rate."""
         serial = importlib.import_module("serial")
         try:
             return serial.Serial(
@@ -210,6 +211,7 @@ def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
 
 
 def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
+    """Read from the port without blocking: the replacement of pyserial's ``read``. Report a lost device."""
     try:
         data = os.read(fd, _READ_SIZE)
     except (BlockingIOError, InterruptedError):
@@ -223,6 +225,7 @@ def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
 
 
 def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -> int:
+    """Call ``write``, and report a lost device: the replacement of pyserial's ``write``."""
     try:
         return write(data)
     except (BlockingIOError, InterruptedError):
@@ -233,6 +236,7 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
 
 
 def _open_error(address: str, error: Exception) -> OSError:
+    """Return the LinkOpenError for an error of pyserial, with a hint for the user."""
     number = error.errno if isinstance(error, OSError) else None
     # An error of termios has no `errno`: its number is only in the text.
     if number is None and str(errno.ENOTTY) in str(error):
@@ -312,6 +316,7 @@ class PtyLink(BaseLink):
         self._has_symlink = True
 
     def _read(self) -> None:
+        """Deliver the data that another program has written. Called when there is some."""
         our_end, _ = self._ends
         try:
             data = os.read(our_end, _READ_SIZE)

@@ -120,6 +120,7 @@ class TcpConnect(_TcpLink):
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
+        """Connect to the first address that accepts. If none does, raise the error of the first one."""
         first_error: OSError | None = None
         for address in addresses:
             try:
@@ -174,7 +175,7 @@ class TcpListen(_TcpLink):
         self._kept: set[Peer] = set()  # clients that the receiver keeps
         self._socket: socket.socket | None = None  # None once the server owns the socket
         self._server: asyncio.AbstractServer | None = None
-        self._local_address = ("", 0)
+        self._local_address = ("", 0)  # host and port
         self._clients: dict[Peer, _Stream] = {}
 
     @property
@@ -283,7 +284,7 @@ class _Stream(asyncio.Protocol):
     def __init__(self, link: _TcpLink) -> None:
         self._link = link
         self._transport: asyncio.Transport | None = None  # None until the connection is made
-        self._outbox: Outbox | None = None
+        self._outbox: Outbox | None = None  # None until the connection is made
         self._fd = -1  # file descriptor of the socket; −1 while there is none
         self._loop = asyncio.get_running_loop()
         self._linger_timer: asyncio.TimerHandle | None = None  # runs from close() until the remaining data is sent
@@ -373,6 +374,7 @@ class _Stream(asyncio.Protocol):
         return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
+        """Drop unsent data, and remove the stream from its link."""
         self._fd = -1  # The system may give the same number to another file.
         if self._outbox is not None:
             self._outbox.discard()

@@ -79,7 +79,8 @@ class Candidate:
             self.loss = new_loss if self.loss is None else self.loss + weight * (new_loss - self.loss)
 
     def record_round_trip(self, seconds: float, now: float) -> None:
-        self.answered_at = self.received_at = now
+        self.answered_at = now
+        self.received_at = now
         before = self.round_trip_s
         self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
 

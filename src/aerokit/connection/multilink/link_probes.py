@@ -115,7 +115,8 @@ class LinkProbes:
         """Record the hardware id if the frame is an AUTOPILOT_VERSION of an autopilot."""
         if frame.message_id != m.AutopilotVersion.ID or frame.component_id != _AUTOPILOT:
             return
-        choice, message = self._choices.get(frame.system_id), self._bus.dialect.decode(frame)
+        choice = self._choices.get(frame.system_id)
+        message = self._bus.dialect.decode(frame)
         if isinstance(message, m.AutopilotVersion) and choice is not None and link in choice.candidates:
             choice.record_hardware(link, HardwareId.from_message(message))
             for candidate in choice.candidates.values():

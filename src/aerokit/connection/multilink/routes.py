@@ -339,7 +339,8 @@ class MultiLinkRoutes:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
-            name, previous = self._link.names[used.link], self._link.names[before.link]
+            name = self._link.names[used.link]
+            previous = self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
             log(
                 "system %d: switched to %s, because %s is %s",

@@ -31,8 +31,8 @@ class AccelerometerCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.is_held_wrong = False  # If True, the calibration fails after the second position.
-        self._run_number = 0
-        self._requested: int | None = None
+        self._run_number = 0  # number of this calibration; timers of earlier ones do nothing
+        self._requested: int | None = None  # position or result that is sent repeatedly; None: nothing is sent
 
     @property
     def is_waiting(self) -> bool:
@@ -57,6 +57,7 @@ class AccelerometerCalibration:
         return MavResult.ACCEPTED
 
     def _on_sample(self, run_number: int, position: int) -> None:
+        """Continue after a position was measured: request the next one, or end the calibration."""
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         has_earlier_position = position != AccelcalVehiclePos.LEVEL  # The vehicle is level first.
@@ -179,7 +180,9 @@ class CompassCalibration:
         if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
-        offsets, diagonal, off_diagonal = (5.0, 13.0, -18.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+        offsets = (5.0, 13.0, -18.0)
+        diagonal = (1.0, 1.0, 1.0)
+        off_diagonal = (0.0, 0.0, 0.0)
         saved = int(self._saves_at_once)
         status = MagCalStatus.SUCCESS
         return m.MagCalReport(

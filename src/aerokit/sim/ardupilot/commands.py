@@ -109,6 +109,8 @@ def commanded_heading(command: ReceivedCommand, yaw: float) -> float | None:
 
 
 class _CommonCommands:
+    """Handlers of the commands that all ArduPilot vehicles execute in the same way."""
+
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
 
@@ -379,6 +381,7 @@ class GimbalCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        """Handle GIMBAL_MANAGER_SET_ATTITUDE, which contains angles or rates."""
         gimbal = self._gimbal(message.gimbal_device_id)
         rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
         has_angles = not any(map(math.isnan, message.q))
@@ -389,6 +392,7 @@ class GimbalCommands:
         gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
     def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        """Handle GIMBAL_MANAGER_SET_PITCHYAW, which contains angles or rates."""
         gimbal = self._gimbal(message.gimbal_device_id)
         values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
         has_angles_and_rates = not any(map(math.isnan, values))

@@ -138,6 +138,8 @@ class _ReturnLeg(CopterRtl):
 
 
 class _DescendLeg:
+    """Landing at the place where the leg begins. Complete when the motors idle on the ground."""
+
     def __init__(self, copter: CopterHost) -> None:
         self._copter = copter
 
@@ -393,6 +395,7 @@ class CopterAuto(MissionMode):
         self._go(self._place(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
+        """Start the climb of a take-off command."""
         copter = self.vehicle
         point = copter.world_point(0, 0, item.z, item.frame)  # Only the altitude is used.
         copter.yaw.hold()
@@ -435,6 +438,7 @@ class CopterAuto(MissionMode):
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
+        """Execute DO_CHANGE_SPEED of a mission."""
         if item.param2 <= 0:  # A value of -1 means no change.
             return
         if item.param1 == SpeedType.CLIMB_SPEED:

@@ -245,6 +245,7 @@ class CopterSetpoints:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_GLOBAL_INT."""
         if not self._is_guided:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)

@@ -23,7 +23,7 @@ class AutoYaw:
         self._copter = copter
         self._control: Callable[[], None] = self._hold
         """The method that `update` calls at every tick."""
-        self._roi: tuple[float, float] | None = None
+        self._roi: tuple[float, float] | None = None  # (north, east) of the region of interest
         self._heading = 0.0
         self._rate = 0.0
         """Turn rate that `turn` has set, or `turn_to` for a turn by the longer way; otherwise 0."""
@@ -103,6 +103,7 @@ class AutoYaw:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def _go_to_heading(self) -> None:
+        """Turn to the commanded heading, at first in the commanded direction."""
         motion = self._copter.motion
         offset = wrap_pi(self._heading - motion.yaw)
         if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
@@ -223,7 +224,7 @@ class CopterPilotedMode(CopterModeBase):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._take_off: CopterTakeOff | None = None
+        self._take_off: CopterTakeOff | None = None  # None while no take-off runs
 
     def enter(self, *, force: bool) -> bool:
         self._take_off = None
@@ -367,6 +368,7 @@ class CopterRtl(CopterModeBase):
         return (north, east, down if self._phase == "land" else self._return_down)
 
     def update(self, dt: float) -> None:
+        """Continue the present phase of the return."""
         copter, target = self.vehicle, self.destination
         if self._phase == "land":
             copter.land()
@@ -398,7 +400,7 @@ class CopterSmartRtl(CopterModeBase):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._way_back: list[Ned] = []
+        self._way_back: list[Ned] = []  # points to fly to, in order
 
     def enter(self, *, force: bool) -> bool:
         if not self.vehicle.path.is_active:

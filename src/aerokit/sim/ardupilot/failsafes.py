@@ -185,7 +185,8 @@ class ArduPilotArming(Generic[HostT]):
         self.vehicle = vehicle
         self.passes: bool = False  # True if the last pre-arm checks have passed, as SYS_STATUS reports.
         self._reported_at = -math.inf
-        self._passed_common = self._has_new_failure = False
+        self._passed_common = False  # result of the common checks one second ago
+        self._has_new_failure = False  # True until the failure is reported
         self._was_always_armed = False
 
     def start(self) -> None:

@@ -58,6 +58,7 @@ class ArduPilotMissionServer(MissionServer):
             MavMissionType.FENCE: self.fence,
             MavMissionType.RALLY: self.rally,
         }
+        # (message type, list type) of the warnings that were sent.
         self._warnings: set[tuple[type[Message], int]] = set()
 
     def listen(self) -> None:
@@ -120,6 +121,7 @@ class ArduPilotMissionServer(MissionServer):
         return mission_type
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
+        """Return the MAV_MISSION_RESULT with which a message is refused; None if it is not."""
         kind = message.mission_type
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")

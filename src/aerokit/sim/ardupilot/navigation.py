@@ -41,7 +41,7 @@ class ArduPilotNavigation:
         self.origin: Ned | None = None
         self.home: Ned | None = None
         self.home_is_locked: bool = False
-        self._gps_lost_at = math.nan
+        self._gps_lost_at = math.nan  # NaN while GPS is good
 
     def start(self) -> None:
         """Schedule the events of the boot timeline."""
@@ -201,6 +201,7 @@ class ArduPilotNavigation:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
+        """React to a lost GPS, and use a returned one again."""
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
@@ -395,15 +396,22 @@ def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
 
 
 def _vector(start: Ned, end: Ned) -> Ned:
-    return (end[0] - start[0], end[1] - start[1], end[2] - start[2])
+    start_north, start_east, start_down = start
+    north, east, down = end
+    return (north - start_north, east - start_east, down - start_down)
 
 
 def _dot(first: Ned, second: Ned) -> float:
-    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+    first_north, first_east, first_down = first
+    north, east, down = second
+    return first_north * north + first_east * east + first_down * down
 
 
 def _along(start: Ned, line: Ned, share: float) -> Ned:
-    return (start[0] + share * line[0], start[1] + share * line[1], start[2] + share * line[2])
+    """Return the point on a line after this share of the line, 0 to 1."""
+    start_north, start_east, start_down = start
+    north, east, down = line
+    return (start_north + share * north, start_east + share * east, start_down + share * down)
 
 
 def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:

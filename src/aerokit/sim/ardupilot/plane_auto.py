@@ -202,6 +202,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.radius: float = item.param2 if item.command == Cmd.NAV_LOITER_TO_ALT else item.param3
 
     def _land(self, item: MissionItem) -> None:
+        """Start a landing at the position of the command."""
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
@@ -350,6 +351,7 @@ class PlaneSetpoints:
         plane.info(f"Change alt to {home_down - down:.1f}")
 
     def _on_global(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_GLOBAL_INT, which changes only the altitude."""
         plane = self._plane
         if not self._is_guided:
             return

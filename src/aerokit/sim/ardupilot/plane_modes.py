@@ -89,6 +89,7 @@ class PlaneLanding:
         self._stopped_at = math.nan  # NaN until the plane has stopped after the landing
 
     def update(self, dt: float) -> None:
+        """Continue the landing for one tick."""
         plane, wing = self._plane, self._plane.wing
         if plane.is_landed:
             self._disarm_after_stop()
@@ -100,6 +101,7 @@ class PlaneLanding:
             self._approach()
 
     def _fly_to_start(self, start: Ned) -> None:
+        """Fly to the start of the approach, which begins when the plane is there."""
         wing = self._plane.wing
         north, east, down = start
         distance = math.hypot(north - wing.north, east - wing.east)
@@ -210,7 +212,7 @@ class PlaneAltitudeMode(PlaneModeBase):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self._down = 0.0
+        self._down = 0.0  # altitude to hold
 
     def enter(self, *, force: bool) -> bool:
         self._down = self.vehicle.wing.down
@@ -239,9 +241,10 @@ class PlaneCruise(PlaneAltitudeMode):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self._course: float | None = None
+        self._course: float | None = None  # course to hold, in radians from north; None while the pilot turns
 
     def steer(self, climb: float) -> None:
+        """Hold the course, unless the pilot turns."""
         wing = self.vehicle.wing
         if abs(self.stick(RC_ROLL)) > _CENTRED_STICK:  # The pilot turns, so no course is held.
             self._course = None
@@ -274,7 +277,7 @@ class PlaneNavigatingMode(PlaneModeBase):
         super().__init__(plane)
         self.speed: float = 0.0  # Commanded airspeed in m/s; 0 selects AIRSPEED_CRUISE.
         self.radius: float = 0.0  # Radius of the circle in metres; 0 selects WP_LOITER_RAD.
-        self._place: Ned | None = None
+        self._place: Ned | None = None  # centre of the circle, or end of the line, to fly
 
     def enter(self, *, force: bool) -> bool:
         self.speed = self.radius = 0.0
@@ -329,6 +332,7 @@ class PlaneTakeOff(PlaneNavigatingMode):
         return self._is_climbing
 
     def update(self, dt: float) -> None:
+        """Climb out, then circle at the take-off position."""
         plane = self.vehicle
         if self._place is None:
             self._start()
@@ -380,7 +384,8 @@ class PlaneAutoland(PlaneNavigatingMode):
         if plane.take_off_yaw is None:
             plane.send_text(MavSeverity.WARNING, "Takeoff initial direction not set")
             return False
-        home = north, east, down = plane.home_or_ground
+        home = plane.home_or_ground
+        north, east, down = home
         distance, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
         # The landing has the direction of the take-off, so the approach starts on the other side of home.
         start_north = north - distance * math.cos(plane.take_off_yaw)

@@ -87,7 +87,7 @@ class _Rtl(_Mode):
     def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed = 0.0
-        self._path: list[Ned] = []
+        self._path: list[Ned] = []  # places to drive to, in order
 
     def enter(self, *, force: bool) -> bool:
         rover, home = self.vehicle, self.vehicle.navigation.home
@@ -185,9 +185,9 @@ class RoverGuided(_Mode):
     def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed: float = 0.0
-        self._place: Ned | None = None
+        self._place: Ned | None = None  # place to drive to; None: follow `_target`
         self._has_arrived = False
-        self._target: GuidedTarget | None = None
+        self._target: GuidedTarget | None = None  # None: stop
         self._target_at = 0.0
 
     @property
@@ -232,6 +232,7 @@ class RoverGuided(_Mode):
             rover.motion.stop()
 
     def _drive_to(self, place: Ned) -> None:
+        """Drive to a place and stop there. The arrival is reported once."""
         rover = self.vehicle
         if not self._has_arrived and rover.has_arrived(place):
             self._has_arrived = True

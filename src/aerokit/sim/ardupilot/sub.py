@@ -181,14 +181,16 @@ class _HullLimit:
     def __init__(self, quantity: str, prefix: str) -> None:
         self.is_exceeded: bool = False
         self._quantity, self._prefix = quantity, prefix
-        self._good_at = self._reported_at = 0.0
+        self._good_at = 0.0  # time at which the limit was last kept
+        self._reported_at = 0.0
 
     def update(self, sub: SubHost, value: float) -> None:
         """Compare a measured value with its maximum. Values above the maximum must last for `_HULL_TIMEOUT_S`."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:
-            self._good_at = self._reported_at = sub.now
+            self._good_at = sub.now
+            self._reported_at = sub.now
             self.is_exceeded = False
             return
         if sub.now - self._good_at > _HULL_TIMEOUT_S:

@@ -153,6 +153,7 @@ _UNDEFINED_BITS = 0xF000
 # Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 _GRIDS_PER_BLOCK = 56  # The mask of TERRAIN_REQUEST has one bit for each grid of a block.
+_REQUESTED_BLOCKS = 9  # The firmware requests the vehicle's block and its neighbours (TerrainGCS.cpp).
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
 
@@ -206,6 +207,7 @@ def _gps_without_fix(fix_type: int, *, dilution: int, satellites: int) -> m.GpsR
 
 
 def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
+    """Build EKF_STATUS_REPORT; None before the estimator runs."""
     flags = vehicle.navigation.flags
     if flags is None:
         return None
@@ -239,6 +241,7 @@ def _global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
 
 
 def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | None:
+    """Build POSITION_TARGET_GLOBAL_INT; None without a destination, or while disarmed."""
     target = vehicle.mode.destination
     if target is None or not vehicle.motors.is_armed:
         return None
@@ -249,6 +252,7 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
 
 
 def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
+    """Build POSITION_TARGET_LOCAL_NED of GUIDED; None in other modes."""
     guided, time = vehicle.mode, vehicle.time_boot_ms
     if not isinstance(guided, CopterGuided):
         return None
@@ -288,14 +292,17 @@ def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
 
 
 def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
+    """Build TERRAIN_REPORT of a vehicle that receives no terrain data."""
     place = vehicle.navigation.position
     if place is None:
         return m.TerrainReport(
             lat=0, lon=0, spacing=_GRID_M, terrain_height=0.0, current_height=0.0, pending=_GRIDS_PER_BLOCK, loaded=0
         )
+    pending = 0 if vehicle.KIND == "sub" else _REQUESTED_BLOCKS * _GRIDS_PER_BLOCK
+    # A spacing of 0 means that no terrain data is available for this place.
     return m.TerrainReport(
         lat=place.latitude_e7, lon=place.longitude_e7, spacing=0, terrain_height=0.0, current_height=place.altitude_m,
-        pending=0 if vehicle.KIND == "sub" else 9 * _GRIDS_PER_BLOCK, loaded=0,
+        pending=pending, loaded=0,
     )  # fmt: skip
 
 
@@ -343,10 +350,15 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), id=0, temperature=3500),
     m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), temperature=3500),
     m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), temperature=3500),
-    m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, 0, 0, 0, 0, 0, 0, *_magnetic_field(v)),
+    # The third compass has no accelerometers and gyroscopes.
+    m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, *(0,) * 6, *_magnetic_field(v)),
     m.HighresImu.ID: _highres_imu,
-    m.ScaledPressure.ID: lambda v: m.ScaledPressure(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),
-    m.ScaledPressure2.ID: lambda v: m.ScaledPressure2(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),
+    m.ScaledPressure.ID: lambda v: m.ScaledPressure(
+        v.time_boot_ms, _pressure_hpa(v), press_diff=0.0, temperature=2800, temperature_press_diff=0
+    ),
+    m.ScaledPressure2.ID: lambda v: m.ScaledPressure2(
+        v.time_boot_ms, _pressure_hpa(v), press_diff=0.0, temperature=2800, temperature_press_diff=0
+    ),
     m.Wind.ID: _wind,
     m.GlobalPositionInt.ID: _global_position,
     m.LocalPositionNed.ID: _local_position,

@@ -100,7 +100,7 @@ class Px4Vehicle(Px4Host):
         self.rates: Px4StreamRates = Px4StreamRates(link_modes, self.can_build, fast_rate_hz)
         self.events = Px4Events(self)
         self._next_text_id = 0
-        self._pings = 0
+        self._pings = 0  # number of PINGs sent
         self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points, which survive a reboot."""
@@ -380,6 +380,7 @@ class Px4Vehicle(Px4Host):
             self.mission.on_landed()
 
     def _auto_disarm(self) -> None:
+        """Disarm some time after a landing, or after arming without a take-off."""
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown:

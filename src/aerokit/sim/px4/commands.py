@@ -175,11 +175,14 @@ def _change(px4: Px4Vehicle, mode: Px4Mode) -> int:
 
 
 class _Flight:
+    """Handlers of the commands that arm, move or restart the vehicle."""
+
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
-        self._tuning_since = math.nan
+        self._tuning_since = math.nan  # start of the autotuning; NaN while it does not run
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
+        """Handle COMPONENT_ARM_DISARM."""
         force = command.param2 == _FORCE_MAGIC
         arm = round(command.param1) if math.isfinite(command.param1) else None
         if arm == 1:
@@ -361,6 +364,7 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def reboot(self, command: ReceivedCommand) -> int:
+        """Handle PREFLIGHT_REBOOT_SHUTDOWN. The reboot follows a moment after the acknowledgement."""
         if command.param1 == 0.0:
             return MavResult.ACCEPTED
         if self._px4.is_armed or command.param1 not in (1.0, 2.0):
@@ -397,6 +401,8 @@ _LEGACY_REQUESTS = {
 
 
 class _Requests:
+    """Handlers of the commands that request messages once or periodically."""
+
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
 

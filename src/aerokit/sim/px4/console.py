@@ -25,7 +25,7 @@ class Px4Shell:
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4
-        self._line = b""
+        self._line = b""  # characters received since the last line end
         self.is_open: bool = False
         px4.on(m.SerialControl, self._on_input)
 
@@ -73,6 +73,7 @@ class Px4LogStream:
         px4.on(m.LoggingAck, self._on_ack)
 
     def start(self, command: ReceivedCommand) -> int:
+        """Handle LOGGING_START."""
         if self._station is not None:
             return MavResult.TEMPORARILY_REJECTED
         log_format = command.param1

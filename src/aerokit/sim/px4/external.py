@@ -98,7 +98,7 @@ class PrecisionLanding:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._search_began_at: float | None = None
+        self._search_began_at: float | None = None  # None while the target is visible
         self._search_count = 0
 
     def enter(self) -> None:

@@ -108,9 +108,9 @@ class Px4Flight:
         self.manual_flight: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
-        self._phase = ""
-        self._ramp_began_at = 0.0
-        self._is_default_height = False
+        self._phase = ""  # phase of a return: "climb", "return" or "land"
+        self._ramp_began_at = 0.0  # time at which the motors began to speed up for a take-off
+        self._is_default_height = False  # True if the take-off command had no altitude
 
     @property
     def cruise_speed_m_s(self) -> float:
@@ -123,6 +123,7 @@ class Px4Flight:
         return self._vehicle.parameters["MPC_XY_VEL_MAX"]
 
     def enter(self, mode: Px4Mode) -> None:
+        """Prepare the flight in a new mode."""
         self.speed_m_s = self.cruise_speed_m_s
         self.heading = None
         self._phase = "climb"

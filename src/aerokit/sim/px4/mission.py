@@ -292,7 +292,8 @@ class Px4Mission:
         if item.command == Cmd.NAV_DELAY:
             px4.flight.stay_here()
             return
-        target = north, east, down = self._place(item)
+        target = self._place(item)
+        north, east, down = target
         px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None: look ahead.
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(down if item.command in _TAKE_OFFS else None)
@@ -353,6 +354,7 @@ class Px4Mission:
                 self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
+        """Return True if the vehicle is within the acceptance radius of an item, and at its height."""
         if item.command == Cmd.NAV_DELAY:
             return True
         motion = self._px4.motion

@@ -69,6 +69,7 @@ class Px4Offboard:
 
     @property
     def wants_up(self) -> bool:
+        """True if the set-point leads upwards, so that a landed vehicle takes off."""
         if self._attitude is not None:
             return self._thrust > 0.5
         _, _, position_down = self._position
@@ -78,6 +79,7 @@ class Px4Offboard:
         return any(down < -_UPWARDS for down in components)  # False for components that are NaN
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_LOCAL_NED."""
         frame = target.coordinate_frame
         if frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
             self._warn(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
@@ -180,10 +182,12 @@ class Px4Offboard:
             motion.turn(self._yaw_rate if math.isfinite(self._yaw_rate) else 0.0)
 
     def _fly_attitude(self, attitude: tuple[float, float, float], elapsed: float) -> None:
+        """Follow the target attitude, which the body rates have changed for ``elapsed`` seconds."""
         motion = self._vehicle.motion
         if self._body_rates is not None:
             angles_and_rates = zip(attitude, self._body_rates, strict=True)
-            attitude = self._attitude = _vector(angle + rate * elapsed for angle, rate in angles_and_rates)
+            attitude = _vector(angle + rate * elapsed for angle, rate in angles_and_rates)
+            self._attitude = attitude
         roll, pitch, yaw = attitude
         # In the simulation, a thrust of 0.5 holds the height.
         climb_share = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0

@@ -257,8 +257,8 @@ class Px4CameraTrigger:
         self.sends_image_captured = True  # False simulates a PX4 without the geotag module.
         self._is_enabled = False
         self._is_paused = False
-        self._series_number = 0
-        self._last_at = -math.inf
+        self._series_number = 0  # number of this series; timers of earlier ones do nothing
+        self._last_at = -math.inf  # time of the last image
 
     @property
     def is_fitted(self) -> bool:
@@ -282,6 +282,7 @@ class Px4CameraTrigger:
         }
 
     def _digicam_control(self, command: ReceivedCommand) -> int | None:
+        """Handle DO_DIGICAM_CONTROL. Return None, for no answer, without a trigger."""
         if not self.is_fitted:
             return None
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.

@@ -54,6 +54,7 @@ _POSITION_FLAGS = Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | E
 
 
 def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
+    """Build HEARTBEAT."""
     mode = modes.TERMINATION if px4.arming.is_terminated else px4.mode
     base_mode = modes.MODES[mode].base_mode
     if px4.is_armed:
@@ -65,6 +66,7 @@ def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
 
 
 def _state(px4: Px4Vehicle) -> MavState:
+    """Return the field system_status of HEARTBEAT."""
     if px4.arming.is_terminated:
         return MavState.FLIGHT_TERMINATION
     if px4.is_in_failsafe:
@@ -108,7 +110,8 @@ def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
         flags |= Ekf.CONST_POS_MODE
     if not px4.has_position:
         flags &= ~_POSITION_FLAGS
-        flags |= Ekf.POS_HORIZ_REL if px4.external.has_vision else 0
+        if px4.external.has_vision:
+            flags |= Ekf.POS_HORIZ_REL
     if not px4.is_ready:
         flags = _BOOT_FLAGS
     ratio = 0.02 if px4.is_ready else math.nan  # The test ratio of velocity, position and magnetometer.
@@ -230,6 +233,7 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
 
 
 def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
+    """Build HOME_POSITION; None while the vehicle boots."""
     if not px4.is_ready:
         return None
     place = px4.frame.to_global(*px4.home)
@@ -287,7 +291,8 @@ def _mission_current(px4: Px4Vehicle) -> m.MissionCurrent:
 
 
 def _vibration(px4: Px4Vehicle) -> m.Vibration:
-    return m.Vibration(px4.time_boot_us, 0.0, 0.1, 1.4 if px4.is_armed else 0.1, 0, 0, 0)
+    vibration_z = 1.4 if px4.is_armed else 0.1
+    return m.Vibration(px4.time_boot_us, 0.0, 0.1, vibration_z, clipping_0=0, clipping_1=0, clipping_2=0)
 
 
 def _system_time(px4: Px4Vehicle) -> m.SystemTime:
@@ -299,7 +304,7 @@ def _current_mode(px4: Px4Vehicle) -> m.CurrentMode:
 
 
 def _ping(px4: Px4Vehicle) -> m.Ping:
-    return m.Ping(px4.time_boot_us, px4.next_ping(), 0, 0)
+    return m.Ping(px4.time_boot_us, px4.next_ping(), target_system=0, target_component=0)
 
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:

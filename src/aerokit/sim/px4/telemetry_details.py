@@ -183,6 +183,7 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
 
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
+    """Build SCALED_IMU."""
     motion = px4.motion
     # The fields of SCALED_IMU are in milli-g, mrad/s and milligauss.
     force_x, force_y, force_z = (round(axis / GRAVITY_M_S2 * 1000) for axis in _measured_acceleration(px4))

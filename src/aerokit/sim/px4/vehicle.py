@@ -179,6 +179,7 @@ class Px4PlaneFlight(Px4Flight):
         self._touch_down(self._glide)
 
     def _touch_down(self, approach: Callable[[], None]) -> None:
+        """Land: call ``approach`` until the flare, then touch down and roll out."""
         motion = self._motion
         height = motion.ground_down - motion.down
         if motion.is_on_ground:

@@ -132,7 +132,8 @@ class ZenohConnect(NetworkLink):
         # A sample that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
         def callback_for(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
-                is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)
+                is_put = sample.kind == zenoh.SampleKind.PUT
+                payload = payload_of(sample)
                 if len(payload) <= MAX_PAYLOAD_BYTES:
                     queue.post(partial(process, payload, attachment_of(sample), is_put))
 
@@ -143,7 +144,8 @@ class ZenohConnect(NetworkLink):
             queue.post(partial(self._on_liveliness, str(sample.key_expr), is_put))
 
         keys, client = self._keys, self.client
-        on_frames, liveliness = callback_for(self._on_frames), session.liveliness()
+        on_frames = callback_for(self._on_frames)
+        liveliness = session.liveliness()
         self._declared = [
             session.declare_subscriber(keys.to_all_clients, on_frames),
             session.declare_subscriber(keys.from_vehicle(client), on_frames),
@@ -210,6 +212,7 @@ class ZenohConnect(NetworkLink):
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
+        """Send a datagram to the vehicle side. It is dropped while beacons are missing."""
         stamp = self._tracker.make_stamp(self._now(), mode)
         if stamp is None:
             self._drop(1)

@@ -151,13 +151,13 @@ class ZenohListen(NetworkLink):
         zenoh, session, keys = self._zenoh, self._session, self._keys
 
         def on_datagram(sample: Any) -> None:
-            client, payload = str(sample.key_expr).rpartition("/")[2], payload_of(sample)
+            payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
-                queue.post(partial(self._on_datagram, client, payload, attachment_of(sample)))
+                queue.post(partial(self._on_datagram, _client_of(sample), payload, attachment_of(sample)))
 
         def on_liveliness(sample: Any) -> None:
-            client, is_put = str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT
-            queue.post(partial(self._on_client_joined if is_put else self._remove_client, client))
+            has_joined = sample.kind == zenoh.SampleKind.PUT
+            queue.post(partial(self._on_client_joined if has_joined else self._remove_client, _client_of(sample)))
 
         liveliness = session.liveliness()
         self._publisher = session.declare_publisher(
@@ -238,6 +238,7 @@ class ZenohListen(NetworkLink):
             self._lease.release(name)
 
     def _on_beacon(self, data: bytes) -> None:
+        """Detect another vehicle side with the same name. Our own beacons arrive here, too."""
         beacon = Beacon.decode(data)
         if beacon is None or beacon.epoch == self._freshness.epoch:  # A beacon with this epoch is our own.
             return
@@ -272,3 +273,8 @@ class ZenohListen(NetworkLink):
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
+
+
+def _client_of(sample: Any) -> str:
+    """Return the name of the client, which is the last part of the sample's key."""
+    return str(sample.key_expr).rpartition("/")[2]

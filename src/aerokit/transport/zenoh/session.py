@@ -142,7 +142,7 @@ class NetworkLink(BaseLink):
         super().__init__(address)
         self._session: Any = None  # None while the link is not open
         self._declared: list[Any] = []  # references to all declarations, which would end when garbage-collected
-        self._queue: LoopQueue[Callable[[], object]] | None = None
+        self._queue: LoopQueue[Callable[[], object]] | None = None  # passes calls of zenoh's threads to the loop
         self._timer: asyncio.TimerHandle | None = None
 
     def _on_release(self, session: Any) -> None:
