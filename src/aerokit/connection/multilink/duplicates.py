@@ -29,7 +29,7 @@ COPY_WINDOW_FRAMES = 128
 
 
 class _Seen:
-    """What is known about a frame that was received."""
+    """Record of a received frame: its links, and whether it was admitted and accepted."""
 
     __slots__ = ("at", "count", "is_accepted", "is_admitted", "link_bits")
 

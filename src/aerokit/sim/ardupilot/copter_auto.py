@@ -100,6 +100,7 @@ class _CircleLeg:
         )
 
     def _point(self) -> Ned:
+        """Return the point of the circle at the bearing `_angle`."""
         north = self._centre_north + self._radius * math.cos(self._angle)
         east = self._centre_east + self._radius * math.sin(self._angle)
         return (north, east, self._centre_down)
@@ -132,6 +133,8 @@ class _ClimbLeg:
 
 
 class _ReturnLeg(CopterRtl):
+    """Return to home and landing. Complete when the motors idle on the ground."""
+
     @property
     def is_complete(self) -> bool:
         return self.vehicle.is_landed and self.vehicle.motors.is_idle
@@ -186,7 +189,7 @@ class CopterAuto(MissionMode):
         self._condition_started_at = 0.0
         self._delay_until = 0.0
         self._list_version = -1  # version of the command list from which `_upcoming` was read
-        # The next navigation commands, which decide how the current leg ends.
+        # The current and the next navigation commands, to notice an upload that changes them.
         self._upcoming: tuple[MissionCommand, ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys(_TAKE_OFFS, self._take_off),
@@ -285,6 +288,7 @@ class CopterAuto(MissionMode):
         return has_changed and has_same_index
 
     def _restart_command(self) -> None:
+        """Start the current command again, because an upload has changed what follows it."""
         run = self.vehicle.mission
         if not run.is_running:
             return
@@ -387,6 +391,7 @@ class CopterAuto(MissionMode):
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
+        """Start a leg to a waypoint, at which the copter stops unless the mission continues from there."""
         run = self.vehicle.mission
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
@@ -411,6 +416,7 @@ class CopterAuto(MissionMode):
         self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
 
     def _land(self, item: MissionItem) -> None:
+        """Start a landing, at the place of the command or at the present one."""
         self.vehicle.yaw.hold()
         if (item.x, item.y) == (0, 0):
             self._leg = _DescendLeg(self.vehicle)
@@ -419,7 +425,8 @@ class CopterAuto(MissionMode):
         self._go((north, east, self.vehicle.motion.down))
 
     def _return(self, _: MissionItem) -> None:
-        self._leg = leg = _ReturnLeg(self.vehicle)
+        leg = _ReturnLeg(self.vehicle)
+        self._leg = leg
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:

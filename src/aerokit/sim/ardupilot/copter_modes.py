@@ -92,7 +92,7 @@ class AutoYaw:
         self._control()
 
     def _hold(self) -> None:
-        pass
+        """Do nothing: `Motion` keeps the heading."""
 
     def _turn(self) -> None:
         self._copter.motion.turn(self._rate)
@@ -323,10 +323,10 @@ class CopterRtl(CopterModeBase):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._phase = "climb"
-        self._return_down = 0.0
+        self._phase = "climb"  # "climb", "return", "wait" or "land"
+        self._return_down = 0.0  # altitude of the return
         self._waiting_since = 0.0
-        self._place: Ned = (0.0, 0.0, 0.0)
+        self._place: Ned = (0.0, 0.0, 0.0)  # place to which the copter returns
         self.speed: float = 0.0
 
     def enter(self, *, force: bool) -> bool:

@@ -91,6 +91,7 @@ class ArduPilotMissionServer(MissionServer):
         return Result.ACCEPTED
 
     def _home(self) -> MissionItem:
+        """Return item 0 of a download. Zeros if home is unknown."""
         home = self._vehicle.navigation.home
         if home is None:
             return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
@@ -165,6 +166,7 @@ class ArduPilotMissionServer(MissionServer):
         self._warn(f"Only {self.capacity(count.mission_type)} items are supported")
 
     def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
+        """Prepare the list for an upload. ``first`` and ``end`` are the range of the uploaded items."""
         if isinstance(message, m.MissionCount):
             self._lists[message.mission_type].begin(message.count)
         return super()._begin(message, channel, first, end)
