@@ -37,11 +37,12 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     # Older files have a loiterCoordinate instead of the landingApproachCoordinate.
     approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
     heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # QGroundControl sends these values.
+    x, y, z = _place(pattern["landCoordinate"])
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
         *_reset_items(pattern),
         _approach(pattern, frame, approach),
-        MissionItem(command, frame, 0.0, 0.0, 0.0, heading, *_place(pattern["landCoordinate"])),
+        MissionItem(command, frame, param4=heading, x=x, y=y, z=z),
     )
 
 
@@ -61,12 +62,14 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    # The approach is a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
+    """Create the item of an approach: a waypoint, or a descent in a circle. Older files have only circles."""
+    x, y, z = _place(place)
     if not _flag(pattern, "useLoiterToAlt", default=True):
-        return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
+        return MissionItem(MavCmd.NAV_WAYPOINT, frame, param4=math.nan, x=x, y=y, z=z)
     radius = pattern["loiterRadius"].number(0)
     signed_radius = radius if pattern["loiterClockwise"].boolean() else -radius
-    return MissionItem(MavCmd.NAV_LOITER_TO_ALT, frame, 1.0, signed_radius, 0.0, 1.0, *_place(place))
+    # The vehicle leaves the circle tangentially (param4), as soon as it heads for the next item (param1).
+    return MissionItem(MavCmd.NAV_LOITER_TO_ALT, frame, param1=1.0, param2=signed_radius, param4=1.0, x=x, y=y, z=z)
 
 
 def _flag(pattern: JsonValue, key: str, *, default: bool = False) -> bool:

@@ -171,8 +171,9 @@ def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     altitude = round(place.altitude_m * 1000)
     north, east, down = (round(speed * 100) for speed in _velocity(motion))
     return m.GlobalPositionInt(
-        time, place.latitude_e7, place.longitude_e7, altitude, relative, north, east, down, heading
-    )
+        time, lat=place.latitude_e7, lon=place.longitude_e7, alt=altitude, relative_alt=relative, vx=north, vy=east,
+        vz=down, hdg=heading,
+    )  # fmt: skip
 
 
 def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
@@ -259,7 +260,7 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
     target = guided.destination
     if target is None:  # The submode follows a velocity, not a position.
         vectors = (0.0, 0.0, 0.0, *guided.velocity, *guided.acceleration)
-        return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _VELOCITY_ONLY, *vectors, 0.0, 0.0)
+        return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _VELOCITY_ONLY, *vectors, yaw=0.0, yaw_rate=0.0)
     local = vehicle.navigation.local(target)
     return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _POSITION_ONLY, *local, *(0.0,) * 8)
 

@@ -250,8 +250,12 @@ class Px4Arming:
         px4.is_in_failsafe = True
         px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
         px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")
-        release = float(ParachuteAction.RELEASE)
-        px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, release, *(0.0,) * 6))
+        release, unused_params, confirmation = float(ParachuteAction.RELEASE), (0.0,) * 6, 0
+        px4.send(
+            CommandLong(
+                px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, confirmation, release, *unused_params
+            )
+        )
 
     def start_first_log(self) -> None:
         """Start a log at the boot. This log also records the first flight."""

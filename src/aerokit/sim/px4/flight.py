@@ -62,7 +62,12 @@ class Px4Orbit:
         px4 = self._px4
         place = px4.frame.to_global(*self.middle, self.down)
         return m.OrbitExecutionStatus(
-            px4.time_boot_us, self.radius_m, 0, place.latitude_e7, place.longitude_e7, place.altitude_m
+            px4.time_boot_us,
+            self.radius_m,
+            frame=MavFrame.GLOBAL,
+            x=place.latitude_e7,
+            y=place.longitude_e7,
+            z=place.altitude_m,
         )
 
 

@@ -183,9 +183,9 @@ def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     return m.GlobalPositionInt(
-        px4.time_boot_ms, place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000),
-        round(px4.altitude_m * 1000), round(motion.velocity_north * 100), round(motion.velocity_east * 100),
-        round(motion.velocity_down * 100), centidegrees(motion.yaw),
+        px4.time_boot_ms, lat=place.latitude_e7, lon=place.longitude_e7, alt=round(place.altitude_m * 1000),
+        relative_alt=round(px4.altitude_m * 1000), vx=round(motion.velocity_north * 100),
+        vy=round(motion.velocity_east * 100), vz=round(motion.velocity_down * 100), hdg=centidegrees(motion.yaw),
     )  # fmt: skip
 
 
@@ -209,7 +209,8 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
     heading = int(math.degrees(motion.yaw) % 360.0)
     amsl = px4.frame.origin.altitude_m - motion.down
     return m.VfrHud(
-        px4.airspeed_m_s, motion.ground_speed_m_s, heading, round(px4.throttle * 100), amsl, -motion.velocity_down,
+        airspeed=px4.airspeed_m_s, groundspeed=motion.ground_speed_m_s, heading=heading,
+        throttle=round(px4.throttle * 100), alt=amsl, climb=-motion.velocity_down,
     )  # fmt: skip
 
 
@@ -268,14 +269,16 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
         acceleration = (0.0, 0.0, 100.0)
         mask = _IGNORE_POSITION_AND_VELOCITY
         return m.PositionTargetLocalNed(
-            px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw, 0.0
+            px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw=yaw, yaw_rate=0.0
         )
     # Apart from the position, the simulation sends the present values as the targets.
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
+    nothing_ignored = 0
     return m.PositionTargetLocalNed(
-        px4.time_boot_ms, MavFrame.LOCAL_NED, 0, *px4.flight.target, *velocity, *acceleration, yaw, motion.yaw_rate
-    )
+        px4.time_boot_ms, MavFrame.LOCAL_NED, nothing_ignored, *px4.flight.target, *velocity, *acceleration, yaw=yaw,
+        yaw_rate=motion.yaw_rate,
+    )  # fmt: skip
 
 
 def _servo_output(px4: Px4Vehicle) -> m.ServoOutputRaw:
