@@ -102,7 +102,7 @@ class Bus:
         def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
-            detach_all()
+            detach_all()  # This function is defined below, before the first frame can arrive.
             # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
                 if entry not in entries_before:
@@ -181,6 +181,7 @@ class Bus:
                     _report(sink)
 
     def _attach(self, key: tuple[int, int], entry: _Entry, *, ahead: bool = False) -> Detach:
+        """Add a sink for a (system id, message id), behind the others or, with ``ahead``, before them."""
         entries = self._sinks.get(key, ())
         self._sinks[key] = (entry, *entries) if ahead else (*entries, entry)
         self._plans.clear()

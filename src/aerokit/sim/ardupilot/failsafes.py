@@ -279,10 +279,12 @@ class ArduPilotArming(Generic[HostT]):
         passes_common = not self.common_reasons()
         # After a new failure, the next report is due after `_MIN_REPORT_INTERVAL_S` instead of `_REPORT_INTERVAL_S`.
         self._has_new_failure |= self._passed_common and not passes_common
-        self._passed_common, self.passes = passes_common, not reasons
+        self._passed_common = passes_common
+        self.passes = not reasons
         waited = vehicle.now - self._reported_at
         if waited >= _REPORT_INTERVAL_S or (self._has_new_failure and waited > _MIN_REPORT_INTERVAL_S):
-            self._reported_at, self._has_new_failure = vehicle.now, False
+            self._reported_at = vehicle.now
+            self._has_new_failure = False
             self._send_reasons("PreArm", reasons)
 
     def report(self) -> None:

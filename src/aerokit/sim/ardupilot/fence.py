@@ -86,7 +86,10 @@ class PolygonZone:
 
 
 def _distance_to_side(place: Point, start: Point, end: Point) -> float:
-    (place_north, place_east), (start_north, start_east), (end_north, end_east) = place, start, end
+    """Return the distance from a place to the side between two corners."""
+    place_north, place_east = place
+    start_north, start_east = start
+    end_north, end_east = end
     north, east = end_north - start_north, end_east - start_east
     squared_length = north * north + east * east
     share = 0.0  # Point of the side that is nearest to the place: 0 is the start, 1 the end.
@@ -98,7 +101,9 @@ def _distance_to_side(place: Point, start: Point, end: Point) -> float:
 
 def _crosses(place: Point, start: Point, end: Point) -> bool:
     """Return True if a ray from ``place`` to the north crosses the side."""
-    (place_north, place_east), (start_north, start_east), (end_north, end_east) = place, start, end
+    place_north, place_east = place
+    start_north, start_east = start
+    end_north, end_east = end
     are_ends_on_same_side = (start_east > place_east) == (end_east > place_east)
     if are_ends_on_same_side:
         return False
@@ -228,7 +233,9 @@ class ArduPilotFence(Generic[HostT]):
             self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
-        enable, auto_enable = int(self.vehicle.parameters["FENCE_ENABLE"]), int(self._value("FENCE_AUTOENABLE"))
+        """Enable or disable the fence when its parameters have changed."""
+        enable = int(self.vehicle.parameters["FENCE_ENABLE"])
+        auto_enable = int(self._value("FENCE_AUTOENABLE"))
         if (enable, auto_enable) != self._enabling_parameters:
             self._enabling_parameters = (enable, auto_enable)
             self.enabled = self.configured & ~_MIN_ALT if enable else 0
@@ -329,6 +336,7 @@ class ArduPilotFence(Generic[HostT]):
                 vehicle.send(status)
 
     def _clear(self, kinds: int) -> None:
+        """End the breaches of these kinds."""
         self.breached &= ~kinds
         for kind in _NAMES:
             if kinds & kind:

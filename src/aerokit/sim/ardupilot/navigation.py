@@ -168,6 +168,7 @@ class ArduPilotNavigation:
         self._vehicle.info("GPS 1: detected u-blox")
 
     def _get_fix(self) -> None:
+        """Get the first fix, unless GPS is missing, and watch GPS from now on."""
         if self.is_gps_detected and not self.gps_is_lost:
             self.fix_type = GpsFixType.RTK_FIXED
             if self._vehicle.timeline.uses_dcm_until_gps:
@@ -175,6 +176,7 @@ class ArduPilotNavigation:
         self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_gps)
 
     def _set_origin_when_possible(self) -> None:
+        """Set the estimator's origin and home, or check again in a second if there is no fix yet."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._vehicle.call_later(1.0, self._set_origin_when_possible)
             return
@@ -298,7 +300,8 @@ class SmartPath:
             return
         if self._vehicle.navigation.has_position:
             self._points.append(self._vehicle.motion.place)
-            self._good_at = self._saved_at = self._vehicle.now
+            self._good_at = self._vehicle.now
+            self._saved_at = self._vehicle.now
             self.is_active = True
 
     def take_way_back(self) -> list[Ned]:
