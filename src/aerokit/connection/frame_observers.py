@@ -100,6 +100,7 @@ class Recording:
                 return
 
     def _write(self, raw: bytes, at: float) -> None:
+        """Write a frame, unless it contains a signing key."""
         contains_key = raw[0] == MAGIC_V2 and raw[7:10] == SETUP_SIGNING_ID
         if self._writer is not None and not contains_key:
             try:

@@ -198,6 +198,7 @@ class LinkStateTracker:
         self._set(LinkState.LOST, now, publish=publish)
 
     def _set(self, state: LinkState, now: float, *, publish: bool = True) -> None:
+        """Set the state, and publish a change. The first state is no change."""
         before = self._cell.latest
         if before is not state:
             self._cell.set(state, self._source)

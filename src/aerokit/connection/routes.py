@@ -359,6 +359,7 @@ _SAME_PEER = object()  # stands for the peer in claims of a second sender that s
 
 
 def _peer_name(peer: Peer) -> str:
+    """Return the address of a peer for logs and events."""
     peer = getattr(peer, "peer", peer)  # A peer of a MultiLink contains the peer of one of its links.
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]

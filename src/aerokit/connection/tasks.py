@@ -164,8 +164,10 @@ class Deadlines:
             self._schedule(min(self._deadlines.values()))
 
     def _schedule(self, at: float) -> None:
+        """Set the timer to ``at``, unless it fires earlier anyway."""
         if self._timer is not None and self._timer_at <= at:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer, self._timer_at = self._loop.call_at(at, self._fire, at), at
+        self._timer = self._loop.call_at(at, self._fire, at)
+        self._timer_at = at

@@ -338,6 +338,7 @@ class WaypointLoader:
 
 
 def _checked_index(index: Any, count: int) -> int:
+    """Return the position for an index, which may be negative. IndexError if it is out of range."""
     try:
         position = operator.index(index)
     except TypeError:

@@ -267,6 +267,7 @@ class FlightMethods(VehicleAttributes):
             self._home_location = self._dk_reported_home
 
     def _dk_known_home(self) -> LocationGlobal:
+        """Return home. If it is unknown, request it; APIException if the vehicle has none."""
         if self._home_location is None:
             self._dk.run(self._dk_fetch_home)
         home = self.home_location

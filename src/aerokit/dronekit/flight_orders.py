@@ -343,6 +343,7 @@ class Maintenance(VehicleCore):
 
 
 def _tune_text(tune: str | bytes) -> str:
+    """Check a tune, and return it as text."""
     try:
         text = tune.encode() if isinstance(tune, str) else tune
         notes = text.rstrip(b"\0").decode("ascii")

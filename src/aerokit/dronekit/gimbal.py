@@ -121,6 +121,7 @@ async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
 
 
 def _checked(name: str, value: float) -> float:
+    """Check an angle, and return it in the range of the gimbal."""
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -105,6 +105,7 @@ class ListenerThread:
             self._thread.join(JOIN_TIMEOUT_S)
 
     def _start(self) -> None:
+        """Start the thread, unless it runs or was stopped."""
         with self._lock:
             if self._thread is None and not self.is_stopped:
                 thread = _Thread(target=self._run, name=self._name, daemon=True)

@@ -300,6 +300,7 @@ class Inbox(Mapping[str, Any]):
         return len(self._latest)
 
     def _start(self) -> None:
+        """Start receiving at the first access."""
         with self._frame_arrived:
             if self._started_at is not None:
                 return

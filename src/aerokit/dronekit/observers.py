@@ -231,6 +231,7 @@ class MessageListeners(Listeners):
                 self._detach_by_name[name] = self._listen(name)
 
     def _listen(self, name: str) -> Detach:
+        """Subscribe to the messages of one name, or to all frames."""
         connection = self._handler.connection
         if name == EVERY_NAME:
             return connection.observe_frames(self._on_frame)

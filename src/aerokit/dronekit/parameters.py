@@ -345,6 +345,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return attr_name.upper()
 
     def _find(self, name: object, *, waits: bool = True) -> ResolvedParameter | None:
+        """Look up a parameter by name. With ``waits``, request it if it may still be unknown."""
         if not isinstance(name, str):
             return None
         name = name.upper()

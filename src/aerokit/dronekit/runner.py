@@ -218,6 +218,7 @@ def _split_at_program(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence
 
 
 def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
+    """Serve a simulated vehicle for the program, and print its addresses."""
     from aerokit.dronekit.sitl import parse_home, serve_for_program
     from aerokit.sim.motion import HOME
 
@@ -321,6 +322,7 @@ def _print_program_traceback(kind: type[BaseException], error: BaseException, tr
 
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
+    """Return the part of a traceback that belongs to the program."""
     entry = traceback
     # Skip our frames up to the one that runs the program, then those of runpy.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):

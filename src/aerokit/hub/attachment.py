@@ -218,6 +218,7 @@ class Attachment:
             self._add_port(None)
 
     def _on_down(self) -> None:
+        """Record that the link is lost or closed, and remove its ports."""
         if self._burst:  # The link was lost before it reported the end of the burst.
             self.burst_ended()
         self.is_open = False

@@ -91,6 +91,7 @@ class Filters:
         return 0.0 if rate_hz is None else 1 / rate_hz
 
     def _check(self, field: str, pattern: str) -> None:
+        """Raise InvalidArgument if a pattern matches no message."""
         names = [message_type.NAME for message_type in self._dialect]
         if not any(fnmatchcase(name, pattern) for name in names):
             raise InvalidArgument(

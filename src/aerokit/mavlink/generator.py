@@ -101,6 +101,7 @@ def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tup
 
 
 def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
+    """Return the entries of both enums, sorted by value. An added entry replaces one with the same name."""
     by_name = {entry.name: entry for entry in existing.entries}
     merged = {entry.name: _merged_entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
@@ -411,6 +412,7 @@ def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
 
 
 def _reexports(package: str, names: dict[str, str]) -> str:
+    """Render a stub that imports each name from its module."""
     stub = ""
     for module in sorted(set(names.values())):
         imports = "".join(f"    {name} as {name},\n" for name in sorted(names) if names[name] == module)

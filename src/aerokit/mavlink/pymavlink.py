@@ -125,6 +125,7 @@ def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
 
 
 def _packed(message_class: type[Message], field: Field, items: list[Any]) -> bytes:
+    """Return the items of an array of uint8_t as bytes. InvalidArgument if an item is not a byte."""
     try:
         return bytes(items)
     except (TypeError, ValueError):
@@ -162,8 +163,12 @@ def _error(message_class: type[Message], field: Field, value: Any, problem: str)
 
 # ------------------------------------------------------------------------------------------ texts
 def _original_text(message: Any, name: str) -> Any:
-    # In the text of a received message, pymavlink replaces non-ASCII characters. It also stores the original bytes.
-    text, raw = getattr(message, name), getattr(message, f"_{name}_raw", None)
+    """Return the value of a text field, as bytes if possible.
+
+    In the text of a received message, pymavlink replaces non-ASCII characters. It also stores the original bytes.
+    """
+    text = getattr(message, name)
+    raw = getattr(message, f"_{name}_raw", None)
     if isinstance(raw, bytes) and text == raw.partition(b"\0")[0].decode("ascii", "replace"):
         return raw
     return text

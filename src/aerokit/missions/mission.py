@@ -237,6 +237,7 @@ def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
 
 
 def _read_circle(item: MissionItem, index: int) -> FenceCircle:
+    """Convert an item to a circle of a fence."""
     center = _place(item, index)
     is_inclusion = item.command == MavCmd.NAV_FENCE_CIRCLE_INCLUSION
     try:

@@ -185,6 +185,7 @@ def _missing_in(path: str, value: Any, *keys: str) -> tuple[str, list[str]]:
 
 
 def _read_mission(value: JsonValue) -> Mission:
+    """Read the member ``mission``."""
     value["version"].one_of(2)
     groups = read_entries(value["items"].elements())
     home = value.child("plannedHomePosition")
@@ -232,6 +233,7 @@ def _check_version(value: JsonValue, *content_keys: str) -> int:
 
 
 def _read_polygon(value: JsonValue) -> FencePolygon:
+    """Read one polygon of the fence."""
     corners = value["polygon"]
     places = [_required_place(corner) for corner in corners.elements()]
     if len(places) < 3:

@@ -146,6 +146,7 @@ class _Row:
         )
 
     def _integer(self, column: str, high: int) -> int:
+        """Return the number in a column. FileFormatError if it is not a whole number from 0 to ``high``."""
         text = self.texts[_COLUMNS.index(column)]
         # Every number has at most five digits. int() would take long for a very long text.
         is_short_number = text.isascii() and text.isdigit() and len(text) < 9
@@ -168,6 +169,7 @@ class _Row:
 
 
 def _home_row(home: Position | None) -> str:
+    """Return the first line of items, which is home. Zeros if home is unknown."""
     place = (0.0, 0.0, 0.0)
     if home is not None:
         place = (home.latitude_deg, home.longitude_deg, home.altitude_amsl_m or 0.0)

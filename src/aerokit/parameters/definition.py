@@ -459,6 +459,7 @@ def _is_name(name: str) -> bool:
 
 
 def _number(text: str | None) -> int | float | None:
+    """Parse a number; return None if there is none, or it is not finite."""
     try:
         number = None if text is None else parse_number(text.strip())
         return None if number is None or not math.isfinite(number) else number
@@ -472,6 +473,7 @@ def _int_or_zero(text: str) -> int:
 
 
 def _parse_value(text: str | None, wire_type: int) -> SettingValue | None:
+    """Parse a value of this MAV_PARAM_EXT_TYPE; return None if it is missing or does not fit."""
     value: object = text if wire_type == MavParamExtType.CUSTOM else _number(text)
     try:
         return None if value is None else checked_setting("", value, wire_type)

@@ -308,6 +308,7 @@ def _int_or_none(value: Any) -> int | None:
 
 
 def _number(value: Any) -> int | float | None:
+    """Parse a number; return None for anything else."""
     if not isinstance(value, (int, float, str)):
         return None
     try:

@@ -143,6 +143,7 @@ class Outbox:
         return data
 
     def _drop_outdated(self) -> None:
+        """Drop the buffered writes that have waited longer than `WRITE_TIMEOUT_S`."""
         now = self._loop.time()
         outdated = sum(deadline <= now for deadline, _ in self._waiting)  # The deadlines are in order.
         for _ in range(outdated):

@@ -181,6 +181,7 @@ class ReconnectingLink(Link):
     # ------------------------------------------------------------ callbacks of the current link
 
     def _on_bytes(self, current: _CurrentReceiver, data: bytes, peer: Peer) -> None:
+        """Pass bytes on. The first bytes after a reopening show that the link is back."""
         if current is self._current and self._lost_at is not None:
             self._is_up = True
             self._on_restored()

@@ -288,8 +288,11 @@ class UdpBroadcast(_UdpLink):
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
-        # Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames
-        # before it accepts the port by `keep_peer`.
+        """Return True if another sender than the present peer may be received.
+
+        Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames before
+        it accepts the port by `keep_peer`.
+        """
         host, *_ = source
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)

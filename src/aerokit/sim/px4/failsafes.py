@@ -80,6 +80,7 @@ class Px4Fence:
         return self._areas_allow(north, east)
 
     def _areas_allow(self, north: float, east: float) -> bool:
+        """Return True for a place outside all exclusions, and inside one of the inclusions if there are any."""
         areas = list(self._areas(north, east))
         is_inside_inclusions = [is_inside for is_inclusion, is_inside in areas if is_inclusion]
         is_inside_exclusions = [is_inside for is_inclusion, is_inside in areas if not is_inclusion]

@@ -200,6 +200,7 @@ def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _id_in_control(requested: int, present: int, own: int, sender: int) -> int:
+    """Return the id in control after a request for an id: −2 is the own id, −3 releases control, −1 changes nothing."""
     if requested == _SELF:
         return own
     if requested == _RELEASE:

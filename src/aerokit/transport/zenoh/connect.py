@@ -244,6 +244,7 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
+        """Return why the vehicle side was not found, with the names that were found instead."""
         names = sorted({key.split("/")[2] for key in self._vehicle_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:

@@ -225,7 +225,7 @@ class ZenohListen(NetworkLink):
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        # An extra beacon is sent now, so that the client need not wait for the next periodic one.
+        """Add a client that has come online, and send an extra beacon, so that it need not wait for the next one."""
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
