@@ -353,7 +353,7 @@ class UnderwaterMotion(Motion):
         super().__init__(rng, limits=_LIMITS)
         self.bottom_down = bottom_down
         self.buoyancy_m_s2 = buoyancy_m_s2
-        self._is_floating = False  # True if the vehicle surfaces by its buoyancy
+        self._is_floating = False  # True if the buoyancy, not a target, determines the depth
 
     @property
     def is_on_ground(self) -> bool:

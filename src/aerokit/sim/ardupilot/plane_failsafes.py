@@ -109,7 +109,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _start_short(self, action: int) -> None:
         """Start the short failsafe of the radio. Some modes continue, depending on the action."""
         plane = self.vehicle
-        self.state, self._short_since = _SHORT, plane.now
+        self.state = _SHORT
+        self._short_since = plane.now
         mode = plane.mode.number
         self._mode_before = mode
         # A mode in `_NAVIGATING` continues if the action is "best guess" (events.cpp).
@@ -122,6 +123,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn("RC Short Failsafe On")
 
     def _end_short(self) -> None:
+        """End the short failsafe, and restore the mode unless another one was selected meanwhile."""
         plane = self.vehicle
         self.warn("Short Failsafe Cleared")
         self.state = _NONE
@@ -162,7 +164,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._end_long("RC Long Failsafe Cleared")
 
     def _end_long(self, text: str) -> None:
-        self.state, self._is_long_pending = _NONE, False
+        self.state = _NONE
+        self._is_long_pending = False
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
@@ -248,7 +251,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self._mode_before: int | None = None  # mode before the return; None without a return
+        self._mode_before: int | None = None  # mode before the last return; None before the first
 
     def update(self) -> None:
         super().update()

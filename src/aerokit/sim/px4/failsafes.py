@@ -196,7 +196,8 @@ class Px4Failsafes:
         self._px4.text_links.on_station_heartbeat(channel)
         if not self.has_station and math.isfinite(self._station_at):
             self._px4.info("GCS connection regained")
-        self.has_station, self._station_at = True, self._px4.now
+        self.has_station = True
+        self._station_at = self._px4.now
 
     def _watch_station(self) -> None:
         timeout = self._px4.parameters["COM_DL_LOSS_T"]

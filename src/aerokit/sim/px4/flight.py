@@ -114,7 +114,7 @@ class Px4Flight:
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
         self._phase = ""  # phase of a return: "climb", "return" or "land"
-        self._ramp_began_at = 0.0  # time at which the motors began to speed up for a take-off
+        self._ramp_began_at = 0.0  # time of the lift-off, from which the climb rate grows
         self._is_default_height = False  # True if the take-off command had no altitude
 
     @property
