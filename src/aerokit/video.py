@@ -113,18 +113,19 @@ class VideoStream:
         """Address of the stream."""
         self.missed: int = 0
         """Number of frames dropped because the reader was slow."""
-        self._vehicle = vehicle
+        self._vehicle = vehicle  # source of each frame's position and attitude; None: frames have neither
         self._now = asyncio.get_running_loop().time
-        self._latest: VideoFrame | None = None
+        self._latest: VideoFrame | None = None  # the frame to read next; None after it was read
         self._is_open = False
-        self._end: Exception | None = None
-        self._changed = asyncio.Event()
-        self._has_reader = False
+        self._end: Exception | None = None  # why the stream has ended; EOFError at the end of a file
+        self._changed = asyncio.Event()  # set when one of the attributes above changes
+        self._has_reader = False  # True while a reader waits; a second one is refused
 
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> VideoFrame:
+        """Return the latest frame that was not read yet, or wait for the next one."""
         if self._has_reader:
             raise BusyError("another task already reads this video stream; call open_video() again for a second reader")
         self._has_reader = True
@@ -158,6 +159,7 @@ class VideoStream:
         self._changed.set()
 
     def _on_frame(self, picture: object, stream_s: float | None) -> None:
+        """Replace the frame to read next. Called for each decoded frame."""
         if self._latest is not None:
             self.missed += 1
         vehicle = self._vehicle
@@ -176,10 +178,10 @@ class _Reader(threading.Thread):
 
     def __init__(self, uri: str, options: dict[str, str], timeouts_s: tuple[float, float], stream: VideoStream) -> None:
         super().__init__(name=f"aerokit video {uri}", daemon=True)
-        self.ended = asyncio.Event()
+        self.ended = asyncio.Event()  # set when the thread has ended, or was never started
         self._uri, self._options, self._timeouts_s, self._stream = uri, options, timeouts_s, stream
         self._loop = asyncio.get_running_loop()
-        self._is_stopped = False
+        self._is_stopped = False  # set by stop() on the loop's thread, read by this thread
 
     def start(self) -> None:
         try:
@@ -194,6 +196,7 @@ class _Reader(threading.Thread):
         self._is_stopped = True
 
     def run(self) -> None:
+        """Decode the stream in this thread, and report why it has ended to the event loop."""
         # This error is reported if something other than an Exception, such as SystemExit, ends the thread.
         error: Exception = LinkLost(f"the video of {self._uri} ended")
         try:
@@ -208,6 +211,7 @@ class _Reader(threading.Thread):
             self._call_on_loop(self.ended.set)
 
     def _read(self) -> None:
+        """Pass frames to the event loop until the stream ends or stop() is called. LinkOpenError, or LinkLost later."""
         errors = (self._av.error.FFmpegError, OSError, ValueError, IndexError)
         try:
             container = self._av.open(self._uri, options=self._options, timeout=self._timeouts_s)

@@ -105,11 +105,12 @@ class _Rules:
 
     def __init__(self, function: Callable[..., Any], times_are_above_zero: bool) -> None:
         self._function, self._times_are_above_zero = function, times_are_above_zero
-        self._by_name: dict[str, Rule] | None = None
-        self._positional: tuple[str, ...] = ()
-        self._var_positional = ""
+        self._by_name: dict[str, Rule] | None = None  # rules by parameter name; None before the first call
+        self._positional: tuple[str, ...] = ()  # names of the positional parameters
+        self._var_positional = ""  # name of the parameter ``*args``; "" if there is none
 
     def check(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+        """Raise InvalidArgument if a value in a call of the function is not allowed."""
         rules = self._compute() if self._by_name is None else self._by_name
         names = self._positional
         if self._var_positional:

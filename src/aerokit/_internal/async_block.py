@@ -34,10 +34,13 @@ def async_block(
 
 
 class _Block(AbstractAsyncContextManager[T]):
+    """Context manager that forwards to ``block``, and raises helpful errors when it is misused."""
+
     def __init__(self, name: str, block: AbstractAsyncContextManager[T]) -> None:
         self._name, self._block = name, block
 
     async def __aenter__(self) -> T:
+        """Enter the block. InvalidArgument if no asyncio event loop is running."""
         try:
             asyncio.get_running_loop()
         except RuntimeError:  # No asyncio loop is running, for example in trio.run.
@@ -101,6 +104,7 @@ class ReadOnly:
     """
 
     def __setattr__(self, name: str, value: object) -> None:
+        """Set an attribute of the program or of this library; refuse one that reports the vehicle's state."""
         attribute = inspect.getattr_static(type(self), name, None)
         is_setter = isinstance(attribute, property) and attribute.fset is not None
         is_descriptor = hasattr(type(attribute), "__get__")

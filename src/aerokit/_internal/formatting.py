@@ -58,6 +58,7 @@ def _names(member: Enum) -> Any:
 
 
 def _fields(value: object) -> Mapping[str, object] | None:
+    """Return the fields of an object with ``to_dict()``, a message's name first; None for other objects."""
     to_dict = getattr(value, "to_dict", None)
     if to_dict is None or isinstance(value, type):
         return None

@@ -25,15 +25,17 @@ class _SnapshotType(type):
     """Turns annotated names into slots and generates ``__init__``. Needs ``from __future__ import annotations``."""
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
+        """Create the class. Its fields are those of its bases, followed by its own."""
         annotations: dict[str, str] = namespace.get("__annotations__", {})
         own_fields = tuple(field for field, annotation in annotations.items() if not annotation.startswith("ClassVar"))
-        defaults = {field: value for base in bases for field, value in getattr(base, "_defaults", {}).items()}
-        # A default is removed from the class, because a slot and a class attribute cannot have the same name.
-        defaults.update({field: namespace.pop(field) for field in own_fields if field in namespace})
+        defaults: dict[str, Any] = {}
         fields: tuple[str, ...] = ()
         for base in bases:
+            defaults.update(getattr(base, "_defaults", {}))
             fields += getattr(base, "__match_args__", ())
         fields += own_fields
+        # A default is removed from the class, because a slot and a class attribute cannot have the same name.
+        defaults.update({field: namespace.pop(field) for field in own_fields if field in namespace})
         cls = super().__new__(mcs, name, bases, {**namespace, "__slots__": own_fields, "__match_args__": fields})
         if own_fields:
             type.__setattr__(cls, "__init__", _lazy_init(cls))
@@ -57,7 +59,11 @@ class _SnapshotType(type):
 
 
 def _lazy_init(cls: Any) -> Callable[..., None]:
-    # __init__ is generated when it is first called, because a program creates values of only a few of these classes.
+    """Return an ``__init__`` that generates and calls the real one, and is replaced by it.
+
+    A program creates values of only a few of these classes, and generating takes time.
+    """
+
     def generate_and_call(self: object, *args: Any, **kwargs: Any) -> None:
         init = _generate_init(cls)
         type.__setattr__(cls, "__init__", init)

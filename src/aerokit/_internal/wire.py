@@ -15,6 +15,7 @@ _VERSION = 1  # Must equal VERSION in _wire.c, so that an outdated build of the 
 
 
 def _load() -> Any:
+    """Return the compiled module; None if it is missing, out of date, or turned off by AEROKIT_PURE."""
     if os.environ.get("AEROKIT_PURE", "") not in ("", "0"):
         return None
     try:

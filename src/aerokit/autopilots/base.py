@@ -357,6 +357,7 @@ class Autopilot:
         return tuple(self.modes.find(name) for name in sorted(names))
 
     def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+        """Return the mode that a DO_SET_MODE with these parameters sets; nothing without a custom mode."""
         base_mode, custom_mode = mode_numbers((*params, 0.0, 0.0)[:2])  # Missing parameters are 0.
         return (self.mode(custom_mode, base_mode, extra),) if base_mode & CUSTOM_MODE_ENABLED else ()
 

@@ -78,6 +78,7 @@ class ModeTable:
         return Mode(self.name_of(number, extra), number)
 
     def _number_of(self, name: str, extra: Mapping[int, str]) -> int:
+        """Return the number of the mode that has this name, or of a text such as "MODE 42" or "42"."""
         key = _key(name)
         if key in self._numbers:
             return self._numbers[key]

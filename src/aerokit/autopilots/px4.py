@@ -147,7 +147,8 @@ class Px4(Autopilot):
         "take_off": "TAKEOFF",
         "mission": "MISSION",
     }
-    can_shut_down = tunes_by_command = True
+    can_shut_down = True
+    tunes_by_command = True
     mission_storage = "px4"
     mission_upload_window = 6
     reports_mission_checksum = True
@@ -198,10 +199,12 @@ class Px4(Autopilot):
 
     def mode_order(self, mode: Mode) -> ModeOrder:
         # param2 is the main mode, param3 the sub mode.
-        main, sub = mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24
+        main = mode.custom_mode >> 16 & 0xFF
+        sub = mode.custom_mode >> 24
         return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
 
     def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+        """Return the mode that a DO_SET_MODE with these parameters sets; nothing without a custom mode."""
         base_mode, main, sub = mode_numbers((*params, 0.0, 0.0, 0.0)[:3])  # Missing parameters are 0.
         if not base_mode & CUSTOM_MODE_ENABLED:
             return ()

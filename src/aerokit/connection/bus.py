@@ -102,7 +102,7 @@ class Bus:
         def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
-            detach_all()
+            detach_all()  # This function is defined below, before the first frame can arrive.
             # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
                 if entry not in entries_before:
@@ -181,6 +181,7 @@ class Bus:
                     _report(sink)
 
     def _attach(self, key: tuple[int, int], entry: _Entry, *, ahead: bool = False) -> Detach:
+        """Add a sink for a (system id, message id), behind the others or, with ``ahead``, before them."""
         entries = self._sinks.get(key, ())
         self._sinks[key] = (entry, *entries) if ahead else (*entries, entry)
         self._plans.clear()
@@ -340,12 +341,12 @@ class Subscription(Generic[ItemT]):
         self.missed: int = 0
         """Number of items that were dropped because the reader was too slow."""
         self._attach = attach
-        self._detachers: list[Detach] = []
+        self._detachers: list[Detach] = []  # functions that end the subscription; empty before the `with` block
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._has_reader = False
+        self._has_reader = False  # True while a reader waits; a second one is refused
         self._waiter: asyncio.Future[None] | None = None  # set while a reader waits
-        self._error: Exception | None = None
+        self._error: Exception | None = None  # raised in the reader once the queue is empty
         self._closed = False
 
     def __enter__(self) -> Self:
@@ -407,6 +408,7 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
+        """Queue an item and wake the reader. Called with each item of the subscribed types."""
         if self._closed:  # An earlier sink of the same delivery has closed this subscription.
             return
         if len(self._queue) < self._capacity:
@@ -425,6 +427,7 @@ class Subscription(Generic[ItemT]):
             self.close(SubscriptionOverflow(f"the reader was too slow: {self._capacity} items are already queued"))
 
     async def _wait(self) -> None:
+        """Wait until an item is queued or the subscription is closed. BusyError if another reader waits."""
         if self._has_reader:
             raise BusyError("another task already reads this subscription; open a second one for another reader")
         self._has_reader, self._waiter = True, asyncio.get_running_loop().create_future()

@@ -91,16 +91,16 @@ class StateCell(Generic[T]):
         """Names of the messages that carry the value."""
         # Returns why no values arrive, for time-out errors; "" if unknown.
         self._explain_timeout: Callable[[], str] = _no_explanation
-        self._known = False
+        self._known = False  # False before the first value and after `forget`; `_latest` then has no meaning
         self._latest: T | None = None
         self._source: Source | None = None
         self._updated_at = -math.inf
         self._arrivals = 0  # number of values set so far
         self._changes = 0  # number of values that differed from the value before
-        self._sinks: list[_Sink[T]] = []
+        self._sinks: list[_Sink[T]] = []  # waiters and observers
         self._followers = 0  # number of iterators
-        self._feeds: tuple[Feed, ...] = ()
-        self._close_error: BaseException | None = None
+        self._feeds: tuple[Feed, ...] = ()  # decode pending messages before the cell is read
+        self._close_error: BaseException | None = None  # set when no more values will arrive
 
     # ------------------------------------------------------------------------------ reading
 
@@ -322,7 +322,8 @@ class Changes(AsyncIterator[T]):
         cell._follow()
         self._cell = cell
         self._every_arrival = every_arrival
-        # The current value counts as unread, because iteration starts with it.
+        # Number of values read so far, counted as `_total` does. The current value counts as unread, because iteration
+        # starts with it.
         self._read_count = self._total() - (1 if cell.is_known else 0)
         self._missed = 0
 
@@ -394,12 +395,14 @@ class _Waiter(_Sink[T]):
         self._held_for = held_for
         self._loop = asyncio.get_running_loop()
         self._future: asyncio.Future[T | None] = self._loop.create_future()
-        self._error: BaseException | None = None
-        self._hold_timer: asyncio.TimerHandle | None = None
+        self._error: BaseException | None = None  # raised by `wait` instead of returning a value
+        self._hold_timer: asyncio.TimerHandle | None = None  # runs while the predicate is true
+        # Last values that differ from the value before, for the time-out error.
         self._seen: deque[T] = deque(maxlen=_MAX_LISTED_VALUES)
-        self._seen_count = 0
+        self._seen_count = 0  # number of values received, equal ones included
 
     async def wait(self, timeout: float | None, description: str) -> T:
+        """Return the value that met the condition. Raise OperationTimeout after ``timeout`` seconds."""
         timer = None if timeout is None else self._loop.call_later(timeout, self._expire, timeout, description)
         try:
             value = await self._future
@@ -413,6 +416,7 @@ class _Waiter(_Sink[T]):
         return value  # type: ignore[return-value]
 
     def receive(self, value: T) -> None:
+        """Check the predicate for a new value: end the wait, or start or stop the timer that measures ``held_for``."""
         if self._future.done():
             return
         self._record(value)
@@ -455,6 +459,7 @@ class _Waiter(_Sink[T]):
             self._seen.append(value)
 
     def _timeout_text(self, timeout: float, description: str) -> str:
+        """Return the text of the time-out error: the condition, the last values, and why no values arrive."""
         text = f"{description or self._cell.name}: not reached within {timeout:g} s; {self._cell._describe()}"
         if self._held_for > 0:
             text += f"; the condition had to be true for {self._held_for:g} s without a break"
@@ -473,9 +478,10 @@ class _Observer(_Sink[T]):
         self._cell = cell
         self._every_arrival = every_arrival
         self._callback = callback
-        self._previous = cell.latest
+        self._previous = cell.latest  # None if no value is known
 
     def receive(self, value: T) -> None:
+        """Call the callback if the value has changed, or in any case with ``every_arrival``."""
         previous, self._previous = self._previous, value
         if self._every_arrival or previous is None or previous != value:
             try:

@@ -112,25 +112,28 @@ class Connection:
         """State of the link, from frames of any sender; ``vehicle.link_state`` is about one vehicle."""
         self.deadlines: Deadlines = Deadlines()
         self._clock = loop_clock()
-        self._unix_epoch_s = time.time() - self._clock()
+        self._unix_epoch_s = time.time() - self._clock()  # seconds since 1970 at loop time 0
         self._encoder = FrameEncoder(source_system, source_component, version=mavlink_version)
         self._gate = SignatureGate(self._encoder, self.unix_time, self.bus.publish)
         self.signing = signing
         make_routes = partial(Routes, link, self.bus.publish, self.attached, self.boot_clocks, may_move=may_move)
+        # None with a single link; otherwise the same object as `_routes`.
         self._multilink = self._make_multilink(make_routes) if link.is_multilink else None
         self._routes: Routes | MultiLinkRoutes = self._multilink or make_routes()
         self._receiver = FrameReceiver(link, self.bus, self._routes, self._multilink, self._gate, self._clock)
         self._observers = self._receiver.observers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = self._receiver.heartbeats
         """Last HEARTBEAT of every (system id, component id) on the link."""
-        self.keeps_peers = True
+        self.keeps_peers = True  # The link asks for this; see `aerokit.transport.link.PeerKeeper`.
         self._background = BackgroundTasks(self.fail)
         self._owns_link = True  # False if the link turns out to belong to another connection
         self._state_watch = LinkStateTracker(self.link_state, self.bus, system_id=0)
         self._end_signal = EndSignal()
+        # None: this program sends no heartbeat.
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
 
     def _make_multilink(self, make_routes: Callable[[], Routes]) -> MultiLinkRoutes:
+        """Create the routes over several links, which get a :class:`Routes` of their own for each link."""
         # Imported here because few programs have several links.
         from aerokit.connection.multilink.routes import MultiLinkRoutes
         from aerokit.transport.multilink import MultiLink
@@ -489,6 +492,7 @@ class Connection:
             await self.link.wait_closed()
 
     def _start(self) -> None:
+        """Start the tasks that run until the connection ends. Called once, when the link is open."""
         self._state_watch.record_activity(self._clock())
         self._receiver.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
@@ -506,6 +510,7 @@ class Connection:
             await anyio.sleep(HEARTBEAT_INTERVAL_S)
 
     def _end(self, error: Exception) -> None:
+        """End the connection because of ``error``, which all waiters and later calls raise. Idempotent."""
         if not self.is_open:
             return
         self._end_signal.error = error  # Set first, so that sinks of the following events find the connection closed.
@@ -531,6 +536,7 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
+        """Write a frame to the peers of its target. ``message`` None: the target is unknown, so all peers get it."""
         system_id = getattr(message, "target_system", 0) if to is None else to
         for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
             self.link.write(data, peer)

@@ -44,7 +44,8 @@ class ExchangeRun(Generic[ResultT]):
 
     def __init__(self, connection: Connection, exchange: Exchange[ResultT]) -> None:
         self._connection, self._exchange = connection, exchange
-        self._deadline: float | None = None
+        self._deadline: float | None = None  # loop time of the timer that is set; None if no timer is set
+        # Set when the exchange is done or has failed.
         self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     async def result(self) -> ResultT:
@@ -76,6 +77,7 @@ class ExchangeRun(Generic[ResultT]):
         self._after_step()
 
     def _expire(self) -> None:
+        """Inform the exchange that its deadline has passed. Called by the timer."""
         now = self._connection.now()
         if self._deadline is not None:
             # A timer may fire early by the clock's resolution. `expire` would then find that nothing is due yet.
@@ -88,6 +90,7 @@ class ExchangeRun(Generic[ResultT]):
         self._after_step()
 
     def _after_step(self) -> None:
+        """Send what the exchange wants to send, and set its next deadline or end it. Called after each step."""
         exchange = self._exchange
         try:
             for message in exchange.take_outbox():

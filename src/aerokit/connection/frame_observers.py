@@ -48,9 +48,9 @@ class Recording:
 
     def __init__(self, path: str | os.PathLike[str], now: float) -> None:
         self._path = os.fspath(path)
-        self._unix_epoch_s = time.time() - now
-        self._writer: TlogWriter | None = None
-        self._file: BinaryIO | None = None
+        self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
+        self._writer: TlogWriter | None = None  # None before the first received frame and after the end
+        self._file: BinaryIO | None = None  # the file, if it was created here
         # Sent frames that wait until a frame is received and the existing file is renamed. None: no frame must wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
@@ -100,6 +100,7 @@ class Recording:
                 return
 
     def _write(self, raw: bytes, at: float) -> None:
+        """Write a frame, unless it contains a signing key."""
         contains_key = raw[0] == MAGIC_V2 and raw[7:10] == SETUP_SIGNING_ID
         if self._writer is not None and not contains_key:
             try:
@@ -133,6 +134,7 @@ class Recording:
                 file.close()
 
     def _abort(self, error: OSError) -> None:
+        """End the recording because of an error, which is logged. The connection continues."""
         self._report(error)
         try:
             self._close()

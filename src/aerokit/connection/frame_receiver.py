@@ -58,8 +58,8 @@ class PeerTable:
         self._evictable_peers, self._on_evict = evictable_peers, on_evict
         self.framers: dict[Peer, Framer] = {}
         """Framers of verified peers."""
-        self._unverified: dict[Peer, Framer] = {}
-        self._limit = SourceLimit(MAX_SENDERS)
+        self._unverified: dict[Peer, Framer] = {}  # framers of senders without a valid frame, oldest first
+        self._limit = SourceLimit(MAX_SENDERS)  # bounds the number of counters that all framers have together
 
     def __iter__(self) -> Iterator[Framer]:
         yield from self.framers.values()
@@ -88,6 +88,7 @@ class PeerTable:
             self._link.keep_peer(peer)
 
     def forget(self, peer: Peer) -> Framer | None:
+        """Remove a peer here and in the link. Return its framer; None if the peer is unknown."""
         framer = self.framers.pop(peer, None) or self._unverified.pop(peer, None)
         if framer is not None:
             framer.close()
@@ -149,7 +150,7 @@ class FrameReceiver:
         """Last HEARTBEAT of every (system id, component id) on the link."""
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
-        self._is_closed = False
+        self._is_closed = False  # True once the connection has ended; frames are then dropped
         bus.one_at_a_time = multilink is not None
         gate.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
@@ -172,6 +173,7 @@ class FrameReceiver:
         self._peers.reset()
 
     def receive(self, data: bytes, peer: Peer) -> None:
+        """Deliver the frames in received bytes. Frames that need no checks are delivered together, on a fast path."""
         now = self._clock()
         if now > self._loop_watch.late_after:
             now = self._loop_watch.arrival(now)
@@ -280,8 +282,11 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        # Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
-        # it as a replay.
+        """Return True if the signature check admits a frame.
+
+        Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
+        it as a replay.
+        """
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)

@@ -128,9 +128,9 @@ class HeartbeatWatchdog:
             mavlink_version=3,
         )
         self.activity: ActivityMonitor = ActivityMonitor(clock)
-        self._limit_s = settings.fed_within_s
+        self._limit_s = settings.fed_within_s  # None: heartbeats never pause
         self._clock, self._publish = clock, publish
-        self._paused_at: float | None = None
+        self._paused_at: float | None = None  # None while heartbeats are sent
 
     def watch(self, activity: ActivityMonitor, fed_within_s: float) -> None:
         """Pause the heartbeat when this activity ends. ``fed_within_s`` is the limit if the settings have none."""
@@ -168,7 +168,7 @@ class LinkStateTracker:
     def __init__(self, cell: StateCell[LinkState], bus: Bus, *, system_id: int, component_id: int = 0) -> None:
         self._cell, self._bus = cell, bus
         self._source = Source(system_id, component_id, "link")
-        self._frames = 0
+        self._frames = 0  # number of frames at the last update
 
     @property
     def state(self) -> LinkState | None:
@@ -198,6 +198,7 @@ class LinkStateTracker:
         self._set(LinkState.LOST, now, publish=publish)
 
     def _set(self, state: LinkState, now: float, *, publish: bool = True) -> None:
+        """Set the state, and publish a change. The first state is no change."""
         before = self._cell.latest
         if before is not state:
             self._cell.set(state, self._source)

@@ -71,19 +71,19 @@ class LoopWatch:
         self._on_blocked, self._on_slept, self._on_caught_up = on_blocked, on_slept, on_caught_up
         self._suspended = suspended
         # The largest of three readings is used, because a single reading may be too small; see `_detect_sleep`.
-        self._suspended_before = max(suspended() for _ in range(3))
+        self._suspended_before = max(suspended() for _ in range(3))  # seconds of suspension at the last check
         self.late_after: float = math.inf
         """Data that is read before this loop time has not waited. For data that is read later, call :meth:`arrival`."""
         self._ran_at = self._loop.time()  # when the loop last ran, as far as known
         self._due = self._ran_at  # when the timer should fire
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.TimerHandle | None = None  # None before start() and after close()
         self.oldest_arrival: float = math.inf
         """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
         # The last times at which the computer woke, with the seconds for which it was suspended.
         self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
         self._check_sleep_at = -math.inf  # The clocks are not read again before this time, because reading is slow.
-        self._has_read = False
-        self._idle_iterations = 0
+        self._has_read = False  # True if data was read since the last call of `_end_assumption_when_idle`
+        self._idle_iterations = 0  # number of consecutive loop iterations in which nothing was read
 
     def start(self) -> None:
         self._set_timer(self._loop.time())
@@ -122,6 +122,7 @@ class LoopWatch:
         return sum(seconds for woke_at, seconds in self._sleeps if woke_at > at)
 
     def _tick(self) -> None:
+        """Report the pause if the timer fired late, and set the timer again."""
         now = self._loop.time()
         late_s = now - self._due
         has_slept = self._detect_sleep()
@@ -149,6 +150,7 @@ class LoopWatch:
         return True
 
     def _set_timer(self, now: float) -> None:
+        """Record that the loop runs at time ``now``, and set the timer for the next check."""
         self._ran_at, self._due = now, now + CHECK_INTERVAL_S
         if self.oldest_arrival == math.inf:
             self.late_after = now + CHECK_INTERVAL_S / 2

@@ -132,6 +132,7 @@ def _import_messages() -> None:
 def _create_link(
     address: str | Link | Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None
 ) -> Link:
+    """Create the link for the ``address`` argument of `open_connection`, or return the link object given there."""
     if isinstance(address, str):
         make_link = partial(create_link, address, baud=baud, peers=peers)
         return ReconnectingLink(make_link) if reconnect else make_link()
@@ -150,6 +151,7 @@ def _create_link(
 
 
 def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
+    """Create one link from a list of addresses and links. A list of one item gives that item's link."""
     if not isinstance(addresses, (list, tuple)) or not all(isinstance(address, (str, Link)) for address in addresses):
         raise InvalidArgument(
             f"address = {short_repr(addresses)} is not allowed: it must be an address, a link, or a list of them"
@@ -182,8 +184,10 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
 
 
 def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | LinkAddress]) -> None:
-    # An address that is listed twice is refused here. Otherwise its second link could not be opened, and the error
-    # would look like a broken link.
+    """Raise InvalidArgument if an address is listed twice.
+
+    Otherwise its second link could not be opened, and the error would look like a broken link.
+    """
     seen: set[object] = set()
     for address, target in zip(addresses, targets):  # noqa: B905 - equal lengths
         key = _target_key(target)
@@ -226,6 +230,8 @@ def explain_no_vehicle(connection: Connection, wanted_system: int | None) -> str
 
 
 class _Diagnosis:
+    """Counts of everything received so far, summed over all peers."""
+
     def __init__(self, connection: Connection, wanted_system: int | None) -> None:
         self._wanted_system = wanted_system
         self._heartbeats = connection.heartbeats
@@ -250,8 +256,9 @@ class _Diagnosis:
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        # Noise contains a few patterns that look like frames of an unknown dialect. Such a dialect is therefore only
-        # diagnosed if most bytes belong to frames.
+        """Explain why bytes were received, but no valid frame."""
+        # Noise contains a few patterns that look like frames of an unknown dialect. An unknown dialect is therefore
+        # only diagnosed if most bytes belong to frames.
         received = f"{self._bytes} bytes were received"
         is_mostly_framed = 2 * self._bad_bytes < self._bytes
         if self._unknown_frames and is_mostly_framed:
@@ -265,6 +272,7 @@ class _Diagnosis:
         return f"{received}, but no MAVLink frame: wrong baud rate, or another protocol?"
 
     def _without_heartbeats(self) -> str:
+        """Explain why frames were received, but no accepted heartbeat."""
         received = f"{self._frames} frames were received"
         if self._signature_problems:
             return f"{received}; {self._signature_problems}"

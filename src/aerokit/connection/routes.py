@@ -127,6 +127,8 @@ EVERY_PEER: tuple[Peer, ...] = (None,)
 
 
 class _Route:
+    """Route to one component: the peer that owns it, and what is known about the owner's stream."""
+
     __slots__ = ("counters", "expected", "heartbeat_at", "peer", "rate", "sequence", "silent_since")
 
     peer: Peer
@@ -171,10 +173,10 @@ class Routes:
     ) -> None:
         self._link, self._publish, self._attached = link, publish, attached
         self._boot_clocks = {} if boot_clocks is None else boot_clocks
-        self._may_move = may_move
+        self._may_move = may_move  # True: a silent system may move to any host
         self._routes: dict[ComponentId, _Route] = {}
-        self._claims: dict[tuple[ComponentId, Peer], RouteClaim] = {}
-        self._swept_at = 0.0
+        self._claims: dict[tuple[ComponentId, Peer], RouteClaim] = {}  # by component and claiming peer
+        self._swept_at = 0.0  # time of the last removal of expired routes
 
     def record_heartbeat(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
         """Record a heartbeat received from this peer. Return False if the table is full."""
@@ -281,6 +283,7 @@ class Routes:
         }
 
     def _claim(self, source: ComponentId, peer: Peer) -> RouteClaim:
+        """Return the claim of this peer to the component's route; make one if there is none."""
         key = source, peer
         claim = self._claims.get(key)
         if claim is None:
@@ -315,6 +318,7 @@ class Routes:
         return Evidence(expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
+        """Send to ``peer`` from now on, and drop all claims to the route, because they refer to the old owner."""
         before, route.peer = route.peer, peer
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
@@ -323,6 +327,7 @@ class Routes:
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
+        """Publish, once for each claim, that a second sender uses the ids, and that its claim is refused."""
         source = frame.system_id, frame.component_id
         may_be_owner = is_same_host and claim.may_continue_owner  # The owner may just have changed its port.
         if not claim.is_duplicate_reported and not may_be_owner:
@@ -354,6 +359,7 @@ _SAME_PEER = object()  # stands for the peer in claims of a second sender that s
 
 
 def _peer_name(peer: Peer) -> str:
+    """Return the address of a peer for logs and events."""
     peer = getattr(peer, "peer", peer)  # A peer of a MultiLink contains the peer of one of its links.
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]

@@ -38,10 +38,10 @@ class SignatureGate:
         self, encoder: FrameEncoder, unix_time: Callable[[], float], publish: Callable[[Event], object]
     ) -> None:
         self._encoder, self._unix_time, self._publish = encoder, unix_time, publish
-        self._reported: set[Refusal] = set()
+        self._reported: set[Refusal] = set()  # reasons that were already logged
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True until the `with` block of key_handover() ends
-        self._logged_keep_error: OSError | None = None
+        self._logged_keep_error: OSError | None = None  # error of the last check; None if the file could be written
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = lambda: None
@@ -114,6 +114,7 @@ class SignatureGate:
         return self._encoder.signing is not None and bool(frame.incompat_flags & SIGNED)
 
     def _report(self, frame: Frame, signing: Signing, refusal: Refusal) -> None:
+        """Log the first refusal for a reason, and publish it as an event."""
         source = frame.system_id, frame.component_id
         logger.warning(
             "a frame of %d/%d was refused: %s (%r); further refused frames are counted, but not logged",
@@ -153,7 +154,8 @@ class _Handover:
 
     def __init__(self, signing: Signing | None, source: tuple[int, int], switched: asyncio.Event) -> None:
         self.signing, self.switched = signing, switched
-        self._source = source
+        self._source = source  # (system id, component id)
+        # Number of unsigned frames since the last signed one, and the time of the first of them.
         self._unsigned, self._unsigned_since = 0, 0.0
 
     def concerns(self, frame: Frame) -> bool:

@@ -93,7 +93,7 @@ class Cancellation:
     """
 
     def __init__(self) -> None:
-        self._scope: anyio.CancelScope | None = None
+        self._scope: anyio.CancelScope | None = None  # None before the block is entered
         self._is_cancelled = False
 
     def cancel(self) -> None:
@@ -131,8 +131,8 @@ class Deadlines:
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
-        self._deadlines: dict[Alarm, float] = {}
-        self._timer: asyncio.TimerHandle | None = None
+        self._deadlines: dict[Alarm, float] = {}  # loop time at which each alarm is called
+        self._timer: asyncio.TimerHandle | None = None  # None while there is no deadline
         self._timer_at = 0.0  # Stored here, because uvloop's TimerHandle does not return a time in the past.
 
     def set(self, alarm: Alarm, at: float) -> None:
@@ -151,9 +151,12 @@ class Deadlines:
             self._timer = None
 
     def _fire(self, timer_at: float) -> None:
+        """Call the alarms that are due, and set the timer for the next one.
+
+        An alarm is due if the timer was set for its time or later. The clock is not read, because a loop may fire a
+        timer slightly early.
+        """
         self._timer = None
-        # An alarm is due if the timer was set for its time or later. The clock is not read, because a loop may fire a
-        # timer slightly early.
         for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
             if self._deadlines.pop(alarm, None) is not None:  # None if another alarm of this list has cancelled it
                 alarm()
@@ -161,8 +164,10 @@ class Deadlines:
             self._schedule(min(self._deadlines.values()))
 
     def _schedule(self, at: float) -> None:
+        """Set the timer to ``at``, unless it fires earlier anyway."""
         if self._timer is not None and self._timer_at <= at:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer, self._timer_at = self._loop.call_at(at, self._fire, at), at
+        self._timer = self._loop.call_at(at, self._fire, at)
+        self._timer_at = at

@@ -132,8 +132,8 @@ class VehicleAttributes(VehicleCore):
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
         core = self._dk
-        # Core.on() and Core.announce() return an object that holds the latest message of the type.
         self._location = Locations(self)
+        # Core.on() and Core.announce() return an object that holds the latest message of the type.
         core.on(m.Heartbeat, self._dk_on_heartbeat)
         self._dk_position = core.announce(m.GlobalPositionInt, "velocity")
         self._dk_vfr_hud = core.announce(m.VfrHud, "heading", "airspeed", "groundspeed")
@@ -276,7 +276,8 @@ class VehicleAttributes(VehicleCore):
             self._dk.listeners.announce("rangefinder")
 
     def _dk_on_ekf_status(self, message: m.EkfStatusReport | m.EstimatorStatus) -> None:
-        flags = self._dk_ekf_flags = message.flags
+        flags = message.flags
+        self._dk_ekf_flags = flags
         if self._armed:
             self._dk_ekf_ok = bool(flags & POS_HORIZ_ABS) and not flags & CONST_POS_MODE
         else:
@@ -294,4 +295,6 @@ class VehicleAttributes(VehicleCore):
         self._dk.listeners.notify("autopilot_version", message.flight_sw_version)
 
     def _dk_set_home(self, lat: float, lon: float, alt: float | None) -> None:
-        self._home_location = self._dk_reported_home = LocationGlobal(lat, lon, alt)
+        home = LocationGlobal(lat, lon, alt)
+        self._home_location = home
+        self._dk_reported_home = home

@@ -77,7 +77,7 @@ class Channels(_ChannelDict):
         super().__init__()
         self._core = core = core_of(vehicle)
         self._count = 0
-        self._changing = threading.Lock()
+        self._changing = threading.Lock()  # held while the number of channels or their values change
         self._overrides = ChannelsOverride(vehicle)
         self._set_count(count)
         core.on(RcChannels, self._on_channels)
@@ -133,7 +133,8 @@ class Channels(_ChannelDict):
         self._core.listeners.notify("channels", self)
 
     def _set_count(self, count: int) -> None:
-        self._count = self._overrides.count = count
+        self._count = count
+        self._overrides.count = count
         dict.update(self, {number: self.get(number) for number in NUMBERS[:count]})
 
 
@@ -156,7 +157,7 @@ class ChannelsOverride(_ChannelDict):
         self.count = MIN_CHANNELS
         """Number of channels that can be overridden."""
         self._released: set[str] = set()  # channels above 8 in this set are released again with every message
-        self._changing = threading.RLock()
+        self._changing = threading.RLock()  # held from the check of a change to its message
 
     def __setitem__(self, channel: str | int, value: float | None) -> None:
         self._change({channel: value})
@@ -235,6 +236,7 @@ class ChannelsOverride(_ChannelDict):
         return checked
 
     def _send(self, active: dict[str, int], released: set[str]) -> None:
+        """Send RC_CHANNELS_OVERRIDE with the overridden channels, and with the channels to release."""
         aio = self._core.check_link()
         if aio.connection.mavlink_version == 1 and any(int(channel) > MIN_CHANNELS for channel in active):
             raise APIException("channels above 8 need MAVLink 2, and this vehicle uses MAVLink 1")

@@ -52,7 +52,7 @@ class ClassicConnection:
         self.listener_thread: ListenerThread = ListenerThread()
         self.listener_thread.on_called = loop.activity.feed  # Each callback shows that the program does not hang.
         self.loop = loop
-        self._context = context
+        self._context = context  # the block of `open_connection`, which close() leaves
         self.connection: Connection = context.value
         """The asynchronous connection, for code that runs on its loop."""
         self.calls: BackgroundCalls = BackgroundCalls(loop)
@@ -62,9 +62,11 @@ class ClassicConnection:
         self.note_sent: Callable[[Message], None] = lambda message: None
         """Called on the loop with each sent message, because a message may overrule earlier orders."""
         self.vehicle: Any = None
-        self._is_closed = threading.Event()
-        self._closing = threading.Lock()
+        """The vehicle on this connection; None before it is connected."""
+        self._is_closed = threading.Event()  # set when close() was called
+        self._closing = threading.Lock()  # held while one thread decides to close
         self._close_callbacks: list[Callable[[], object]] = []
+        # Closes the connection when the interpreter exits, without keeping this object alive until then.
         self._exit_callback = weak_callback(self.close)
         atexit.register(self._exit_callback)
         loop.when_dropped(
@@ -170,8 +172,8 @@ class BackgroundCalls:
 
     def __init__(self, loop: LoopThread) -> None:
         self._loop = loop
-        self._newest: dict[str, BackgroundCall] = {}
-        self._pending: set[BackgroundCall] = set()
+        self._newest: dict[str, BackgroundCall] = {}  # the running call of each kind
+        self._pending: set[BackgroundCall] = set()  # calls that have not ended
         self.describe: Callable[[], str] | None = None
         """Describes the vehicle's state in the warning about a rejected command."""
 
@@ -209,6 +211,7 @@ class BackgroundCalls:
             concurrent.futures.wait(pending, timeout)
 
     def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
+        """Start the task of a call, which replaces the running call of its kind. Runs on the loop."""
         kind = SHARED_KINDS.get(call.kind, call.kind)  # Disarming and arming replace each other.
         if kind in self._newest:
             self._cancel(self._newest[kind])  # The new call replaces it.
@@ -223,6 +226,7 @@ class BackgroundCalls:
             call.task.cancel()
 
     def _end(self, kind: str, call: BackgroundCall) -> None:
+        """Forget a call whose task has ended. If the task was cancelled, the call fails with ConnectionClosed."""
         if self._newest.get(kind) is call:
             del self._newest[kind]
         if not call.done():  # The task was cancelled before it had a result.
@@ -283,7 +287,7 @@ class OverrideRelease:
 
     def __init__(self) -> None:
         self.is_enabled = True
-        self._overridden: dict[tuple[int, int], set[int]] = {}
+        self._overridden: dict[tuple[int, int], set[int]] = {}  # (system id, component id) → channels
 
     def note_sent(self, message: Message) -> None:
         """Record which channels a sent RC_CHANNELS_OVERRIDE overrides or releases; ignore other messages."""

@@ -127,13 +127,13 @@ class CommandSequence:
 
     def __init__(self, vehicle: VehicleAttributes) -> None:
         self._vehicle, self._core = vehicle, core_of(vehicle)
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # protects `_state`, `_vehicle_content` and the download
         self._state = SequenceState()
         # Content of the vehicle's mission after the last download or upload.
         self._vehicle_content: tuple[tuple[Any, ...], ...] = ()
         # Number of the latest download. The result of an earlier download, which may arrive later, is ignored.
         self._download_number = 0
-        self._download: BackgroundCall | None = None
+        self._download: BackgroundCall | None = None  # the latest download; None before the first
         self._current = vehicle._dk_current_command
 
     # ------------------------------------------------------------------- from and to the vehicle
@@ -219,7 +219,8 @@ class CommandSequence:
         """
         self._require_downloaded()
         added = _command_from(cmd)
-        cmd.target_system = added.target_system = self._core.target_system
+        added.target_system = self._core.target_system
+        cmd.target_system = added.target_system
         if self._append(added) == 0:
             self._core.logger.info("the first command is home, as in a waypoint file: %s", added)
 
@@ -271,14 +272,15 @@ class CommandSequence:
         with self._lock:
             state = self._state
             if not state.items and _is_home_row(cmd, self._vehicle._home_location):
-                cmd.seq = seq = 0
+                cmd.seq = 0
                 self._state = state.replace(home=cmd, is_changed=True)
             else:
-                cmd.seq = seq = len(state.items) + 1
+                cmd.seq = len(state.items) + 1
                 self._state = state.replace(items=(*state.items, cmd), is_changed=True)
-            return seq
+            return cmd.seq
 
     async def _run_download(self, number: int) -> None:
+        """Read the vehicle's mission and store it. Runs on the loop thread."""
         try:
             mission = await self._core.aio.mission.download()
         except AerokitError as error:
@@ -301,6 +303,7 @@ class CommandSequence:
         self._core.listeners.notify("commands", self)
 
     def _on_download_failed(self, number: int, error: AerokitError) -> None:
+        """Record why the latest download has failed, for programs that wait for it or change the sequence."""
         error_class = TimeoutError if isinstance(error, OperationTimeout) else APIException
         failure = error_class(f"the mission could not be downloaded: {error}")
         failure.__cause__ = error
@@ -335,6 +338,7 @@ class WaypointLoader:
 
 
 def _checked_index(index: Any, count: int) -> int:
+    """Return the position for an index, which may be negative. IndexError if it is out of range."""
     try:
         position = operator.index(index)
     except TypeError:
@@ -381,6 +385,7 @@ def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
 
 
 def _is_at_home(cmd: Command, home: LocationGlobal | None) -> bool:
+    """Return True if a command is at home. False if home is unknown, or if a field is not a number."""
     if home is None or home.lat is None or home.lon is None or home.alt is None:
         return False
     try:
@@ -407,6 +412,7 @@ def _commands_of(mission: Mission, own_ids: tuple[int, int]) -> tuple[Command, .
 
 
 def _item_of(cmd: Command, index: int) -> MissionItem:
+    """Convert a command, which is ``commands[index]``. InvalidArgument if a field is not a number."""
     try:
         command, frame = int(cmd.command), int(cmd.frame)
         param1, param2, param3, param4 = (float(getattr(cmd, name)) for name in PARAM_FIELDS)

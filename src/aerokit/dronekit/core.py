@@ -43,7 +43,7 @@ class Readiness:
         self.names: set[str] = set()
         self.fetchers: dict[str, Callable[[], None]] = {}
         """Maps attributes to functions that request the value; called repeatedly while a program waits for it."""
-        self._failures: dict[str, APIException] = {}
+        self._failures: dict[str, APIException] = {}  # errors with which reading an attribute has failed
         self._changed = threading.Condition()
 
     def mark(self, name: str) -> None:
@@ -90,8 +90,9 @@ class LatestMessage(Generic[MessageT]):
 
     def __init__(self, message_type: type[MessageT], ready: set[str], listeners: Listeners) -> None:
         self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
-        self._ready_names = ready
+        self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
+        # Attributes that the handlers only announce; empty: a handler needs each message.
         self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
@@ -166,11 +167,11 @@ class Core:
         """Orders raise APIException after this many seconds without a heartbeat; 0: never."""
         self.aio_or_none: AsyncVehicle | None = None
         """The asynchronous vehicle; None before it is connected."""
-        self._tasks: BackgroundTasks | None = None
+        self._tasks: BackgroundTasks | None = None  # None before the vehicle is connected
         self._latest: dict[type[Message], LatestMessage[Any]] = {}
         self.on_connected: list[Callable[[], None]] = []
         """Functions to call on the loop when the vehicle is connected."""
-        self._is_silent = False
+        self._is_silent = False  # True while the last heartbeat is older than SILENCE_WARNING_S
 
     # --------------------------------------------------------------------------------- state
 

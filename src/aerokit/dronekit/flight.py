@@ -90,7 +90,8 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
-        self._dk_arming = order = self._dk.order(_armed_order_kind(value), flight_orders.change_armed, aio, value)
+        order = self._dk.order(_armed_order_kind(value), flight_orders.change_armed, aio, value)
+        self._dk_arming = order
         return order
 
     def _dk_is_changing_to(self, value: bool) -> bool:
@@ -137,6 +138,7 @@ class FlightMethods(VehicleAttributes):
             self._dk_take_off(float(alt))
 
     def _dk_take_off(self, altitude: float) -> BackgroundCall:
+        """Start the take-off order of this autopilot. ``altitude`` is in metres above home."""
         if not math.isfinite(altitude):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
@@ -265,6 +267,7 @@ class FlightMethods(VehicleAttributes):
             self._home_location = self._dk_reported_home
 
     def _dk_known_home(self) -> LocationGlobal:
+        """Return home. If it is unknown, request it; APIException if the vehicle has none."""
         if self._home_location is None:
             self._dk.run(self._dk_fetch_home)
         home = self.home_location

@@ -81,7 +81,10 @@ def _px4_base_mode(name: str) -> int:
 
 
 def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
-    # For autopilots without known mode numbers, such as iNav, ArduPilot's mode numbers are used, as by pymavlink.
+    """Return the vehicle's autopilot, or ArduPilot if no mode numbers are known, as for iNav.
+
+    pymavlink also uses ArduPilot's mode numbers then.
+    """
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
     heartbeat = m.Heartbeat(
@@ -340,6 +343,7 @@ class Maintenance(VehicleCore):
 
 
 def _tune_text(tune: str | bytes) -> str:
+    """Check a tune, and return it as text."""
     try:
         text = tune.encode() if isinstance(tune, str) else tune
         notes = text.rstrip(b"\0").decode("ascii")

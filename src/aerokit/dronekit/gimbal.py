@@ -75,7 +75,9 @@ class Gimbal(GimbalPrivates):
                 roll other than 0, the camera therefore points at ``yaw`` at first, but then turns with the vehicle.
             yaw: degrees clockwise from north.
         """
-        pitch, yaw, roll = _checked("pitch", pitch), _checked("yaw", yaw), _checked("roll", roll)
+        pitch = _checked("pitch", pitch)
+        yaw = _checked("yaw", yaw)
+        roll = _checked("roll", roll)
         gimbal = self._core.check_link().gimbal
         self._core.order("gimbal", gimbal.point, pitch, yaw, roll_deg=roll, wait=False)
 
@@ -119,6 +121,7 @@ async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
 
 
 def _checked(name: str, value: float) -> float:
+    """Check an angle, and return it in the range of the gimbal."""
     try:
         number = float(value)
     except (TypeError, ValueError):

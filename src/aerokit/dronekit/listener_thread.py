@@ -30,14 +30,14 @@ class ListenerThread:
     def __init__(self, name: str = "dronekit listeners") -> None:
         self._name = name
         self._calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
-        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None  # None before the first call
+        self._lock = threading.Lock()  # held while the thread is started or stopped
         self.is_stopped: bool = False
         self.on_called: Callable[[], object] = _nothing
         """Called after each callback."""
         self.dropped = 0
         """Number of calls that were dropped because a callback blocked."""
-        self._kept_alive: dict[int, object] = {}
+        self._kept_alive: dict[int, object] = {}  # objects with listeners, by id()
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
         """Queue a call without blocking, from any thread. Ignored after :meth:`stop`."""
@@ -105,6 +105,7 @@ class ListenerThread:
             self._thread.join(JOIN_TIMEOUT_S)
 
     def _start(self) -> None:
+        """Start the thread, unless it runs or was stopped."""
         with self._lock:
             if self._thread is None and not self.is_stopped:
                 thread = _Thread(target=self._run, name=self._name, daemon=True)
@@ -116,6 +117,7 @@ class ListenerThread:
                     self._thread = thread
 
     def _run(self) -> None:
+        """Call the queued functions until :meth:`stop` is called."""
         while True:
             function, args = self._calls.get()
             if self.is_stopped:

@@ -256,10 +256,11 @@ class Inbox(Mapping[str, Any]):
 
     def __init__(self, connection: ClassicConnection) -> None:
         self._connection = connection
-        self._latest: dict[int, Frame] = {}
+        self._latest: dict[int, Frame] = {}  # last frame by message id
+        # Frames that `next_match` has not returned yet, oldest first.
         self._frames: deque[Frame] = deque(maxlen=MAX_MESSAGES)
-        self._frame_arrived = threading.Condition()
-        self._started_at: float | None = None
+        self._frame_arrived = threading.Condition()  # notified for each frame; also protects the other attributes
+        self._started_at: float | None = None  # time of the first access; None before
 
     def next_match(self, names: Collection[str] | None, condition: Any, timeout: float | None) -> Any:
         """Return the next message of these types that satisfies ``condition``; see :meth:`Master.recv_match`."""
@@ -299,6 +300,7 @@ class Inbox(Mapping[str, Any]):
         return len(self._latest)
 
     def _start(self) -> None:
+        """Start receiving at the first access."""
         with self._frame_arrived:
             if self._started_at is not None:
                 return

@@ -63,7 +63,8 @@ class MAVConnection(ClassicConnection):
         use_native: bool = False,
         heartbeat: OwnHeartbeat | None = OwnHeartbeat(),  # noqa: B008 - it is immutable
     ) -> None:
-        loop, overrides = LoopThread(), OverrideRelease()
+        loop = LoopThread()
+        overrides = OverrideRelease()
         context = _open(loop, ip, baud, source_system, source_component, overrides, heartbeat)
         super().__init__(ip, loop, context, target_system, overrides)
         self.loop_listeners: list[Callable[[MAVConnection], object]] = []

@@ -188,7 +188,7 @@ class MessageListeners(Listeners):
     def __init__(self, owner: object, handler: ClassicConnection) -> None:
         super().__init__(owner, handler.listener_thread)
         self._handler = handler
-        self._detach_by_name: dict[str, Detach] = {}
+        self._detach_by_name: dict[str, Detach] = {}  # functions that end the subscription of each name
         self._is_started = False
 
     def add(self, name: str, listener: AttributeListener) -> None:
@@ -231,6 +231,7 @@ class MessageListeners(Listeners):
                 self._detach_by_name[name] = self._listen(name)
 
     def _listen(self, name: str) -> Detach:
+        """Subscribe to the messages of one name, or to all frames."""
         connection = self._handler.connection
         if name == EVERY_NAME:
             return connection.observe_frames(self._on_frame)

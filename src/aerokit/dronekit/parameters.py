@@ -57,10 +57,11 @@ class ParameterDownload:
         self._core, self._store_all = core, store_all
         self.is_complete = False
         """True after a complete download. It stays True when the vehicle reboots."""
-        self._ended: asyncio.Event | None = None
-        self._has_warned = False
+        self._ended: asyncio.Event | None = None  # set when the running download ends; None while none runs
+        self._has_warned = False  # True once a failure was logged
 
     def begin(self) -> None:
+        """Begin the download, unless it runs or is complete. Called on the loop."""
         if self._ended is None and not self.is_complete:
             self._ended = asyncio.Event()
             aio, on_success = self._core.aio, weak_callback(self._store_all)
@@ -154,7 +155,7 @@ class ParameterValues:
 
     def __init__(self) -> None:
         self._parameters: dict[str, Parameter] = {}
-        self._spelling_of_upper: dict[str, str] = {}
+        self._spelling_of_upper: dict[str, str] = {}  # only of names that are not in upper case
 
     def __len__(self) -> int:
         return len(self._parameters)
@@ -344,6 +345,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         return attr_name.upper()
 
     def _find(self, name: object, *, waits: bool = True) -> ResolvedParameter | None:
+        """Look up a parameter by name. With ``waits``, request it if it may still be unknown."""
         if not isinstance(name, str):
             return None
         name = name.upper()

@@ -108,6 +108,8 @@ class VehiclePrivates:
 
 
 class LocationPrivates:
+    """The private attributes of DroneKit's Locations, for reading."""
+
     _lat, _lon = attribute_path("global_relative_frame.lat"), attribute_path("global_relative_frame.lon")
     _alt, _relative_alt = attribute_path("global_frame.alt"), attribute_path("global_relative_frame.alt")
     _north, _east, _down = (
@@ -118,6 +120,8 @@ class LocationPrivates:
 
 
 class GimbalPrivates:
+    """The private attributes of DroneKit's Gimbal, for reading."""
+
     _pitch, _roll, _yaw = attribute_path("pitch"), attribute_path("roll"), attribute_path("yaw")
 
 

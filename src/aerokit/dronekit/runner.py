@@ -93,6 +93,8 @@ class _SubmoduleFinder(MetaPathFinder):
 
 
 class _SubmoduleLoader(Loader):
+    """Loader that returns the aerokit module for an alias, and keeps the spec of that module."""
+
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         module = importlib.import_module(_own_name(spec.name) or spec.name)
         self._own_spec = module.__spec__
@@ -175,6 +177,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
+    """Return the parser for the command's own arguments, which end with the program."""
     parser = _Parser(
         prog=prog,
         usage=f"{prog} [-h] [--sim [OPTION ...]] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",
@@ -215,6 +218,7 @@ def _split_at_program(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence
 
 
 def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
+    """Serve a simulated vehicle for the program, and print its addresses."""
     from aerokit.dronekit.sitl import parse_home, serve_for_program
     from aerokit.sim.motion import HOME
 
@@ -275,11 +279,12 @@ def _run_module(name: str, arguments: Sequence[str]) -> None:
 
 
 def _run_file(path: str, arguments: Sequence[str]) -> None:
+    """Run a program as ``python PATH ARGUMENTS`` does, and return when its main program has ended."""
     sys.argv[:] = [path, *arguments]
     if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
         runpy.run_path(path, run_name="__main__")
         return
-    # Does not use runpy, which removes the module `__main__` at the end, although threads may still need it.
+    # A file is not run by runpy, which removes the module `__main__` at the end, although threads may still need it.
     path = os.path.abspath(path)
     with io.open_code(path) as file:
         source = file.read()
@@ -298,11 +303,16 @@ def _prepend_path(folder: str) -> None:
 
 @contextlib.contextmanager
 def _restored_sys() -> Iterator[None]:
-    argv, path, main = sys.argv[:], sys.path[:], sys.modules["__main__"]
+    """Restore the arguments, the search path and the main module at the end of the block."""
+    argv = sys.argv[:]
+    path = sys.path[:]
+    main = sys.modules["__main__"]
     try:
         yield
     finally:
-        sys.argv[:], sys.path[:], sys.modules["__main__"] = argv, path, main
+        sys.argv[:] = argv
+        sys.path[:] = path
+        sys.modules["__main__"] = main
 
 
 def _print_program_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
@@ -312,6 +322,7 @@ def _print_program_traceback(kind: type[BaseException], error: BaseException, tr
 
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
+    """Return the part of a traceback that belongs to the program."""
     entry = traceback
     # Skip our frames up to the one that runs the program, then those of runpy.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):

@@ -48,9 +48,10 @@ class ServedVehicle:
         self.speedup: float = speedup
         self.addresses: tuple[str, ...] = ()
         """Addresses in the simulator's form, such as ``tcpin:127.0.0.1:5760``."""
+        # Everything below is used by the thread, so the thread is started last.
         self._vehicle = simulated(kind, home=home)
         self._requested_addresses = tuple(addresses)
-        self._error: Exception | None = None
+        self._error: Exception | None = None  # error that ended the thread
         self._startup_ended = threading.Event()  # set when the vehicle is served, or when the start has failed
         self._loop = asyncio.new_event_loop()
         self._stop_requested = asyncio.Event()
@@ -125,8 +126,8 @@ class SITL:
             instance = _next_instance
             _next_instance += 1
         self.instance: int = instance
-        self._kind: str | None = None
-        self._served: ServedVehicle | None = None
+        self._kind: str | None = None  # None: the vehicle of --sim, or a copter
+        self._served: ServedVehicle | None = None  # None before launch()
 
     def download(self, system: str, version: str, target: str | None = None, verbose: bool = False) -> None:
         """Select the kind of vehicle. Downloads nothing; ``version`` is ignored."""

@@ -19,6 +19,8 @@ VEHICLES = {1: "Plane", 2: "Copter", 10: "Rover"}
 
 
 class _Value:
+    """Base class of values whose text is that of DroneKit."""
+
     _text: str  # format string, which gets the object as its argument
 
     def __str__(self) -> str:
@@ -40,6 +42,8 @@ class Attitude(_Value):
 
 
 class _Place(_Value):
+    """Base class of the two kinds of locations with latitude and longitude."""
+
     # DroneKit's locations have these attributes, which are always None, for old programs.
     local_frame: Any = None
     global_frame: Any = None

@@ -74,6 +74,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     def __init__(self, handler: MAVConnection) -> None:
         super().__init__(handler)
+        # None before initialize().
         self._dk_context: OpenContext[AsyncVehicle] | None = None
         self._dk_sync: sync.Vehicle | None = None
         self._dk_initializing = threading.Lock()
@@ -283,9 +284,11 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
 
     def _dk_wait_for_first_values(self) -> None:
+        """Wait for the attributes in FIRST_VALUES, until no further value arrives or too much time has passed."""
         names, ready = set[str](FIRST_VALUES), self._dk.ready
         now = time.monotonic()
-        deadline = next_value_deadline = now + FIRST_VALUES_TIMEOUT_S
+        deadline = now + FIRST_VALUES_TIMEOUT_S
+        next_value_deadline = deadline
         missing_before = names
         while (missing := names - ready.names) and now < min(deadline, next_value_deadline):
             if len(missing) < len(missing_before):  # Another value has arrived.

@@ -58,26 +58,26 @@ class Attachment:
             self.link: Link = ReconnectingLink(make_link)
         else:
             self.link = address
-        self._is_shared = isinstance(self.link, SharedLink)
+        self._is_shared = isinstance(self.link, SharedLink)  # True if the link is a connection of our own program
         self.name: str = endpoint.name or self.link.address
         self.keeps_peers = True
         self.is_open: bool = False
         self._owns_link = False  # True once this object has opened the link, and therefore must close it
-        self._reports_bursts = False
+        self._reports_bursts = False  # True if the link calls `burst_ended`
         # True if the link has a single remote end, e.g. a serial port. Its `Port` has the key None.
         self._is_single = False
-        self._burst: list[bytes] = []
+        self._burst: list[bytes] = []  # datagrams of `_burst_peer` that are not processed yet
         self._burst_peer: Peer = None
         self._ports: dict[Peer, Port] = {}
         self._guard = IdentityGuard(self.link, self._report_peer)
         self._peers = PeerTable(
             self.link, dialect, self._guard.evictable_peers, _keep_unknown, on_evict=self._forget_port
         )
-        self._is_full_reported = False
+        self._is_full_reported = False  # True if it was reported that the endpoint has too many peers
         self.counters: EndpointCounters = EndpointCounters(Counter())
         self._totals_of_forgotten_peers = _Totals(0, 0, 0, 0)
-        self._reported_refusals: set[str] = set()
-        self._gateway: SigningGateway | None = None
+        self._reported_refusals: set[str] = set()  # reasons that were already reported
+        self._gateway: SigningGateway | None = None  # verifies and adds signatures
         if endpoint.signing is not None:
             self._gateway = SigningGateway(endpoint.signing, dialect.extras, self._on_refused)
 
@@ -97,6 +97,7 @@ class Attachment:
             await self.link.wait_closed()
 
     def statistics(self) -> EndpointStatistics:
+        """Return the counters of all peers together, including forgotten ones."""
         router, ports = self._switch.router, tuple(self._ports.values())
         totals = self._totals_of_forgotten_peers
         for framer in self._peers:
@@ -127,8 +128,12 @@ class Attachment:
     # -------------------------------------------------------------------- called by the link
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        # Hot path. Datagrams that a peer sends in one burst are joined and processed together. A datagram that does not
-        # begin with a frame is processed alone, because only data that consists of whole frames is forwarded as it is.
+        """Process received bytes, or collect them until the burst ends.
+
+        Datagrams that a peer sends in one burst are joined and processed together. A datagram that does not begin with
+        a frame is processed alone, because only data that consists of whole frames is forwarded as it is.
+        """
+        # Hot path.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)
@@ -151,6 +156,7 @@ class Attachment:
                 self._receive(data, self._burst_peer)
 
     def _receive(self, data: bytes, peer: Peer) -> None:
+        """Check the frames in received bytes, and forward them. Errors are reported as an event."""
         try:
             now = self._now()
             # Frames of our own program come without a socket, and therefore have not waited.
@@ -205,12 +211,14 @@ class Attachment:
     # ------------------------------------------------------------------------------------ ports
 
     def _on_up(self) -> None:
+        """Record that the link is open, for the first time or again. Each loss of the link removes all ports."""
         self.is_open, self._reports_bursts = True, self.link.reports_bursts
         self._is_single = self.link.has_peer(None)
         if self._is_single and None not in self._ports:
             self._add_port(None)
 
     def _on_down(self) -> None:
+        """Record that the link is lost or closed, and remove its ports."""
         if self._burst:  # The link was lost before it reported the end of the burst.
             self.burst_ended()
         self.is_open = False
@@ -218,6 +226,7 @@ class Attachment:
             self._forget(peer)
 
     def _add_port(self, peer: Peer) -> Port:
+        """Add a port for a peer that has sent its first valid frame, or for the single remote end of the link."""
         port = self._ports[peer] = Port(
             self.link,
             peer,

@@ -78,10 +78,10 @@ class Hub:
             if names.count(name) > 1:
                 raise InvalidArgument(f"two endpoints have the name {name!r}: give each its own name")
         self._dialect = dialect
-        self._attachments: dict[str, Attachment] = {}
+        self._attachments: dict[str, Attachment] = {}  # by name
         self._listeners: list[Callable[[HubEvent], object]] = []
-        self._switch: Switch | None = None
-        self._background: BackgroundTasks | None = None
+        self._switch: Switch | None = None  # None while the hub is not open
+        self._background: BackgroundTasks | None = None  # None while the hub is not open
         self._is_closed = False
 
     async def __aenter__(self) -> Self:
@@ -194,6 +194,7 @@ class Hub:
     # ------------------------------------------------------------------------------------ internal
 
     async def _add(self, endpoint: Endpoint) -> Attachment:
+        """Open an endpoint and attach it. If it cannot be opened, retry it in the background or raise LinkError."""
         assert self._switch is not None
         assert self._background is not None
         clock = asyncio.get_running_loop().time
@@ -215,6 +216,7 @@ class Hub:
         return attachment
 
     async def _retry_opening(self, attachment: Attachment) -> None:
+        """Try to open an endpoint until it is open or removed, with increasing delays."""
         backoff = Backoff()
         while self._attachments.get(attachment.name) is attachment:
             await anyio.sleep(backoff.next_delay())
@@ -230,6 +232,7 @@ class Hub:
                 return
 
     async def _close(self) -> None:
+        """Close all endpoints and the recording, and wait until they are closed."""
         self._is_closed = True
         attachments, self._attachments = list(self._attachments.values()), {}
         for attachment in attachments:
@@ -256,6 +259,7 @@ class Hub:
         return self._switch
 
     def _report(self, attachment: Attachment, kind: HubEventKind, text: str) -> None:
+        """Log an event of an endpoint, and pass it to the listeners."""
         logger.log(logging.INFO if kind in _INFO_KINDS else logging.WARNING, "hub: %s: %s", attachment.name, text)
         event = HubEvent(asyncio.get_running_loop().time(), attachment.name, kind, text)
         for listener in tuple(self._listeners):

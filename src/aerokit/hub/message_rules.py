@@ -54,8 +54,10 @@ class Filters:
         rates: Mapping[str, float] | None = None,
     ) -> None:
         self._dialect = dialect
-        self._only, self._block, self._rates = tuple(only), tuple(block), dict(rates or {})
-        self._periods: dict[int, float | None] = {}
+        self._only = tuple(only)
+        self._block = tuple(block)
+        self._rates = dict(rates or {})
+        self._periods: dict[int, float | None] = {}  # results of `period`, which are computed at the first call
         for field, patterns in (("only", self._only), ("block", self._block), ("rates", self._rates)):
             for pattern in patterns:
                 self._check(field, pattern)
@@ -76,6 +78,7 @@ class Filters:
         return self._periods[message_id]
 
     def _period(self, name: str) -> float | None:
+        """Compute the result of :meth:`period` for a message of the dialect, by name."""
         if self._only and not any(fnmatchcase(name, pattern) for pattern in self._only):
             return None
         if any(fnmatchcase(name, pattern) for pattern in self._block):
@@ -88,6 +91,7 @@ class Filters:
         return 0.0 if rate_hz is None else 1 / rate_hz
 
     def _check(self, field: str, pattern: str) -> None:
+        """Raise InvalidArgument if a pattern matches no message."""
         names = [message_type.NAME for message_type in self._dialect]
         if not any(fnmatchcase(name, pattern) for name in names):
             raise InvalidArgument(

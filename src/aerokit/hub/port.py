@@ -47,8 +47,9 @@ class FrameQueue:
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._last_key = 0  # the negative key that was used last
-        # Numbers of queued commands and of queued telemetry frames. If there are none, the queue is not searched.
-        self._order_count = self._telemetry_count = 0
+        # If there are no commands or no telemetry frames, the queue is not searched for them.
+        self._order_count = 0
+        self._telemetry_count = 0
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -232,10 +233,10 @@ class Port:
         self.node: RouterPort[Port] | None = None
         self._dialect = dialect
         self._queue_above_bytes = queue_above_bytes
-        self._may_queue = queue_above_bytes < UNLIMITED
+        self._may_queue = queue_above_bytes < UNLIMITED  # False if no number of unsent bytes makes frames wait
         self._on_drop = on_drop
-        self._queue = FrameQueue()
-        self._due: dict[int, float] = {}
+        self._queue = FrameQueue()  # frames that wait until the link drains
+        self._due: dict[int, float] = {}  # key of a rate-limited stream → time from which its next frame is forwarded
 
     @property
     def has_queued_frames(self) -> bool:
@@ -254,6 +255,7 @@ class Port:
         return self._may_queue and (bool(self._queue) or self._is_full())
 
     def enqueue(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        """Queue a frame, because the link does not drain. A full queue drops frames."""
         message_type = self._dialect.get(plan.message_id)
         kind = MessageKind.TRANSFER  # An unknown message may be part of a transfer, so it is never replaced.
         if message_type is not None:

@@ -126,7 +126,7 @@ class Router(Generic[PortT]):
         self._recent = RecentFrames()
         self._port_count = 0  # number of ports created so far
         self._unproven: dict[int, None] = {}  # senders that sent no HEARTBEAT yet, and may be noise
-        self._swept_at = -math.inf
+        self._swept_at = -math.inf  # time of the last removal of silent senders
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
         self._unknown: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="unknown")
@@ -277,6 +277,7 @@ class Router(Generic[PortT]):
         return len(self._senders) < MAX_ROUTES
 
     def _record_at_other_port(self, sender: Sender, node: RouterPort[PortT], now: float) -> None:
+        """Record a frame that arrived at another port than the sender's. A silent sender moves to this port."""
         former_number = sender.port_number
         if sender.record_at_other_port(node.number, now):
             self.forget_plans()
@@ -319,6 +320,7 @@ class Router(Generic[PortT]):
             node.echoes[source] = count
 
     def _report(self, kind: HubEventKind, source: int, node: RouterPort[PortT], other_number: int) -> None:
+        """Call :attr:`on_change`. The port with ``other_number`` may have been removed."""
         if self.on_change is not None:
             other_node = self._nodes.get(other_number)
             self.on_change(kind, source, node.port, None if other_node is None else other_node.port)

@@ -158,9 +158,10 @@ class IdentityGuard:
         """True if the endpoint has several peers. With one peer, only heartbeats are checked."""
         self._routes = Routes(link, self._publish)
         self._report = report
-        self._heartbeat_at: dict[Peer, float] = {}
+        self._heartbeat_at: dict[Peer, float] = {}  # time of the last heartbeat of each peer
+        # Time of the last event about a duplicate of each (system id, component id).
         self._reported_at: dict[tuple[int, int], float] = {}
-        self._current_peer: Peer = None
+        self._current_peer: Peer = None  # sender of the frame that is being checked
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
         """Return True if this peer may send this frame. Call it for heartbeats; if `is_shared`, for every frame."""
@@ -186,6 +187,7 @@ class IdentityGuard:
         self._heartbeat_at.pop(peer, None)
 
     def _publish(self, event: Event) -> None:
+        """Report an event of the routes under the hub's names. A duplicate is reported again after `REPEAT_EVENT_S`."""
         if isinstance(event, RouteChanged):
             ids = event.system_id, event.component_id
             self._reported_at.pop(ids, None)  # The peer that owned the ids may now be the duplicate: report it.

@@ -32,10 +32,10 @@ class SharedLink(Link):
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._targets = TargetFields(connection.bus.dialect)
-        self._receiver: Receiver | None = None
-        self._detachments: list[Callable[[], None]] = []
+        self._receiver: Receiver | None = None  # None while the link is not open
+        self._detachments: list[Callable[[], None]] = []  # functions that end the observation of the connection
         self._gateway: SigningGateway | None = None
-        self._loss_report: asyncio.Handle | None = None
+        self._loss_report: asyncio.Handle | None = None  # pending call that reports the end of the connection
         self._is_duplicate_reported = False
         self.address: str = f"shared:{connection.link.address}"
         self.dropped_writes: int = 0
@@ -102,12 +102,14 @@ class SharedLink(Link):
             self._connection.bus.publish(DuplicateSender(self._connection.now(), *ours))
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
+        """Pass a received frame of the connection to the hub, without its signature."""
         gateway = self._current_gateway()
         if self._receiver is not None:
             unsigned = frame if gateway is None else gateway.strip_signature(frame)
             self._receiver.bytes_received(unsigned.raw, None)
 
     def _on_sent(self, raw: bytes) -> None:
+        """Pass a sent frame of the connection to the hub, without its signature."""
         gateway = self._current_gateway()
         if self._receiver is not None:
             unsigned = raw if gateway is None else gateway.strip_signature(Frame.parse(raw)).raw
@@ -126,6 +128,7 @@ class SharedLink(Link):
             receiver.link_lost(lost)
 
     def _current_gateway(self) -> SigningGateway | None:
+        """Return the gateway for the connection's present signing key; None if the connection does not sign."""
         signing: Signing | None = self._connection.signing
         if signing is None:
             self._gateway = None

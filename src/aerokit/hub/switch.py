@@ -49,7 +49,7 @@ class Switch:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
-        self._unix_epoch_s = time.time() - self._clock()
+        self._unix_epoch_s = time.time() - self._clock()  # seconds since 1970 at loop time 0
         self._targets = TargetFields(dialect)
         self.router: Router[Port] = Router(self._targets, period)
         self.router.on_vehicle = _write_single_frames
@@ -62,10 +62,11 @@ class Switch:
         self._loop_watch.start()
         self.recording: Recording | None = None
         """Recording of every forwarded frame."""
-        self._ports_to_flush: list[Port] = []
-        self._is_scheduled = False
+        self._ports_to_flush: list[Port] = []  # ports with a batch to write
+        self._is_scheduled = False  # True while a call of `flush` is pending
+        # Ports with waiting frames; the keys are used as a set that keeps its order.
         self._queueing_ports: dict[Port, None] = {}
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.TimerHandle | None = None  # None while no port has waiting frames
         self._poll_interval_s = MIN_POLL_INTERVAL_S
 
     def unix_time(self) -> float:
@@ -149,6 +150,7 @@ class Switch:
                 self._loop.call_soon(self.flush)
 
     def flush(self) -> None:
+        """Write the batches of all ports."""
         self._is_scheduled = False
         if not self._ports_to_flush:
             return
@@ -224,6 +226,7 @@ class Switch:
             self.recording.write(raw, now)
 
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        """Start the batch of a port with this frame, or queue the frame if the link of the port does not drain."""
         if out.node is None:
             return  # The port was removed after the frame was routed.
         if out.must_queue():
@@ -238,6 +241,7 @@ class Switch:
             self._ports_to_flush.append(out)
 
     def _forward_limited(self, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
+        """Forward one frame to the ports that limit the rate of its message, unless it comes too early."""
         for out, period_s in plan.rate_limited:
             if out.is_due(plan.key, period_s, now):
                 if out.batch:

@@ -278,6 +278,7 @@ def _parse_message(node: Element, origin: str) -> MessageDefinition:
 
 
 def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinition:
+    """Read one ``<field>`` element of a message. ``extension``: it is below ``<extensions/>``."""
     # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
@@ -303,6 +304,7 @@ def carries_bytes(message: str, field_name: str, kind: str) -> bool:
 
 
 def _parse_enum(node: Element, origin: str) -> EnumDefinition:
+    """Read one ``<enum>`` element. ``origin`` is the file that contains it."""
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):
@@ -364,10 +366,13 @@ def _remarks(node: Element) -> tuple[str, ...]:
     remarks: list[str] = []
     for child in node:
         if child.tag in ("deprecated", "superseded"):
-            since, replacement, reason = child.get("since", ""), child.get("replaced_by", ""), _text(child)
-            remark = child.tag.capitalize() + (f" since {since}" if since else "")
-            remark += f", replaced by {replacement}." if replacement else "."
-            remarks.append(f"{remark} {reason}".strip())
+            since, replacement = child.get("since", ""), child.get("replaced_by", "")
+            remark = child.tag.capitalize()
+            if since:
+                remark += f" since {since}"
+            if replacement:
+                remark += f", replaced by {replacement}"
+            remarks.append(f"{remark}. {_text(child)}".strip())
         elif child.tag == "wip":
             remarks.append("Work in progress: may change.")
     return tuple(remarks)
@@ -397,6 +402,7 @@ def _common_prefix(enum: str, names: list[str]) -> str:
 
 
 def _member_name(enum: str, prefix: str, name: str) -> str:
+    """Return the Python name of an enum entry: its name without the prefix of the entries."""
     if not name.startswith(prefix):  # Some entries begin with the last words of the enum's name only.
         words = enum.split("_")
         shorter_prefixes = ("_".join(words[i:]) + "_" for i in range(1, len(words)))

@@ -41,6 +41,7 @@ class Dialect:
         self._set_rows({cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()})
 
     def _set_rows(self, rows: dict[int, Row]) -> None:
+        """Store the table of messages, and prepare decoders that load a message class at its first use."""
         self.rows = rows
         """Maps message ids to (CRC_EXTRA, payload length without extensions, payload length with extensions)."""
         self.extras: dict[int, bytes] = {
@@ -155,6 +156,8 @@ class _Standard(Dialect):
 
 
 class _Extended(Dialect):
+    """The messages and enums of two dialects. If both have a message, that of the first one is used."""
+
     def __init__(self, first: Dialect, second: Dialect) -> None:
         super().__init__(f"{first.name}+{second.name}", ())
         self._parts = (first, second)
@@ -165,6 +168,7 @@ class _Extended(Dialect):
         return first[message_id] if message_id in first else second[message_id]
 
     def enum(self, name: str) -> type[Any]:
+        """Return an enum of all parts: the first one that has every member, otherwise a merged one."""
         enum_types: list[type[Any]] = []
         for part in self._parts:
             try:

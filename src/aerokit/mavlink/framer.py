@@ -72,12 +72,12 @@ class PythonFramer:
         """Frames of the last `receive` call that arrived after newer frames of their sender, and repeated frames."""
         self.foreign: list[Frame] = []
         """Frames of the last `receive` call that came from a second sender with the same ids."""
-        self._rest = b""
-        self._scan = _NEW_SCAN
-        self._unknown: list[bytes] = []
+        self._rest = b""  # data kept for the next call, because a frame may begin in it
+        self._scan = _NEW_SCAN  # what `_search` has found in `_rest` so far
+        self._unknown: list[bytes] = []  # frames of unknown messages, until `receive` returns them
         self._rows = dialect.rows
         self._extras = dialect.extras
-        self._limit = SourceLimit(MAX_SOURCES) if limit is None else limit
+        self._limit = SourceLimit(MAX_SOURCES) if limit is None else limit  # bounds the number of senders with counters
         self._limit.join(self.statistics)
         self._sources = self.statistics.by_key
 
@@ -204,7 +204,11 @@ class PythonFramer:
         return len(self._rest)
 
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
-        # Frames of unwanted messages are not in `frames`, so there may be a different frame at that position.
+        """Sort the frames that were out of order into :attr:`late` and :attr:`foreign`.
+
+        ``out_of_order`` has (position in ``frames``, result of `SourceStatistics.out_of_order`, sequence and sender).
+        Frames of unwanted messages are not in ``frames``, so there may be a different frame at that position.
+        """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
@@ -230,6 +234,7 @@ class PythonFramer:
         end_of_data = (size, _NOISE, size)
         for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
+                # No valid frame was found inside. The bytes count as an unknown frame if a frame may follow them.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._count_skipped(begin, unknown_begin, bad_crcs)
                     self._skip_unknown(data, unknown_begin, unknown_end)
@@ -240,7 +245,7 @@ class PythonFramer:
                 unknown_begin = -1
             if position >= size:
                 break
-            if end <= size and verdict != _UNKNOWN:
+            if end <= size and verdict != _UNKNOWN:  # Enough data has arrived to examine the candidate.
                 verdict, end, frame = self._examine(data, position)
                 if verdict == _GOOD:
                     self._count_skipped(begin, position, bad_crcs)
@@ -252,7 +257,7 @@ class PythonFramer:
             if verdict == _WAIT:
                 keep_from = _earliest(keep_from, unknown_begin, position)
                 examined_to = position + 1
-                break
+                break  # What follows probably belongs to this frame, so it is examined later.
             if verdict == _IMPLAUSIBLE and keep_from < 0:
                 keep_from = position
             elif verdict == _UNKNOWN and keep_from < 0 and unknown_begin < 0:
@@ -273,7 +278,7 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        # An unknown frame was received, so its sequence number must not count as lost.
+        """Count a frame of an unknown message, and keep it if it is wanted."""
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -283,7 +288,7 @@ class PythonFramer:
         self.statistics.count_unknown(message_id & 0xFFFFFF)
         source = self._sources.get(key)
         if source is not None and source.expected & 0xFF == sequence:
-            source.skip(1)
+            source.skip(1)  # The frame was received, so its sequence number must not count as lost.
 
     def _count_skipped(self, begin: int, end: int, bad_crcs: list[int]) -> None:
         # Bytes outside frames are counted. Bytes that are kept are not counted yet, because they may become a frame.

@@ -90,6 +90,7 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
 
 
 def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
+    """Return the fields of both definitions. An added field keeps the type of an existing one."""
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:
         existing_field = fields.get(field.name)
@@ -100,6 +101,7 @@ def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tup
 
 
 def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
+    """Return the entries of both enums, sorted by value. An added entry replaces one with the same name."""
     by_name = {entry.name: entry for entry in existing.entries}
     merged = {entry.name: _merged_entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
@@ -109,7 +111,7 @@ def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[En
 
 
 def _merged_entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
-    # Added params replace existing params with the same number.
+    """Return an entry with the params of both definitions. An added param replaces one with the same number."""
     params = {number: (number, label, units, text) for number, label, units, text in (*existing.params, *added.params)}
     return replace(
         existing,
@@ -370,6 +372,7 @@ def _other_files(stems: Sequence[str]) -> str:
 
 
 def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
+    """Render one module of message classes."""
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
     stems = MODULES.get(module, MODULES["common"])  # COMMON_MORE has messages of the same files as common.
@@ -380,6 +383,7 @@ def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
 
 
 def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
+    """Render ``messages/__init__.py`` and its stub."""
     rows = ""
     for message in sorted(messages, key=lambda message: message.id):
         numbers = f"{message.crc_extra}, {message.base_length}, {message.length}"
@@ -408,6 +412,7 @@ def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
 
 
 def _reexports(package: str, names: dict[str, str]) -> str:
+    """Render a stub that imports each name from its module."""
     stub = ""
     for module in sorted(set(names.values())):
         imports = "".join(f"    {name} as {name},\n" for name in sorted(names) if names[name] == module)

@@ -312,6 +312,7 @@ def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
 
 
 def _same(left: Any, right: Any) -> bool:
+    """Return True if two values are equal, where NaN equals NaN, also inside tuples."""
     are_both_nan = left != left and right != right
     if left == right or are_both_nan:
         return True

@@ -63,7 +63,7 @@ class MessageFactory(_MAVLink):
 
 
 def _accept_text(encode: Callable[..., Any]) -> Callable[..., Any]:
-    # pymavlink accepts only bytes for text fields, so `str` is converted.
+    """Wrap an ``…_encode`` method of pymavlink, which accepts only bytes for text fields, so that it accepts `str`."""
 
     @wraps(encode)
     def encode_text(self: MessageFactory, *args: Any, **kwargs: Any) -> Any:

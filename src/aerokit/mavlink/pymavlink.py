@@ -58,6 +58,7 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
 
 
 def _class_of(message: Any) -> type[Message]:
+    """Return aerokit's class for a message of pymavlink, or of a similar library."""
     message_type: Any = type(message)
     # Classes of pymavlink have these attributes. For any other object, the message's name must be in the standard.
     if hasattr(message_type, "ordered_fieldnames") and hasattr(message_type, "crc_extra"):
@@ -124,6 +125,7 @@ def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
 
 
 def _packed(message_class: type[Message], field: Field, items: list[Any]) -> bytes:
+    """Return the items of an array of uint8_t as bytes. InvalidArgument if an item is not a byte."""
     try:
         return bytes(items)
     except (TypeError, ValueError):
@@ -161,8 +163,12 @@ def _error(message_class: type[Message], field: Field, value: Any, problem: str)
 
 # ------------------------------------------------------------------------------------------ texts
 def _original_text(message: Any, name: str) -> Any:
-    # In the text of a received message, pymavlink replaces non-ASCII characters. It also stores the original bytes.
-    text, raw = getattr(message, name), getattr(message, f"_{name}_raw", None)
+    """Return the value of a text field, as bytes if possible.
+
+    In the text of a received message, pymavlink replaces non-ASCII characters. It also stores the original bytes.
+    """
+    text = getattr(message, name)
+    raw = getattr(message, f"_{name}_raw", None)
     if isinstance(raw, bytes) and text == raw.partition(b"\0")[0].decode("ascii", "replace"):
         return raw
     return text
@@ -244,6 +250,7 @@ def _dialects(preferred: ModuleType | None) -> Any:
 
 
 def _decoder_for(message_class: Any) -> Decoder:
+    """Return the function that decodes frames of one message to objects of pymavlink. Made once for each message."""
     received = _received_class(message_class)
     unpack = message_class.unpacker.unpack_from
     length = HEADER_LENGTH + message_class.unpacker.size

@@ -42,7 +42,8 @@ def render_message(message: MessageDefinition, *, docs: bool = True) -> str:
     ]
     for field in message.fields:
         lines += ["", f"    {field.attribute}: {_annotation(field)}"]
-        lines += _docstring([_field_doc(field)], "    ") if docs else []
+        if docs:
+            lines += _docstring([_field_doc(field)], "    ")
     lines += ["", *_render_init(message), "", *_render_decode(message), "", *_render_encode(message)]
     return "\n".join(lines) + "\n"
 
@@ -62,7 +63,8 @@ def render_enum_stub(enum: EnumDefinition) -> str:
     for name, entry in enum.members():
         lines.append(f"    {name} = {entry.value}")
         doc = _entry_doc(entry)
-        lines += _docstring(doc, "    ") if doc else []
+        if doc:
+            lines += _docstring(doc, "    ")
     return "\n".join(lines) + "\n"
 
 
@@ -84,6 +86,7 @@ def _enum_doc(enum: EnumDefinition) -> list[str]:
 
 
 def _field_doc(field: FieldDefinition) -> str:
+    """Return the docstring of a field: its description, followed by type, unit and values."""
     parts = [_sentence(field.description)] if field.description else []
     if field.array_length:
         parts.append(f"Type: {field.type}[{field.array_length}].")
@@ -101,6 +104,7 @@ def _field_doc(field: FieldDefinition) -> str:
 
 
 def _entry_doc(entry: EntryDefinition) -> list[str]:
+    """Return the paragraphs of an enum entry's docstring."""
     paragraphs = [_sentence(entry.description)] if entry.description else []
     paragraphs += entry.remarks
     for index, label, units, text in entry.params:
@@ -115,6 +119,7 @@ def _sentence(text: str) -> str:
 
 
 def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
+    """Return the lines of a docstring with these paragraphs."""
     texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
     if texts and texts[-1].endswith('"'):  # Without a space, this quotation mark would join the closing quotes.
         texts[-1] += " "
@@ -202,6 +207,7 @@ def _default(field: FieldDefinition) -> str:
 
 
 def _render_init(message: MessageDefinition) -> list[str]:
+    """Return the lines of a message's ``__init__`` method."""
     # A parameter without a default that follows one with a default must be keyword-only in Python, i.e. follow a "*".
     arguments: list[str] = []
     optional = False
@@ -268,6 +274,7 @@ def _text_expression(value: str) -> str:
 
 
 def _render_encode(message: MessageDefinition) -> list[str]:
+    """Return the lines of a message's ``encode`` method."""
     arguments: list[str] = []
     for field in message.wire_fields:
         value = f"self.{field.attribute}"

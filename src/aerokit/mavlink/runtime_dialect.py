@@ -94,7 +94,10 @@ def compile_message(definition: MessageDefinition) -> type[Message]:
 def _load(
     name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition], standard: Standard
 ) -> LoadedDialect:
-    # Several files of a dialect may contain the same definition, but not different ones with the same id.
+    """Compile the messages and enums of a dialect. Messages equal to those of the standard use its classes.
+
+    Several files of a dialect may contain the same definition, but not different ones with the same id.
+    """
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
         earlier = by_id.setdefault(definition.id, definition)
@@ -108,6 +111,7 @@ def _load(
 
 
 def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
+    """Create the enum class for a definition of this dialect."""
     members = [(member, entry.value) for member, entry in enum.members()]
     try:
         return make_enum(
@@ -135,6 +139,7 @@ def _standard_class(definition: MessageDefinition, standard: Standard) -> type[M
 
 # -------------------------------------------------------------------------------- pymavlink modules
 def _import(name: str) -> ModuleType:
+    """Import a dialect of pymavlink by its short name or its module's name."""
     candidates = [name] if "." in name else [f"pymavlink.dialects.v20.{name}", name]
     for candidate in candidates:
         try:
@@ -148,6 +153,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _message_definition(cls: Any) -> MessageDefinition:
+    """Convert a message class of a pymavlink dialect to a definition."""
     order = list(cls.ordered_fieldnames)
     message_name = getattr(cls, "msgname", None) or cls.name
     fields = []
@@ -166,8 +172,10 @@ def _message_definition(cls: Any) -> MessageDefinition:
 
 
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
-    # pymavlink's classes do not tell which fields are extensions. Each possible number of base fields is tried, until
-    # CRC_EXTRA and the wire order match.
+    """Return the definition with its extension fields marked, which pymavlink's classes do not tell.
+
+    Each possible number of base fields is tried, until CRC_EXTRA and the wire order match.
+    """
     fields = definition.fields
     for base_count in range(len(fields), -1, -1):
         guess = MessageDefinition(

@@ -177,7 +177,7 @@ class Signing:
         self.allow_unsigned = allow_unsigned
         self.refused: dict[Refusal, int] = dict.fromkeys(Refusal, 0)
         """Number of frames refused, for each reason."""
-        self._timestamp_file: TimestampFile | None = None
+        self._timestamp_file: TimestampFile | None = None  # None without ``keep``
         if keep is not None:
             self._timestamp_file = TimestampFile(keep, LAST_TIMESTAMP)
             self.timestamp = max(self.timestamp, self._timestamp_file.timestamp)
@@ -189,7 +189,8 @@ class Signing:
     def for_link(self, link_id: int) -> Signing:
         """Create signing for another link (0–255) with the same key. Replays across these links are detected."""
         signing = Signing(self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned)
-        signing.streams, signing._timestamp_file = self.streams, self._timestamp_file
+        signing.streams = self.streams
+        signing._timestamp_file = self._timestamp_file
         return signing
 
     def timestamp_now(self, now: float = 0.0) -> int:

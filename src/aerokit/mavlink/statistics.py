@@ -71,13 +71,13 @@ class SourceStatistics(SourceFields):
         # number, so a received frame only has to increase `expected`.
         self._unreceived = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_base` is missing
-        self._missing_base = sequence
+        self._missing_base = sequence  # value of `expected` to which `_missing` refers
         self._late_sequence = -1  # sequence number of the last repeated frame
         self._late_count = -1  # value of `received` at that frame
         self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations = 0  # how often the two streams have alternated
-        self._alternated_at = 0.0
+        self._alternated_at = 0.0  # time of the last alternation
         self._last_expected = sequence  # value of `expected` at the last call of `out_of_order`
         self._advanced_at = 0.0  # time of the last call at which `expected` had advanced
 
@@ -112,7 +112,7 @@ class SourceStatistics(SourceFields):
         if ahead < _HALF:
             self._on_gap(ahead, sequence, now)
             return IN_ORDER
-        if self._was_missing(256 - ahead):  # A frame that counted as lost has arrived late.
+        if self._consume_missing(256 - ahead):  # A frame that counted as lost has arrived late.
             self._unreceived -= 1
             self.lost -= 1
             return LATE
@@ -148,8 +148,8 @@ class SourceStatistics(SourceFields):
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
-    def _was_missing(self, behind: int) -> bool:
-        """Return True if the frame ``behind`` numbers before `expected` counted as lost. It no longer does."""
+    def _consume_missing(self, behind: int) -> bool:
+        """Return True if the frame ``behind`` numbers before `expected` counted as lost, and no longer count it so."""
         self._missing, self._missing_base = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
@@ -157,7 +157,10 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        # A single frame with an old number is a repetition. Several in direct succession show that the sender rebooted.
+        """Process a frame with an old number that was not missing. Return a result of :meth:`out_of_order`.
+
+        A single such frame is a repetition. Several in direct succession show that the sender rebooted.
+        """
         follows = sequence == (self._late_sequence + 1) & 0xFF
         is_direct_succession = follows and self._late_count == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
@@ -188,8 +191,11 @@ class SourceStatistics(SourceFields):
         self._missing = self._skipped_over = 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        # Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
-        # other one does.
+        """Process a frame that continues the other stream. Return a result of :meth:`out_of_order`.
+
+        Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
+        other one does.
+        """
         count = self.received - self._stream_start
         is_other_longer = self._other_count > count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
@@ -197,9 +203,10 @@ class SourceStatistics(SourceFields):
         if is_other_longer:
             self._returns += 1
         if is_over or self._returns >= _MIN_RETURNS:
-            self._swap(sequence, now, count, self._other_count if is_other_longer else 0)
+            other_count = self._other_count if is_other_longer else 0
+            self._swap(sequence, now, count, other_count)
             return IN_ORDER
-        if is_other_longer and self._was_missing((self.expected - sequence) & 0xFF or 256):
+        if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
             # The frame is in the gap before the current stream, which was counted as lost.
             self.lost -= 1
             self._skipped_over -= 1

@@ -45,7 +45,8 @@ _compiled: Any = None if wire is None else wire.tlog_records
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
-    data = b""
+    """Yield the records of a file. If garbage is found, the search continues with the next byte."""
+    data = b""  # a part of the file
     begin: int = 0  # position of the next record in `data`
     end: int | None
     is_at_end = False  # True if the whole file has been read

@@ -108,7 +108,9 @@ def _check_integer(where: str, field: str, value: object, high: int) -> None:
 
 
 def _check_command(where: str, command: int, mission_type: int) -> None:
-    is_fence_command, is_rally_command = command in FENCE_COMMANDS, command in RALLY_COMMANDS
+    """Raise InvalidArgument if a command does not belong to this type of plan."""
+    is_fence_command = command in FENCE_COMMANDS
+    is_rally_command = command in RALLY_COMMANDS
     if mission_type == MavMissionType.FENCE:
         is_allowed, allowed = is_fence_command, "a fence command (5000 to 5004), because it is in a fence"
     elif mission_type == MavMissionType.RALLY:
@@ -121,6 +123,7 @@ def _check_command(where: str, command: int, mission_type: int) -> None:
 
 
 def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
+    """Raise InvalidArgument if the frame is unknown, or not allowed for the command or the type of plan."""
     _check_integer(where, "frame", item.frame, 0xFF)
     if item.frame not in _FRAMES:
         raise _wrong(where, "frame", item.frame, "a MAV_FRAME")
@@ -131,6 +134,7 @@ def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
 
 
 def _check_float(where: str, field: str, value: object, *, may_be_nan: bool) -> None:
+    """Raise InvalidArgument if a field is not a number that a 32-bit float can store."""
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         raise _wrong(where, field, value, "a number")
     if math.isnan(value) and may_be_nan:
@@ -148,6 +152,7 @@ def _fits_float32(value: float) -> bool:
 
 
 def _check_place(where: str, item: MissionItem) -> None:
+    """Raise InvalidArgument if x or y is not an integer, or out of range."""
     scale = xy_scale(item.command, item.frame)
     for field, limit, name in (("x", 90, "latitude"), ("y", 180, "longitude")):
         value = getattr(item, field)

@@ -262,6 +262,7 @@ def item_differences(
 def _different_fields(
     expected: MissionItem, actual: MissionItem, storage: ItemStorage, single_precision: bool
 ) -> Iterator[str]:
+    """Yield the names of the fields in which two items with the same command differ."""
     if not _frames_match(expected, actual, storage):
         yield "frame"
     for field in ("param1", "param2", "param3", "param4"):
@@ -284,6 +285,7 @@ def _drops_autocontinue(actual: MissionItem, storage: ItemStorage) -> bool:
 
 
 def _frames_match(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
+    """Return True if both items have the same frame, or if the vehicle stores one frame as the other."""
     expected_frame, actual_frame = canonical_frame(expected.frame), canonical_frame(actual.frame)
     if expected_frame == actual_frame:
         return True
@@ -297,6 +299,7 @@ def _frames_match(expected: MissionItem, actual: MissionItem, storage: ItemStora
 
 
 def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage: ItemStorage) -> bool:
+    """Return True if a parameter is equal in both items, apart from how the vehicle stores it."""
     value, actual_value = getattr(expected, field), getattr(actual, field)
     if _close(value, actual_value):
         return True
@@ -311,6 +314,7 @@ def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage
 def _same_place(
     expected: MissionItem, actual: MissionItem, field: str, storage: ItemStorage, single_precision: bool
 ) -> bool:
+    """Return True if ``field``, which is "x" or "y", is equal in both items, apart from rounding."""
     value, actual_value = getattr(expected, field), getattr(actual, field)
     scale = xy_scale(expected.command, expected.frame)
     if scale != 1:
@@ -332,6 +336,7 @@ def _float_step(value: float) -> float:
 
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
+    """Return True if the altitudes (``z``) are equal, apart from how the vehicle stores them."""
     if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):  # A fence has no altitudes.
         return True
     if not has_place(expected.command):

@@ -220,7 +220,10 @@ def _return_item(place: Position) -> MissionItem:
 
 
 def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
-    # On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
+    """Return the polygon whose vertices begin at item ``first``. RemoteProtocolError if vertices are missing.
+
+    On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
+    """
     item = items[first]
     count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0  # A polygon has at least 3 vertices.
     vertices = items[first : first + count]
@@ -229,19 +232,22 @@ def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
             f"item {first} ({item.name}) begins a polygon of {item.param1:g} vertices, but some of them are missing"
         )
     places = [_place(vertex, first + number) for number, vertex in enumerate(vertices)]
-    is_inclusion = item.command == _POLYGON[True]
+    is_inclusion = item.command == MavCmd.NAV_FENCE_POLYGON_VERTEX_INCLUSION
     return FencePolygon(places, is_inclusion)
 
 
 def _read_circle(item: MissionItem, index: int) -> FenceCircle:
+    """Convert an item to a circle of a fence."""
     center = _place(item, index)
+    is_inclusion = item.command == MavCmd.NAV_FENCE_CIRCLE_INCLUSION
     try:
-        return FenceCircle(center, item.param1, item.command == _CIRCLE[True])
+        return FenceCircle(center, item.param1, is_inclusion)
     except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
 
 
 def _place(item: MissionItem, index: int) -> Position:
+    """Return the position of a fence item, with an altitude only if it is a return point with one."""
     try:
         place = Position(item.x / 1e7, item.y / 1e7)
     except InvalidArgument as error:

@@ -185,6 +185,7 @@ def _missing_in(path: str, value: Any, *keys: str) -> tuple[str, list[str]]:
 
 
 def _read_mission(value: JsonValue) -> Mission:
+    """Read the member ``mission``."""
     value["version"].one_of(2)
     groups = read_entries(value["items"].elements())
     home = value.child("plannedHomePosition")
@@ -193,6 +194,7 @@ def _read_mission(value: JsonValue) -> Mission:
 
 
 def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
+    """Return firmware type, vehicle type, cruise speed and hover speed. Missing values get their defaults."""
     defaults = _numbers(Plan())
     default_firmware, default_vehicle, default_cruise, default_hover = defaults
     if mission is None:
@@ -207,6 +209,7 @@ def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
 
 
 def _read_fence(value: JsonValue) -> Fence:
+    """Read the member ``geoFence``."""
     if _check_version(value, "polygon", "polygons", "circles") == 1:  # Version 1 is allowed only for empty fences.
         return Fence()
     polygons, circles = (value.child(key) for key in ("polygons", "circles"))
@@ -230,6 +233,7 @@ def _check_version(value: JsonValue, *content_keys: str) -> int:
 
 
 def _read_polygon(value: JsonValue) -> FencePolygon:
+    """Read one polygon of the fence."""
     corners = value["polygon"]
     places = [_required_place(corner) for corner in corners.elements()]
     if len(places) < 3:
@@ -238,6 +242,7 @@ def _read_polygon(value: JsonValue) -> FencePolygon:
 
 
 def _read_circle(value: JsonValue) -> FenceCircle:
+    """Read one circle of the fence."""
     circle = value["circle"]
     radius = circle["radius"]
     center = _required_place(circle["center"])
@@ -299,6 +304,7 @@ def _numbers(plan: Plan) -> tuple[int, int, float, float]:
 
 
 def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> None:
+    """Write the mission of a plan into a document. Members that are unchanged since ``old`` are kept as they are."""
     mission = document.setdefault("mission", {})
     if not mission:
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
@@ -316,6 +322,7 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
 
 
 def _fence_members(fence: Fence) -> dict[str, Any]:
+    """Return the members of ``geoFence``. InvalidArgument if the return point's altitude cannot be stored."""
     members: dict[str, Any] = {
         "version": 2,
         "circles": [

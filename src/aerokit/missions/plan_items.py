@@ -37,11 +37,12 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     # Older files have a loiterCoordinate instead of the landingApproachCoordinate.
     approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
     heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # QGroundControl sends these values.
+    x, y, z = _place(pattern["landCoordinate"])
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
         *_reset_items(pattern),
         _approach(pattern, frame, approach),
-        MissionItem(command, frame, 0.0, 0.0, 0.0, heading, *_place(pattern["landCoordinate"])),
+        MissionItem(command, frame, param4=heading, x=x, y=y, z=z),
     )
 
 
@@ -61,12 +62,14 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    # The approach is a waypoint, or a descent in a circle that is left tangentially. Older files have only circles.
+    """Create the item of an approach: a waypoint, or a descent in a circle. Older files have only circles."""
+    x, y, z = _place(place)
     if not _flag(pattern, "useLoiterToAlt", default=True):
-        return MissionItem(MavCmd.NAV_WAYPOINT, frame, 0.0, 0.0, 0.0, math.nan, *_place(place))
+        return MissionItem(MavCmd.NAV_WAYPOINT, frame, param4=math.nan, x=x, y=y, z=z)
     radius = pattern["loiterRadius"].number(0)
     signed_radius = radius if pattern["loiterClockwise"].boolean() else -radius
-    return MissionItem(MavCmd.NAV_LOITER_TO_ALT, frame, 1.0, signed_radius, 0.0, 1.0, *_place(place))
+    # The vehicle leaves the circle tangentially (param4), as soon as it heads for the next item (param1).
+    return MissionItem(MavCmd.NAV_LOITER_TO_ALT, frame, param1=1.0, param2=signed_radius, param4=1.0, x=x, y=y, z=z)
 
 
 def _flag(pattern: JsonValue, key: str, *, default: bool = False) -> bool:
@@ -122,7 +125,8 @@ def merged_entries(
         group = groups[head_end]
         if not _matches(group, items[first_new : first_new + len(group)]):
             break
-        head_end, first_new = head_end + 1, first_new + len(group)
+        head_end += 1
+        first_new += len(group)
     # Keep the entries from `tail_start` on, which contain the items from `end_new` on.
     tail_start, end_new = len(groups), len(items)
     while tail_start > head_end:
@@ -130,9 +134,11 @@ def merged_entries(
         start = end_new - len(group)
         if start < first_new or not _matches(group, items[start:end_new]):
             break
-        tail_start, end_new = tail_start - 1, start
+        tail_start -= 1
+        end_new = start
     new_entries = [simple_entry(item) for item in items[first_new:end_new]]
-    head, tail = copy.deepcopy(list(entries[:head_end])), copy.deepcopy(list(entries[tail_start:]))
+    head = copy.deepcopy(list(entries[:head_end]))
+    tail = copy.deepcopy(list(entries[tail_start:]))
     merged = [*head, *new_entries, *tail]
     sizes = [*map(len, groups[:head_end]), *(1 for _ in new_entries), *map(len, groups[tail_start:])]
     _set_jump_ids(merged, sizes, items)
@@ -198,6 +204,7 @@ def _jump_ids(
 
 
 def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
+    """Read one simple item. ``ids`` maps the file's jump ids to indices of items."""
     command, frame = value["command"].integer(0, 0xFFFF), value["frame"].integer(0, 0xFF)
     params = value["params"].elements(7)
     param1, param2, param3, param4, latitude, longitude, z = (param.number(null=True) for param in params)
@@ -232,8 +239,10 @@ def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
 
 def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
     """Return True if the items are equal. Jump targets are ignored, because they are always rewritten."""
-    if len(group) == len(items) == 1 and group[0].command == items[0].command == MavCmd.DO_JUMP:
-        return group[0].replace(param1=0.0) == items[0].replace(param1=0.0)
+    if len(group) == len(items) == 1:
+        old, new = group[0], items[0]
+        if old.command == new.command == MavCmd.DO_JUMP:
+            return old.replace(param1=0.0) == new.replace(param1=0.0)
     return tuple(group) == tuple(items)
 
 

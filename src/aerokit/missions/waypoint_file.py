@@ -128,6 +128,7 @@ class _Row:
         return Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None
 
     def item(self) -> MissionItem:
+        """Return the item in this line. FileFormatError for values that are invalid or out of range."""
         has_degrees = xy_scale(self.command, self.frame) == DEGREE_SCALE
         latitude = self._number("latitude", 90.0 if has_degrees else math.inf, may_be_nan=True)
         longitude = self._number("longitude", 180.0 if has_degrees else math.inf, may_be_nan=True)
@@ -145,6 +146,7 @@ class _Row:
         )
 
     def _integer(self, column: str, high: int) -> int:
+        """Return the number in a column. FileFormatError if it is not a whole number from 0 to ``high``."""
         text = self.texts[_COLUMNS.index(column)]
         # Every number has at most five digits. int() would take long for a very long text.
         is_short_number = text.isascii() and text.isdigit() and len(text) < 9
@@ -153,6 +155,7 @@ class _Row:
         return int(text)
 
     def _number(self, column: str, limit: float = math.inf, *, may_be_nan: bool = False) -> float:
+        """Return the number in a column. FileFormatError if it is not a finite number within ``limit``."""
         text = self.texts[_COLUMNS.index(column)]
         try:
             value = float(text) if "_" not in text else math.inf  # float() would accept 1_000.
@@ -166,6 +169,7 @@ class _Row:
 
 
 def _home_row(home: Position | None) -> str:
+    """Return the first line of items, which is home. Zeros if home is unknown."""
     place = (0.0, 0.0, 0.0)
     if home is not None:
         place = (home.latitude_deg, home.longitude_deg, home.altitude_amsl_m or 0.0)
@@ -174,6 +178,7 @@ def _home_row(home: Position | None) -> str:
 
 
 def _item_row(item: MissionItem, index: int) -> str:
+    """Return the line for one item. InvalidArgument for numbers that the file cannot store."""
     integers = (index, 0, int(item.frame), int(item.command))
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):

@@ -372,6 +372,7 @@ class _Reader:
         self._types = {node.get("name", ""): TYPES.get(node.get("type", "")) for node in reversed(nodes)}
 
     def definition(self) -> CameraDefinition:
+        """Return the camera's definition. The caller has checked that the file can be parsed."""
         root, head = self._root, self._root.find("definition")
         settings: dict[str, SettingDefinition] = {}
         for node in root.iterfind("parameters/parameter"):
@@ -392,6 +393,7 @@ class _Reader:
         )
 
     def _setting(self, node: Element) -> SettingDefinition | None:
+        """Read one ``<parameter>`` element; return None if its name or type is invalid."""
         name, kind = node.get("name", ""), node.get("type", "")
         if not _is_name(name) or kind not in TYPES:
             return None
@@ -414,6 +416,7 @@ class _Reader:
         )
 
     def _options(self, nodes: Iterable[Element], wire_type: int) -> Iterator[SettingOption]:
+        """Yield the options of a setting whose value is valid for its type."""
         for node in nodes:
             value = _parse_value(node.get("value"), wire_type)
             if value is not None:
@@ -456,6 +459,7 @@ def _is_name(name: str) -> bool:
 
 
 def _number(text: str | None) -> int | float | None:
+    """Parse a number; return None if there is none, or it is not finite."""
     try:
         number = None if text is None else parse_number(text.strip())
         return None if number is None or not math.isfinite(number) else number
@@ -469,6 +473,7 @@ def _int_or_zero(text: str) -> int:
 
 
 def _parse_value(text: str | None, wire_type: int) -> SettingValue | None:
+    """Parse a value of this MAV_PARAM_EXT_TYPE; return None if it is missing or does not fit."""
     value: object = text if wire_type == MavParamExtType.CUSTOM else _number(text)
     try:
         return None if value is None else checked_setting("", value, wire_type)

@@ -155,6 +155,7 @@ def parameter_file_text(
 
 
 def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -> ParameterFile:
+    """Parse a file of Mission Planner or MAVProxy. Each line comes with its place for error texts."""
     values: dict[str, int | float] = {}
     places: dict[str, str] = {}
     for place, line in lines:
@@ -173,6 +174,7 @@ def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -
 def _parse_qgroundcontrol(
     lines: list[tuple[str, str]], comments: list[str], source: str, component_id: int | None
 ) -> ParameterFile:
+    """Parse a file of QGroundControl, and return the parameters of one component."""
     values: dict[int, dict[str, int | float]] = {}
     types: dict[int, dict[str, ParameterType]] = {}
     places: dict[int, dict[str, str]] = {}
@@ -222,6 +224,7 @@ def _select_component(requested: int | None, values: Mapping[int, object], sourc
 
 
 def _add_value(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
+    """Add a parameter to ``values``. FileFormatError if the value is invalid, or the name was added before."""
     try:
         number = parse_number(text)
     except ValueError:

@@ -189,6 +189,7 @@ def _parse(data: bytes) -> list[ParameterMetadata]:
 
 # ------------------------------------------------------------------------------------- ArduPilot
 def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
+    """Yield the parameters of an apm.pdef.xml."""
     for group in root.iter("parameters"):
         for param in group.iter("param"):
             fields = {field.get("name", ""): field.text or "" for field in param.iter("field")}
@@ -212,6 +213,7 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 
 def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
+    """Yield the parameters of an apm.pdef.json."""
     for group, parameters in content.items():
         if group == "json":  # This entry is the version of the format.
             continue
@@ -245,6 +247,7 @@ def _range(text: str) -> tuple[float | None, float | None]:
 
 # ------------------------------------------------------------------------------------------- PX4
 def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
+    """Yield the parameters of PX4's parameters.xml."""
     for group in root.iter("group"):
         for param in group.iter("parameter"):
             values: Mapping[float, str] = _names_by_number(
@@ -272,6 +275,7 @@ def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 
 def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
+    """Convert one entry of PX4's parameters.json."""
     return ParameterMetadata(
         _text(entry["name"]),
         short_description=_text(entry.get("shortDesc", "")),
@@ -304,6 +308,7 @@ def _int_or_none(value: Any) -> int | None:
 
 
 def _number(value: Any) -> int | float | None:
+    """Parse a number; return None for anything else."""
     if not isinstance(value, (int, float, str)):
         return None
     try:

@@ -186,7 +186,8 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     if position + 1 == len(data):
         return None
     # The name begins with characters of the previous name, which the file does not repeat. 1 to 16 more follow.
-    common_length, own_length = data[position + 1] & 0x0F, (data[position + 1] >> 4) + 1
+    common_length = data[position + 1] & 0x0F
+    own_length = (data[position + 1] >> 4) + 1
     if common_length > len(previous_name) or common_length + own_length > NAME_LENGTH:
         raise _damaged(position, f"invalid name length {common_length} + {own_length} after {previous_name!r}")
     kind, format_ = _CODES[code]
@@ -194,13 +195,16 @@ def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | 
     end = start + format_.size * (2 if has_default else 1)
     if end > len(data):
         return None
-    value = format_.unpack_from(data, start)[0]
-    default = format_.unpack_from(data, start + format_.size)[0] if has_default else None
+    (value,) = format_.unpack_from(data, start)
+    default = None
+    if has_default:
+        (default,) = format_.unpack_from(data, start + format_.size)
     name = previous_name[:common_length] + data[position + 2 : start]
     return PackEntry(name, kind, value, default, end)
 
 
 def _parameters(data: bytes, with_defaults: bool, index: int) -> Iterator[Parameter]:
+    """Yield the parameters in a downloaded file. ``index`` is the index of the first one."""
     position = _skip_padding(data, HEADER.size)
     previous_name = b""
     while position < len(data):

@@ -187,7 +187,7 @@ def translate_values(
 
 
 def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
-    # Compute with decimal numbers, and only with the digits that a 32-bit float has.
+    """Return the converted value, computed with decimal numbers and only with the digits that a 32-bit float has."""
     try:
         return float(scale(Decimal(number_text(value))))
     except (ArithmeticError, ValueError):  # The value is infinite, NaN or beyond 32 bits, which no vehicle accepts.
@@ -195,8 +195,11 @@ def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
 
 
 def _checks_to_skip(checks: int) -> int:
-    # If all checks are enabled, none are skipped. If none are enabled, all are skipped, including future checks.
-    # Otherwise the checks that are not enabled are skipped.
+    """Convert ARMING_CHECK to ARMING_SKIPCHK.
+
+    If all checks are enabled, none are skipped. If none are enabled, all are skipped, including future checks.
+    Otherwise the checks that are not enabled are skipped.
+    """
     if checks & _ALL_CHECKS:
         return 0
     return ~checks & _SINGLE_CHECKS if checks & _SINGLE_CHECKS else _SKIP_ALL

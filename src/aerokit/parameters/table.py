@@ -118,6 +118,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
 
 def _merged(old: Parameter | None, new: Parameter) -> Parameter:
+    """Return the new value, with the old default and index if the new one has none."""
     if old is None or (new.default is not None and new.index is not None):
         return new
     default = old.default if new.default is None else new.default
@@ -174,6 +175,7 @@ def _same(left: float | None, right: float | None, tolerance: float) -> bool:
 
 
 def _text(value: float | None) -> str:
+    """Return a value for the text of a difference."""
     if value is None:
         return "missing"
     try:

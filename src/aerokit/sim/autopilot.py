@@ -81,6 +81,7 @@ class VehicleSigning:
         self.load()
 
     def _on_setup(self, message: SetupSigning, _channel: Channel) -> None:
+        """Handle SETUP_SIGNING: use the key in the message, or turn signing off."""
         if not self.may_change():
             return
         has_key = any(message.secret_key)  # A key whose bytes are all 0 turns signing off.
@@ -109,7 +110,7 @@ class ReceivedCorrections:
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
         self.messages: list[bytes] = []
-        self._received_at = -math.inf
+        self._received_at = -math.inf  # time of the last assembled message
         self._sequence = -1  # of the message that is being assembled
         self._fragments: dict[int, bytes] = {}  # by fragment id
         vehicle.on(GpsRtcmData, lambda message, _: self._on_fragment(message))
@@ -119,6 +120,7 @@ class ReceivedCorrections:
         return self._vehicle.now - self._received_at < _CORRECTIONS_MAX_AGE_S
 
     def _on_fragment(self, message: GpsRtcmData) -> None:
+        """Store a fragment of an RTCM message, and assemble the message when all fragments are there."""
         data = bytes(message.data[: message.len])
         is_fragmented = message.flags & 1
         fragment_id = message.flags >> 1 & 3

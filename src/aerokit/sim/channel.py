@@ -89,7 +89,7 @@ class SharedMessageReader(MessageReader):
 
     def __init__(self) -> None:
         super().__init__(None)
-        self._cached: list[Message] | None = None
+        self._cached: list[Message] | None = None  # messages of the last datagram, which several vehicles read
 
     def messages(self, data: bytes, now: float, peer: Hashable) -> list[Message]:
         if self._cached is None:

@@ -92,10 +92,10 @@ class Setpoint:
         mask = message.type_mask
         return cls(
             mask,
-            (message.vx, message.vy, message.vz),
-            (message.afx, message.afy, message.afz),
-            None if mask & Mask.YAW_IGNORE else message.yaw,
-            None if mask & Mask.YAW_RATE_IGNORE else message.yaw_rate,
+            velocity=(message.vx, message.vy, message.vz),
+            acceleration=(message.afx, message.afy, message.afz),
+            yaw=None if mask & Mask.YAW_IGNORE else message.yaw,
+            yaw_rate=None if mask & Mask.YAW_RATE_IGNORE else message.yaw_rate,
         )
 
     @property

@@ -73,9 +73,9 @@ class LogServer:
         self._vehicle = vehicle
         self._erase_files = erase_files
         self._append_to_file = append_to_file
-        self._outgoing: deque[Callable[[], Message]] = deque()
-        self._channel: Channel | None = None
-        self._transfer_number = 0
+        self._outgoing: deque[Callable[[], Message]] = deque()  # builds each message of the present transfer
+        self._channel: Channel | None = None  # where the present transfer is sent
+        self._transfer_number = 0  # Number of the present transfer. An earlier transfer sends nothing more.
         # Content of the log that was requested last, and its index; -1 if there is none.
         self._content = b""
         self._content_number = -1
@@ -160,6 +160,7 @@ class ArduPilotLogServer(LogServer):
         self._has_warned = False
 
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:
+        """Handle LOG_REQUEST_LIST: send an entry for each log in the requested range."""
         if self._refuses():
             return
         if self.is_busy:

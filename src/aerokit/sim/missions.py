@@ -65,7 +65,7 @@ class MissionMount(Mount):
 
     def __init__(self, store: MissionStore) -> None:
         self._store = store
-        self._writer: _Writer | None = None
+        self._writer: _Writer | None = None  # the upload that is open; None without one
 
     def size(self, path: str) -> int:
         _type_of(path)
@@ -106,6 +106,7 @@ class _Writer(UploadedFile):
         return 0
 
     def close(self) -> None:
+        """Decode the file and replace the list. FileFault if the file or an item is invalid."""
         self.is_closed = True
         try:
             header = read_header(bytes(self.content))

@@ -181,14 +181,16 @@ class Motion:
         self.yaw_rate: float = 0.0
         self.impact_speed_m_s: float = 0.0
         """Vertical speed at the last touchdown."""
-        self._gust_north = self._gust_east = 0.0
-        self._jerk_m_s3 = math.inf
+        # Present wind in addition to the mean wind, in m/s.
+        self._gust_north = 0.0
+        self._gust_east = 0.0
+        self._jerk_m_s3 = math.inf  # present change of the acceleration; infinite before the first step
         # The target velocity (north, east, down), or the target acceleration if `_target_is_acceleration` is True.
         self._target = (0.0, 0.0, 0.0)
         self._target_is_acceleration = False
         # The target roll and pitch, which replace the horizontal components of `_target`; None without such a target.
         self._target_lean: tuple[float, float] | None = None
-        self._wanted_yaw: float | None = None
+        self._wanted_yaw: float | None = None  # None: turn with `_wanted_yaw_rate`
         self._wanted_yaw_rate = 0.0
 
     @property
@@ -291,10 +293,11 @@ class Motion:
         self.acceleration_north = self.acceleration_east = self.acceleration_down = 0.0
         self.roll = self.pitch = self.roll_rate = self.pitch_rate = self.yaw_rate = 0.0
         self._set_target((0.0, 0.0, 0.0))
-        self._wanted_yaw, self._wanted_yaw_rate = None, 0.0
+        self._wanted_yaw = None
+        self._wanted_yaw_rate = 0.0
 
     def _update_gusts(self, dt: float) -> None:
-        # The gusts are a random walk that returns to zero. Its standard deviation is `gusts_m_s`.
+        """Change the gusts, which are a random walk that returns to zero. Its standard deviation is `gusts_m_s`."""
         decay = 1.0 - dt / 2.0
         kick = self.wind.gusts_m_s * math.sqrt(dt)
         self._gust_north = self._gust_north * decay + self._rng.gauss(0.0, kick)
@@ -319,6 +322,7 @@ class Motion:
         return north, east, down
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
+        """Return the acceleration (north, east) of a copter that leans by these angles in radians."""
         max_lean = self.limits.lean_rad
         # A positive pitch raises the nose, which pushes the copter backwards. A positive roll pushes it to the right.
         forward = -GRAVITY_M_S2 * math.tan(_clamp(pitch, max_lean))
@@ -328,6 +332,7 @@ class Motion:
         return (forward * cos_yaw - right * sin_yaw - drag_north, forward * sin_yaw + right * cos_yaw - drag_east)
 
     def _drag(self) -> tuple[float, float]:
+        """Return the deceleration (north, east) by the air, in m/s²."""
         return (
             _DRAG_PER_S * (self.velocity_north - self.wind.north_m_s - self._gust_north),
             _DRAG_PER_S * (self.velocity_east - self.wind.east_m_s - self._gust_east),
@@ -359,19 +364,22 @@ class Motion:
         if powered and not self.is_on_ground:
             # The copter also leans against its drag.
             drag_north, drag_east = self._drag()
-            north, east = north + drag_north, east + drag_east
+            north += drag_north
+            east += drag_east
             cos_yaw, sin_yaw = math.cos(self.yaw), math.sin(self.yaw)
             limit = self.limits.lean_rad
             pitch = _clamp(-math.atan2(north * cos_yaw + east * sin_yaw, GRAVITY_M_S2), limit)
             roll = _clamp(math.atan2(east * cos_yaw - north * sin_yaw, GRAVITY_M_S2), limit)
         share = 1.0 - _LEAN_KEPT_PER_S**dt  # The lean approaches its target exponentially.
-        roll_step, pitch_step = (roll - self.roll) * share, (pitch - self.pitch) * share
+        roll_step = (roll - self.roll) * share
+        pitch_step = (pitch - self.pitch) * share
         self.roll += roll_step
         self.pitch += pitch_step
         self.roll_rate = roll_step / dt
         self.pitch_rate = pitch_step / dt
 
     def _turn(self, dt: float, *, powered: bool) -> None:
+        """Turn by ``dt`` seconds to the wanted heading, or with the wanted turn rate."""
         rate = 0.0
         if powered and not self.is_on_ground:
             rate = self._wanted_yaw_rate

@@ -71,8 +71,8 @@ class ArduPilotParameterServer(ParameterServer):
     ) -> None:
         super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz, errors=errors)
         self._send_banner = send_banner
-        self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()
-        self._is_reading = False
+        self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()  # read requests that wait for their answer
+        self._is_reading = False  # True while a call of `_read_next` is pending
 
     def restart(self) -> None:
         super().restart()
@@ -92,6 +92,7 @@ class ArduPilotParameterServer(ParameterServer):
             self._vehicle.call_later(0.0, self._read_next)
 
     def _read_next(self) -> None:
+        """Answer the oldest read request, and schedule the next answer."""
         self._is_reading = bool(self._reads)
         if not self._reads:
             return
@@ -107,6 +108,7 @@ class ArduPilotParameterServer(ParameterServer):
             self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
+        """Handle PARAM_SET: store and broadcast the value, or refuse it."""
         name, faults = request.param_id, self._vehicle.faults
         if name not in self._parameters:
             self._refuse(request, MavParamError.DOES_NOT_EXIST, channel)
@@ -172,6 +174,7 @@ class Px4ParameterServer(ParameterServer):
         self._vehicle.send(value_message(parameter, len(rows), bytewise=True), channel)
 
     def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
+        """Answer a read by index, or by name if the index is −1. _HASH_CHECK is read by name only."""
         names, index, sender = self._parameters.names, request.param_index, sender_of(request)
         if index >= 0:
             if index < len(names):
@@ -186,6 +189,7 @@ class Px4ParameterServer(ParameterServer):
             self._refuse(sender, request.param_id, _UNUSED_INDEX, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
+        """Handle PARAM_SET: store and confirm the value, and broadcast a change a moment later."""
         name, parameters = request.param_id, self._parameters
         if name == HASH_NAME:  # By this request, the client stops the running list, because it knows the parameters.
             self.stop_list(channel)
@@ -204,6 +208,7 @@ class Px4ParameterServer(ParameterServer):
             self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 
     def _error_for(self, name: str, type_: int) -> int | None:
+        """Return the MAV_PARAM_ERROR of a wrong PARAM_SET; None if it is right."""
         if name == HASH_NAME:
             return MavParamError.READ_ONLY
         if name not in self._parameters:

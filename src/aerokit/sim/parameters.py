@@ -63,7 +63,7 @@ class SimParameters:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
         # Maps the name of a parameter to the name of the parameter that enables it.
         self._switches = {row.name: row.switch for row in self._all_rows() if row.switch is not None}
-        self._names: tuple[str, ...] | None = None
+        self._names: tuple[str, ...] | None = None  # None: computed at the next access
         self._indices: dict[str, int] = {}
 
     @classmethod
@@ -165,7 +165,9 @@ def stored_value(value: float, type_: int) -> float:
 
 
 def _row(fields: list[str]) -> SimParameter:
-    name, type_, value = fields[0], int(fields[1]), float(fields[2])
+    """Parse the columns of one line of a parameter table. The default and the last column may be missing."""
+    name, type_text, value_text = fields[:3]
+    type_, value = int(type_text), float(value_text)
     default = float(fields[3]) if len(fields) > 3 else value
     switch_or_mark = fields[4] if len(fields) > 4 else None
     is_volatile = switch_or_mark == _VOLATILE
@@ -252,7 +254,7 @@ class _Reader(FileHandle):
         self._block = block or 0  # The block size; 0 means that the first read determines the size.
         # Only PX4 has a fixed block size. PX4 does not divide a value and its default between two blocks.
         self._whole_defaults = block is not None
-        self._content: bytes | None = None
+        self._content: bytes | None = None  # the whole file; None before the first read
 
     @property
     def content(self) -> bytes:
@@ -262,6 +264,7 @@ class _Reader(FileHandle):
         return self._content
 
     def _packed(self) -> bytes:
+        """Encode the file, as far as the path requests it."""
         try:
             return pack_for_download(
                 (self._parameters.row(name).as_parameter() for name in self._parameters.names),
@@ -309,6 +312,7 @@ class _Writer(UploadedFile):
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
+        """Apply the values in an uploaded file. Unknown names are skipped."""
         # An entry omits the beginning of its name that the previous name has, too, so `read_entry` needs that name.
         position, previous_name = HEADER.size, b""
         for _ in range(count):

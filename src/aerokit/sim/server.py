@@ -69,19 +69,19 @@ class SimulatorServer:
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
         self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # None before the `async with` block
         # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
         self._end_source: Callable[[], None] | None = None
-        self._started_at = 0.0
-        self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)
+        self._started_at = 0.0  # loop time at the start
+        self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)  # simulated time at the start
         self._ports: list[_Port] = []
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.TimerHandle | None = None  # None while no event is scheduled
         self._timer_due = 0.0  # simulated time of the event that the timer is for
         self._timer_at = 0.0  # loop time at which the timer fires
-        self._exit = AsyncExitStack()
+        self._exit = AsyncExitStack()  # closes the links at the end of the block
         # The task that entered the `async with` block. A failing vehicle cancels this task.
         self._owner: asyncio.Task[Any] | None = None
-        self._cancels_owner = False
+        self._cancels_owner = False  # True if the owner was cancelled because of `failure`
         self.on_datagram: Callable[[float, bytes, bool], object] | None = None
         """Called with every datagram: simulated time, bytes, and True if a vehicle has sent the datagram."""
         self.failure: Exception | None = None
@@ -100,6 +100,7 @@ class SimulatorServer:
         return self._now_at_start + (self._loop.time() - self._started_at) * self._speedup
 
     async def __aenter__(self) -> Self:
+        """Open the links and run the vehicles until the present time. The links are closed again if a step fails."""
         if self._loop is not None:
             raise BusyError("this SimulatorServer was already started once; create a new SimulatorServer")
         self._loop = asyncio.get_running_loop()
@@ -114,13 +115,14 @@ class SimulatorServer:
                 if add_source is not None:
                     self._end_source = add_source(self._next_loop_time, self._on_due)
                 self._run(self.now)
-                self._exit = opening.pop_all()
+                self._exit = opening.pop_all()  # From now on, `__aexit__` closes the links instead of this block.
         except BaseException as error:
             self._end(error)
             raise
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
+        """Open each link, with a channel of each of its vehicles. ``opening`` closes them again."""
         connected: set[int] = set()
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
@@ -163,6 +165,7 @@ class SimulatorServer:
             raise
 
     def _on_due(self) -> None:
+        """Run what is due. Called by the timer or the event source."""
         self._skip_lateness()
         self._timer = None
         try:
@@ -193,11 +196,13 @@ class SimulatorServer:
         self._ports.clear()
 
     def _run(self, now: float) -> None:
+        """Run what is due at the simulated time ``now``, send the output, and set the timer."""
         self._step(now)
         self._flush()
         self._schedule()
 
     def _step(self, now: float) -> None:
+        """Advance the vehicles that have an event until ``now``."""
         dues = self._dues
         for number, due in enumerate(dues):
             if due <= now:
@@ -225,6 +230,7 @@ class SimulatorServer:
             self._fail(error)
 
     def _flush(self) -> None:
+        """Write the datagrams of all vehicles to their links."""
         for port in self._ports:
             for datagram in port.take_datagrams(together=self._end_source is None):
                 port.link.write(datagram)
@@ -233,6 +239,7 @@ class SimulatorServer:
             port.hang_up()
 
     def _schedule(self) -> None:
+        """Set the timer for the next event of any vehicle, unless it is set already."""
         loop = self._loop
         if loop is None or self._end_source is not None:  # An event source needs no timer.
             return
@@ -293,8 +300,11 @@ class _Port:
 
     def hang_up(self) -> None:
         """Disconnect the clients of a TCP port whose only vehicle reboots."""
-        if len(self.channels) == 1 and self.channels[0].closes_clients:
-            self.channels[0].closes_clients = False
+        if len(self.channels) != 1:
+            return
+        (channel,) = self.channels
+        if channel.closes_clients:
+            channel.closes_clients = False
             if isinstance(self.link, TcpListen):
                 self.link.close_clients()
 

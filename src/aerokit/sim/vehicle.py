@@ -114,15 +114,16 @@ class SimulatedVehicle:
         self.handlers: dict[int, Handler] = {}
         """Handlers by message id."""
         self._observers: dict[int, list[Handler]] = {}
+        # Heap of (due time, number, function). The numbers keep the order of timers that are due at the same time.
         self._timers: list[tuple[float, int, Callable[[], None]]] = []
         self._timer_count = 0
         self._first_tick_at = self._next_tick_at = math.inf  # infinity while the vehicle does not tick
         self._ticks_done = 0  # since `_first_tick_at`, in units of TICK_S
-        self._text_id = 0
-        self._is_on = False
-        self._at_power_on: list[Callable[[], None]] = []
+        self._text_id = 0  # id of the last STATUSTEXT that was split into several messages
+        self._is_on = False  # False before the power-on and during a reboot
+        self._at_power_on: list[Callable[[], None]] = []  # functions to call at each power-on
         self.channels: list[Channel] = []
-        self._channel = self.open_channel()
+        self._channel = self.open_channel()  # the first channel
         for component in self.components:
             component.join(self)
 
@@ -303,6 +304,7 @@ class SimulatedVehicle:
             self._schedule_tick(_STEADY_TICKS if self.is_steady else 1)
 
     def _run_due(self, due: float) -> None:
+        """Run everything that is due at this time: ticks, timers, and messages of the streams."""
         self._tick_until(due)
         while self._timers and self._timers[0][0] <= due:
             _, _, action = heappop(self._timers)
@@ -379,6 +381,7 @@ class SimulatedVehicle:
         self.send_text(MavSeverity.INFO, text)
 
     def _handle(self, message: Message, channel: Channel) -> None:
+        """Pass a received message to its observers and, if it is for this vehicle, to its handler."""
         handler = self.handlers.get(message.ID)
         # Observers get all messages, even those for other vehicles and those that a fault drops.
         for observer in self._observers.get(message.ID, ()):

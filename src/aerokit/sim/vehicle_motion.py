@@ -149,6 +149,7 @@ class FixedWing(Motion):
         self._advance(dt)
 
     def _fly(self, dt: float, *, powered: bool) -> None:
+        """Move a flying plane by ``dt`` seconds. Without power, it glides at a fixed airspeed."""
         wing = self.wing_limits
         wanted_climb = self._wanted_climb if powered else -wing.glide_sink_m_s
         wanted_speed = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))
@@ -170,6 +171,7 @@ class FixedWing(Motion):
         self.throttle = max(0.0, min(1.0, throttle)) if powered else 0.0
 
     def _touch_down(self) -> None:
+        """Stop the descent on the ground. The plane keeps its speed over ground."""
         self.impact_speed_m_s: float = self.velocity_down
         self._speed = self.ground_speed_m_s
         self.down = self.ground_down
@@ -177,10 +179,12 @@ class FixedWing(Motion):
         self.roll = self.pitch = 0.0
 
     def _change_airspeed(self, wanted: float, dt: float) -> None:
+        """Approach the wanted speed. On the ground, the plane brakes with another deceleration."""
         deceleration = self.wing_limits.roll_out_m_s2 if self.is_on_ground else self.wing_limits.acceleration_m_s2
         self._speed += max(-deceleration * dt, min(self.wing_limits.acceleration_m_s2 * dt, wanted - self._speed))
 
     def _bank(self, wanted: float, dt: float) -> None:
+        """Approach the wanted bank angle, and turn as a plane with this bank angle does."""
         step = (wanted - self.roll) * min(1.0, dt / _BANK_TIME_CONSTANT_S)
         self.roll += step
         self.roll_rate: float = step / dt
@@ -188,6 +192,7 @@ class FixedWing(Motion):
         self.yaw: float = wrap_pi(self.yaw + self.yaw_rate * dt)
 
     def _pitch(self, dt: float) -> None:
+        """Approach the pitch angle that belongs to the present climb."""
         sine_of_slope = -self.velocity_down / max(self._speed, 1.0)
         slope = math.asin(max(-_MAX_SLOPE, min(_MAX_SLOPE, sine_of_slope)))
         step = (slope + _ANGLE_OF_ATTACK_RAD - self.pitch) * min(1.0, dt / _PITCH_TIME_CONSTANT_S)
@@ -195,9 +200,11 @@ class FixedWing(Motion):
         self.pitch_rate: float = step / dt
 
     def _along_nose(self, speed: float) -> tuple[float, float]:
+        """Return the components (north, east) of a speed in the direction of the nose."""
         return speed * math.cos(self.yaw), speed * math.sin(self.yaw)
 
     def _air_movement(self) -> tuple[float, float]:
+        """Return the wind (north, east) with its gusts, in m/s."""
         return self.wind.north_m_s + self._gust_north, self.wind.east_m_s + self._gust_east
 
     def _advance(self, dt: float) -> None:
@@ -261,7 +268,9 @@ class GroundMotion(Motion):
 
     def head(self, speed: float, heading: float) -> None:
         """Drive at this speed in m/s, and turn to this heading in radians."""
-        self._wanted_speed, self._wanted_turn_rate, self._wanted_heading = speed, 0.0, heading
+        self._wanted_speed = speed
+        self._wanted_turn_rate = 0.0
+        self._wanted_heading = heading
 
     def drive_to(self, north: float, east: float, *, speed: float, stops: bool = True, backwards: bool = False) -> None:
         """Drive to a point at up to this speed in m/s. With ``stops``, the rover brakes and stops at the point."""
@@ -318,6 +327,7 @@ class GroundMotion(Motion):
         return max(-limit, min(limit, self._wanted_speed))
 
     def _accelerate(self, wanted: float, dt: float) -> None:
+        """Approach the wanted speed."""
         change = (wanted - self.speed_m_s) * min(1.0, dt / _SPEED_TIME_CONSTANT_S)
         limit = self.wheels.acceleration_m_s2 * dt
         is_braking = abs(wanted) < abs(self.speed_m_s)
@@ -343,7 +353,7 @@ class UnderwaterMotion(Motion):
         super().__init__(rng, limits=_LIMITS)
         self.bottom_down = bottom_down
         self.buoyancy_m_s2 = buoyancy_m_s2
-        self._is_floating = False
+        self._is_floating = False  # True if the buoyancy, not a target, determines the depth
 
     @property
     def is_on_ground(self) -> bool:

@@ -56,6 +56,7 @@ class LinkAddress(Snapshot):
         return dict(self.options).get(name)
 
     def _without_options(self) -> str:
+        """Return the canonical address without its ``?option=value`` part."""
         if self.kind == "serial":
             baud = "" if self.baud is None else f":{self.baud}"
             return f"serial://{_quote_device(self.device)}{baud}"
@@ -158,10 +159,13 @@ _YES_AND_NO = {
 
 
 class _Parser:
+    """Parses one connection string. Its errors name the whole string and the reason."""
+
     def __init__(self, text: str) -> None:
         self.text = text
 
     def parse(self) -> LinkAddress:
+        """Parse the whole text: an address with a scheme, ``pty``, or a bare device, path, or host and port."""
         text = self.text.strip()
         if not text:
             raise self.error("it is empty")
@@ -187,6 +191,7 @@ class _Parser:
         return "", text
 
     def parse_with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
+        """Parse the part after a known scheme. Aliases of the scheme, e.g. ``file``, were already resolved."""
         kind = _SCHEMES[scheme]
         target, _, query = after_scheme.partition("?")
         options = self.parse_options(kind, query)
@@ -301,6 +306,7 @@ class _Parser:
         return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
 
     def parse_options(self, kind: LinkKind, query: str) -> dict[str, str]:
+        """Parse and check the options after the ``?``. Options that have their default value are left out."""
         options: dict[str, str] = {}
         allowed = _OPTIONS.get(kind, ())
         if kind not in _NEVER_COSTLY:

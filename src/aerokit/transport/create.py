@@ -75,6 +75,7 @@ def _endpoints(comma_separated: str | None) -> tuple[str, ...]:
 
 
 def _create_zenoh(parsed: LinkAddress) -> Link:
+    """Create one side of a zenoh link: the vehicle side for ``zenohin``, a client for ``zenoh``."""
     fleet, _, name = parsed.path.partition("/")
     options = network_options(parsed)
     if parsed.kind == "zenohin":

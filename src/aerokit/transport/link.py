@@ -197,12 +197,13 @@ class BaseLink(Link):
         self.dropped_writes: int = 0
         self._state = _State.NEW
         self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
-        self._keeps_peers = False
-        self._stalled_at: float | None = None
-        self._released = asyncio.Event()
+        self._keeps_peers = False  # True if the receiver decides which peers are remembered; see `PeerKeeper`
+        self._stalled_at: float | None = None  # time at which the link stalled; None while it drains
+        self._released = asyncio.Event()  # set while no socket is open
         self._released.set()
 
     async def open(self, receiver: Receiver) -> None:
+        """See `Link.open`. After a failure, the link can be opened again."""
         self._check_may_open()
         self._state, self._receiver = _State.OPENING, receiver
         self._keeps_peers = keeps_peers(receiver)
@@ -280,6 +281,7 @@ class BaseLink(Link):
             raise BusyError(f"{self.address} is {self._state.value}; a link can be opened only once")
 
     def _abort_opening(self) -> None:
+        """Release the link after a failed opening, so that it can be opened again."""
         self._receiver = None
         self._release()
         if self._state is not _State.CLOSED:
@@ -296,6 +298,7 @@ def link_open_error(address: str, cause: OSError, hint: str = "") -> LinkOpenErr
 
 
 def _hint(address: str, cause: OSError) -> str:
+    """Return what the user can do about an error of opening a link; "" if unknown."""
     if isinstance(cause, socket.gaierror):
         return "unknown host name; check the spelling or use the IP address"
     if cause.errno == errno.EADDRNOTAVAIL and address.startswith(("udpin", "tcpin")):
@@ -346,10 +349,10 @@ class MemoryLink(BaseLink):
     def __init__(self, address: str, latency_s: float = 0.0) -> None:
         super().__init__(address)
         self._latency_s = latency_s
-        self._far: MemoryLink | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._far: MemoryLink | None = None  # the other end, set by `memory_link_pair`
+        self._loop: asyncio.AbstractEventLoop | None = None  # None while the link is not open
         self._inbox: deque[tuple[float, bytes | None]] = deque()  # (due time, data); data is None if the far end closed
-        self._wake_up: asyncio.Handle | None = None
+        self._wake_up: asyncio.Handle | None = None  # pending call of `_arrive`
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. The far end receives the data in a later loop iteration."""
@@ -360,6 +363,7 @@ class MemoryLink(BaseLink):
         self._loop = asyncio.get_running_loop()
 
     def _release(self) -> None:
+        """See `BaseLink._release`. Drops received data that was not delivered yet."""
         if self._wake_up is not None:
             self._wake_up.cancel()
         self._wake_up = None
@@ -385,6 +389,7 @@ class MemoryLink(BaseLink):
             self._wake_up = loop.call_at(due, self._arrive) if self._latency_s else loop.call_soon(self._arrive)
 
     def _arrive(self) -> None:
+        """Deliver the data that is due, and schedule the delivery of the rest."""
         self._wake_up = None
         if self._loop is None or not self._inbox:
             return

@@ -71,18 +71,18 @@ class MultiLink(Link):
         self._factories = tuple(factories)
         self._links = [make_link() for make_link in factories]
         self._survives_loss = survives_loss
-        self._receiver: Receiver | None = None
+        self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
         self._was_opened = self._is_closed = False
         self._is_available = [False] * len(self._links)
         # For each link, the peers that the receiver keeps. After a reopening, `keep_peer` is called again for them.
         self._kept: list[set[Peer]] = [set() for _ in self._links]
-        self._openings: set[asyncio.Task[None]] = set()
+        self._openings: set[asyncio.Task[None]] = set()  # tasks that retry links which could not be opened
         # Indices of links that another connection has opened, and that must not be closed here.
         self._foreign: set[int] = set()
-        self._is_opening = False
-        self._last_loss: LinkLost | None = None
-        self._lost_at: float | None = None
-        self._dropped = 0
+        self._is_opening = False  # True while open() runs
+        self._last_loss: LinkLost | None = None  # last loss of any link since the opening
+        self._lost_at: float | None = None  # time since which all links are lost; None while one is available
+        self._dropped = 0  # number of writes dropped here because their link was not available
 
     @property
     def address(self) -> str:  # type: ignore[override]
@@ -183,6 +183,7 @@ class MultiLink(Link):
 
     @property
     def _own_links(self) -> list[Link]:
+        """The links that this object opens and closes."""
         return [link for index, link in enumerate(self._links) if index not in self._foreign]
 
     # ------------------------------------------------------------------------------- opening
@@ -202,13 +203,14 @@ class MultiLink(Link):
         return None
 
     async def _abort_opening(self, openings: Collection[asyncio.Future[LinkOpenError | None]]) -> None:
+        """Cancel all attempts after a failed open(), and make new links, so that it can be called again."""
         self._receiver = None
         for opening in openings:
             opening.cancel()
         await asyncio.wait(openings)
         for link in self._own_links:
             link.close()
-        # open() may be called again, and then needs new links, because a closed link cannot be opened again.
+        # A closed link cannot be opened again.
         for index, make_link in enumerate(self._factories):
             if index not in self._foreign:
                 self._links[index] = make_link()
@@ -221,6 +223,7 @@ class MultiLink(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _retry_opening(self, index: int) -> None:
+        """Try to open a link until it is open or this link is closed, with increasing delays."""
         backoff = Backoff()
         is_reported = False
         while not self._is_closed:

@@ -51,7 +51,7 @@ class Outbox:
         self._progress_at = 0.0  # time at which data last left this machine, or at which polling began
         self._is_full = False  # True between pause() and resume()
         self._is_stalled = self._is_closed = False
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.TimerHandle | None = None  # None while nothing is unsent
 
     @property
     def is_stalled(self) -> bool:
@@ -110,6 +110,7 @@ class Outbox:
             self._forward(self._take_joined())
 
     def _buffer(self, data: bytes) -> None:
+        """Add data to the buffer, or drop it if the buffer is full."""
         # An empty buffer accepts even a frame that is larger than the limit.
         if self._waiting and self._waiting_bytes + len(data) > self._limit:
             self._on_dropped(1)
@@ -142,6 +143,7 @@ class Outbox:
         return data
 
     def _drop_outdated(self) -> None:
+        """Drop the buffered writes that have waited longer than `WRITE_TIMEOUT_S`."""
         now = self._loop.time()
         outdated = sum(deadline <= now for deadline, _ in self._waiting)  # The deadlines are in order.
         for _ in range(outdated):
@@ -175,6 +177,7 @@ class Outbox:
             self._schedule_poll()
 
     def _set_stalled(self, is_stalled: bool) -> None:
+        """Report a change. When the stall ends, forward the buffered data first."""
         if is_stalled == self._is_stalled:
             return
         self._is_stalled = is_stalled

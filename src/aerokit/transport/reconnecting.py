@@ -88,11 +88,12 @@ class ReconnectingLink(Link):
         self._backoff = Backoff(min_delay_s, max_delay_s)
         self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
         self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
-        self._was_opened = self._is_closed = self._is_up = False
+        self._was_opened = self._is_closed = False
+        self._is_up = False  # True while the current link is open
         self._lost_at: float | None = None  # time of the reported loss; None while no loss is reported
-        self._reopening: asyncio.Task[None] | None = None
-        self._stable_timer: asyncio.TimerHandle | None = None
-        self._dropped = 0
+        self._reopening: asyncio.Task[None] | None = None  # None while no attempt is running or due
+        self._stable_timer: asyncio.TimerHandle | None = None  # runs after a reopening, until the link counts as stable
+        self._dropped = 0  # writes dropped by earlier links, and while the link was lost
 
     @property
     def address(self) -> str:  # type: ignore[override]
@@ -125,6 +126,7 @@ class ReconnectingLink(Link):
         return self._lost_at is not None
 
     async def open(self, receiver: Receiver) -> None:
+        """See `Link.open`. After a failure, the link may be opened again."""
         if self._is_closed:
             raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
         if self._was_opened:
@@ -179,6 +181,7 @@ class ReconnectingLink(Link):
     # ------------------------------------------------------------ callbacks of the current link
 
     def _on_bytes(self, current: _CurrentReceiver, data: bytes, peer: Peer) -> None:
+        """Pass bytes on. The first bytes after a reopening show that the link is back."""
         if current is self._current and self._lost_at is not None:
             self._is_up = True
             self._on_restored()
@@ -192,6 +195,7 @@ class ReconnectingLink(Link):
         return None
 
     def _on_lost(self, current: _CurrentReceiver, error: LinkLost) -> None:
+        """Report the loss once, and start to reopen the link. At the end of a recording, end this link instead."""
         if current is not self._current:
             return
         self._is_up = False
@@ -211,6 +215,7 @@ class ReconnectingLink(Link):
     # ----------------------------------------------------------------------- reopening
 
     async def _reopen(self) -> None:
+        """Try to open a new link until one is open. Runs as a task, from each loss on."""
         try:
             while not await self._try_to_open():
                 pass
@@ -256,6 +261,7 @@ class ReconnectingLink(Link):
             self._receiver.link_restored(away_s)
 
     def _end(self, error: LinkLost) -> None:
+        """Report that this link is lost for good. Nothing is called afterwards."""
         receiver, self._receiver, self._current = self._receiver, None, None
         if receiver is not None:
             receiver.link_lost(error)

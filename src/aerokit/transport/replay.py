@@ -36,11 +36,12 @@ class Replay(BaseLink):
         self.frames: int = 0
         """Number of frames delivered so far."""
         self._path, self._speed = path, factor
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # None before the opening
         self._records: Iterator[tuple[float, bytes]] = iter(())
+        # (time stamp, frame); None at the end of the recording.
         self._next: tuple[float, bytes] | None = None  # (time stamp, frame)
         self._due = 0.0  # time of the next frame, on the loop's clock
-        self._wake_up: asyncio.Handle | None = None
+        self._wake_up: asyncio.Handle | None = None  # pending call of `_play`
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """Ignore the data and count the call."""
@@ -62,6 +63,7 @@ class Replay(BaseLink):
             records.close()
 
     def _play(self) -> None:
+        """Deliver the frames that are due, then wait for the next frame, or end the link after the last one."""
         assert self._loop is not None
         now = self._loop.time()
         for _ in range(MAX_FRAMES_PER_ITERATION):

@@ -58,9 +58,9 @@ class SerialLink(BaseLink):
         super().__init__(str(LinkAddress("serial", device=device, baud=baud, options=options)))
         self._device, self._baud, self._rtscts = device, baud, rtscts
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._port: Any = None
-        self._transport: Any = None
-        self._outbox: Outbox | None = None
+        self._port: Any = None  # pyserial's port
+        self._transport: Any = None  # pyserial-asyncio's transport; None while the link is not open
+        self._outbox: Outbox | None = None  # None while the link is not open
 
     @property
     def unsent_bytes(self) -> int:
@@ -115,6 +115,7 @@ class SerialLink(BaseLink):
             raise _open_error(self.address, error) from None
 
     def _open_device(self) -> Any:
+        """Open the port with pyserial. Raises OSError, or ValueError for an unsupported baud rate."""
         serial = importlib.import_module("serial")
         try:
             return serial.Serial(
@@ -131,6 +132,7 @@ class SerialLink(BaseLink):
             self._loop.call_soon(self._lose, f"the device failed: {error.strerror or error}", error)
 
     def _release(self) -> None:
+        """See `BaseLink._release`. Closes the port when the remaining data is sent, at the latest after `LINGER_S`."""
         transport, self._transport = self._transport, None
         outbox, self._outbox = self._outbox, None
         if transport is None or self._loop is None:
@@ -146,6 +148,7 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _close_when_sent(self, transport: Any, deadline: float) -> None:
+        """Close the port when all data is sent or the deadline has passed. Called repeatedly until then."""
         assert self._loop is not None
         if self._waiting_to_be_sent(transport) and self._loop.time() < deadline:
             self._loop.call_later(_LINGER_STEP_S, self._close_when_sent, transport, deadline)
@@ -153,11 +156,13 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _waiting_to_be_sent(self, transport: Any) -> int:
+        """Return the number of unsent bytes in the transport and the driver; 0 if the device is gone."""
         with contextlib.suppress(OSError):
             return int(transport.get_write_buffer_size() + self._port.out_waiting)
         return 0
 
     def _close_port(self, transport: Any) -> None:
+        """Close the port without waiting for unsent data."""
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # The loop may be closed.
             # `_release` has already called this, but a call before the transport's first loop iteration has no effect.
@@ -172,6 +177,8 @@ class SerialLink(BaseLink):
 
 
 class _SerialProtocol(asyncio.Protocol):
+    """Passes the callbacks of the transport to the link and its outbox."""
+
     def __init__(self, link: SerialLink) -> None:
         self._link = link
 
@@ -204,6 +211,7 @@ def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
 
 
 def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
+    """Read from the port without blocking: the replacement of pyserial's ``read``. Report a lost device."""
     try:
         data = os.read(fd, _READ_SIZE)
     except (BlockingIOError, InterruptedError):
@@ -217,6 +225,7 @@ def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
 
 
 def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -> int:
+    """Call ``write``, and report a lost device: the replacement of pyserial's ``write``."""
     try:
         return write(data)
     except (BlockingIOError, InterruptedError):
@@ -227,6 +236,7 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
 
 
 def _open_error(address: str, error: Exception) -> OSError:
+    """Return the LinkOpenError for an error of pyserial, with a hint for the user."""
     number = error.errno if isinstance(error, OSError) else None
     # An error of termios has no `errno`: its number is only in the text.
     if number is None and str(errno.ENOTTY) in str(error):
@@ -265,7 +275,7 @@ class PtyLink(BaseLink):
         self._path = path
         self._ends: tuple[int, ...] = ()  # file descriptors: our end, the other end
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._has_symlink = False
+        self._has_symlink = False  # True while `_path` is a symbolic link that this link has made
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         """See `Link.write`. Data that does not fit into the kernel's buffer is dropped."""
@@ -280,6 +290,7 @@ class PtyLink(BaseLink):
             self._drop(1)
 
     async def _connect(self) -> None:
+        """Create the pseudo-terminal and the symbolic link to its other end."""
         if sys.platform == "win32":
             raise OSError(errno.ENOSYS, "Windows has no pseudo-terminals")
         import tty
@@ -298,6 +309,7 @@ class PtyLink(BaseLink):
         self._loop.add_reader(ours, self._read)
 
     def _make_symlink(self, target: str) -> None:
+        """Make the symbolic link to the other end. OSError if a file of that name exists."""
         # A symbolic link without a target is left over, e.g. from a killed program.
         if os.path.islink(self._path) and not os.path.exists(self._path):
             os.unlink(self._path)
@@ -305,6 +317,7 @@ class PtyLink(BaseLink):
         self._has_symlink = True
 
     def _read(self) -> None:
+        """Deliver the data that another program has written. Called when there is some."""
         our_end, _ = self._ends
         try:
             data = os.read(our_end, _READ_SIZE)
@@ -316,6 +329,7 @@ class PtyLink(BaseLink):
         self._deliver(data)
 
     def _release(self) -> None:
+        """See `BaseLink._release`. Closes both ends at once."""
         ends, self._ends = self._ends, ()
         if self._loop is not None and ends and not self._loop.is_closed():
             our_end, _ = ends

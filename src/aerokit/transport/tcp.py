@@ -51,7 +51,7 @@ class _TcpLink(BaseLink):
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
         self._streams: set[_Stream] = set()  # includes streams that are closed, but still send their remaining data
-        self._stalled: set[_Stream] = set()
+        self._stalled: set[_Stream] = set()  # streams with data that does not leave this machine
 
     @property
     def unsent_bytes(self) -> int:
@@ -101,7 +101,7 @@ class TcpConnect(_TcpLink):
     def __init__(self, host: str, port: int, *, connect_timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         super().__init__("tcp", host, port)
         self._connect_timeout_s = connect_timeout_s
-        self._stream: _Stream | None = None
+        self._stream: _Stream | None = None  # None while the link is not open
 
     @property
     def local_address(self) -> tuple[str, int]:
@@ -120,6 +120,7 @@ class TcpConnect(_TcpLink):
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
+        """Connect to the first address that accepts. If none does, raise the error of the first one."""
         first_error: OSError | None = None
         for address in addresses:
             try:
@@ -129,6 +130,7 @@ class TcpConnect(_TcpLink):
         raise first_error or OSError(errno.EADDRNOTAVAIL, "the host has no address")
 
     async def _connect_to(self, address: SocketAddress) -> None:
+        """Connect to one address. On success, `_on_connected` has stored the stream."""
         loop = asyncio.get_running_loop()
         sock = socket.socket(address.family, socket.SOCK_STREAM)
         try:
@@ -170,10 +172,10 @@ class TcpListen(_TcpLink):
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("tcpin", host, port)
         self._allowed = AllowedPeers(peers)
-        self._kept: set[Peer] = set()
+        self._kept: set[Peer] = set()  # clients that the receiver keeps
         self._socket: socket.socket | None = None  # None once the server owns the socket
         self._server: asyncio.AbstractServer | None = None
-        self._local_address = ("", 0)
+        self._local_address = ("", 0)  # host and port
         self._clients: dict[Peer, _Stream] = {}
 
     @property
@@ -236,6 +238,7 @@ class TcpListen(_TcpLink):
         await self._server.start_serving()
 
     def _on_connected(self, stream: _Stream) -> None:
+        """Accept a client, or disconnect it if it is not allowed or there are too many."""
         # The host is unknown if the client has already disconnected.
         host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
         if (host and not self._allowed.allows(host)) or not self._make_room():
@@ -280,12 +283,12 @@ class _Stream(asyncio.Protocol):
 
     def __init__(self, link: _TcpLink) -> None:
         self._link = link
-        self._transport: asyncio.Transport | None = None
-        self._outbox: Outbox | None = None
-        self._fd = -1
+        self._transport: asyncio.Transport | None = None  # None until the connection is made
+        self._outbox: Outbox | None = None  # None until the connection is made
+        self._fd = -1  # file descriptor of the socket; −1 while there is none
         self._loop = asyncio.get_running_loop()
-        self._linger_timer: asyncio.TimerHandle | None = None
-        self.peer: Peer = None
+        self._linger_timer: asyncio.TimerHandle | None = None  # runs from close() until the remaining data is sent
+        self.peer: Peer = None  # address of the other end, set in `connection_made`
 
     @property
     def own_address(self) -> tuple[str, int]:
@@ -328,6 +331,7 @@ class _Stream(asyncio.Protocol):
 
     # The type of `transport` is Any, because the transports of some loops do not inherit from asyncio.Transport.
     def connection_made(self, transport: Any) -> None:
+        """Keep the buffers of the transport and the kernel small, make the outbox, and add the stream to its link."""
         self._transport = transport
         # The address is unknown (None) if the client has already disconnected. The peer then gets a unique name.
         self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"
@@ -364,11 +368,13 @@ class _Stream(asyncio.Protocol):
             self._outbox.resume()
 
     def _pending(self) -> int:
+        """Return the number of unsent bytes in the transport and the kernel."""
         if self._transport is None or self._fd < 0:
             return 0
         return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
+        """Drop unsent data, and remove the stream from its link."""
         self._fd = -1  # The system may give the same number to another file.
         if self._outbox is not None:
             self._outbox.discard()

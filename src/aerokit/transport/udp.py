@@ -53,11 +53,12 @@ class _UdpLink(BaseLink):
     def __init__(self, scheme: str, host: str, port: int) -> None:
         super().__init__(f"{scheme}:{host_and_port(host, port)}")
         self._host, self._port = host, port
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._socket: socket.socket | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # None before the opening
+        self._socket: socket.socket | None = None  # None while the link is not open
         self._transport: asyncio.DatagramTransport | None = None  # used only on loops without add_reader
-        self._transport_owns_socket = False
+        self._transport_owns_socket = False  # True if asyncio reads and closes the socket
         self._has_more: Callable[[], object] = lambda: False  # returns a true value if a datagram can be read
+        # The receiver, if it wants to know when a burst has been read.
         self._burst_listener: BurstListener | None = None
 
     @property
@@ -84,6 +85,7 @@ class _UdpLink(BaseLink):
             await self._connect_without_reader(sock)
 
     async def _connect_without_reader(self, sock: socket.socket) -> None:
+        """Let asyncio read the socket, through a protocol, and close it."""
         assert self._loop is not None
         self._transport_owns_socket = True
         self._released.clear()
@@ -104,6 +106,7 @@ class _UdpLink(BaseLink):
         self._lose(f"the socket failed: {error}" if error else "the socket was closed", error)
 
     def _release(self) -> None:
+        """See `BaseLink._release`. On loops without ``add_reader``, asyncio closes the socket a moment later."""
         sock, self._socket = self._socket, None
         transport, self._transport = self._transport, None
         loop = None if self._loop is None or self._loop.is_closed() else self._loop
@@ -124,6 +127,7 @@ class _UdpLink(BaseLink):
             self._burst_listener.burst_ended()
 
     def _read_burst(self) -> None:
+        """Read the waiting datagrams, at most `MAX_BURST_DATAGRAMS`."""
         for _ in range(MAX_BURST_DATAGRAMS):
             if self._socket is None:  # The receiver has closed the link in its callback.
                 return
@@ -163,7 +167,7 @@ class UdpListen(_UdpLink):
         super().__init__("udpin", host, port)
         self._allowed = AllowedPeers(peers)
         self._peers: dict[Peer, None] = {}  # ordered, the most recent peer last
-        self._last_source: Peer = None
+        self._last_source: Peer = None  # sender of the last accepted datagram
 
     @property
     def peers(self) -> tuple[Peer, ...]:
@@ -195,6 +199,7 @@ class UdpListen(_UdpLink):
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
+        """Deliver a datagram, unless its sender is not allowed."""
         if source != self._last_source:  # Consecutive datagrams of one sender are checked once, to save time.
             host, *_ = source
             if source not in self._peers and not self._allowed.allows(host):
@@ -220,13 +225,13 @@ class UdpConnect(_UdpLink):
 
     def __init__(self, host: str, port: int) -> None:
         super().__init__("udpout", host, port)
-        self._remote: Any = None
+        self._remote: Any = None  # address of the other end, resolved when the link opens
 
     def write(self, data: bytes, peer: Peer = None) -> None:
         self._send(data, self._remote)
 
     async def _make_socket(self) -> socket.socket:
-        remote = (await resolve(self._host, self._port, socket.SOCK_DGRAM))[0]
+        remote, *_ = await resolve(self._host, self._port, socket.SOCK_DGRAM)
         self._remote = _source_address(remote)
         return bind_to(SocketAddress(remote.family, ("", 0)), socket.SOCK_DGRAM)
 
@@ -247,7 +252,7 @@ class UdpBroadcast(_UdpLink):
     def __init__(self, host: str, port: int, *, peers: PeerFilter | None = None) -> None:
         super().__init__("udpbcast", host, port)
         self._allowed = AllowedPeers(peers)
-        self._broadcast_address: Any = None
+        self._broadcast_address: Any = None  # resolved when the link opens
         self._remote: Any = None  # the peer that answered
 
     def write(self, data: bytes, peer: Peer = None) -> None:
@@ -265,13 +270,14 @@ class UdpBroadcast(_UdpLink):
         return self._remote is None or self._now() - self._received_at > REMOTE_TIMEOUT_S
 
     async def _make_socket(self) -> socket.socket:
-        remote = (await resolve(self._host, self._port, socket.SOCK_DGRAM))[0]
+        remote, *_ = await resolve(self._host, self._port, socket.SOCK_DGRAM)
         self._broadcast_address, self._remote = remote.address, None
         sock = bind_to(SocketAddress(socket.AF_INET, ("", 0)), socket.SOCK_DGRAM)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
+        """Deliver a datagram of the present peer, or of a sender that is accepted as the new peer."""
         if source == self._remote:
             self._received_at = self._now()
         elif not self._is_accepted(source):
@@ -282,8 +288,11 @@ class UdpBroadcast(_UdpLink):
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
-        # Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames
-        # before it accepts the port by `keep_peer`.
+        """Return True if another sender than the present peer may be received.
+
+        Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames before
+        it accepts the port by `keep_peer`.
+        """
         host, *_ = source
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)

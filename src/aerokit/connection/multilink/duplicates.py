@@ -29,13 +29,16 @@ COPY_WINDOW_FRAMES = 128
 
 
 class _Seen:
+    """Record of a received frame: its links, and whether it was admitted and accepted."""
+
     __slots__ = ("at", "count", "is_accepted", "is_admitted", "link_bits")
 
     def __init__(self, at: float, link_bit: int, count: int) -> None:
-        self.at = at
+        self.at = at  # receive time of the first copy
         self.link_bits = link_bit  # has one bit for each link over which the frame arrived
         self.count = count  # number of the sender's frames, this one included, when it arrived
-        self.is_admitted = self.is_accepted = False
+        self.is_admitted = False  # see `Copies.was_admitted`
+        self.is_accepted = False  # see `Copies.was_accepted`
 
 
 class Copies:
@@ -46,9 +49,10 @@ class Copies:
     """
 
     def __init__(self) -> None:
+        # (body, checksum, signature) → what is known about the frame.
         self._seen: dict[tuple[bytes, int, bytes], _Seen] = {}
         self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
-        self._current: _Seen | None = None
+        self._current: _Seen | None = None  # of the last checked frame; None before the first
         self.is_late: bool = False
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 

@@ -61,6 +61,7 @@ class Candidate:
         self.is_other_hardware: bool = False
         """True if :attr:`hardware` is another vehicle's. The link is then not proven by its clock or by copies."""
         self._hardware_requests = self._answers_since_request = 0
+        # Numbers of consecutive matches and mismatches of the clock, and of copies since the proof was last reset.
         self._clock_matches = self._clock_mismatches = self._copies = 0
         self._last_counts = (0, 0)  # numbers of frames received and lost at the last call of `record_counts`
 
@@ -78,7 +79,8 @@ class Candidate:
             self.loss = new_loss if self.loss is None else self.loss + weight * (new_loss - self.loss)
 
     def record_round_trip(self, seconds: float, now: float) -> None:
-        self.answered_at = self.received_at = now
+        self.answered_at = now
+        self.received_at = now
         before = self.round_trip_s
         self.round_trip_s = seconds if before is None else 0.7 * before + 0.3 * seconds
 
@@ -97,6 +99,7 @@ class Candidate:
             self._doubt()
 
     def record_copy(self, now: float) -> None:
+        """Record that a frame with the time since boot arrived both here and over the link in use."""
         self.shared_at = now
         self._copies += 1
         if self._copies >= MIN_COPIES and not self.is_other_hardware:

@@ -53,10 +53,10 @@ class LinkProbes:
     ) -> None:
         self._names, self._choices, self._bus, self._send = names, choices, bus, send
         self._pending: dict[int, tuple[int, int, float]] = {}  # ts1 of a probe → system id, link, send time
-        self._probed_at: dict[tuple[int, int], float] = {}
+        self._probed_at: dict[tuple[int, int], float] = {}  # (system id, link) → time of its last probe
         # Number of probes that may be sent now to systems without a vehicle object, and the time of its last refill.
         self._budget, self._budget_at = UNATTACHED_RATE_HZ, 0.0
-        self._reported: set[tuple[int, int]] = set()
+        self._reported: set[tuple[int, int]] = set()  # (system id, link) of the reported second vehicles
         bus.require_frames(m.Timesync, m.AutopilotVersion)
 
     def probe(
@@ -115,7 +115,8 @@ class LinkProbes:
         """Record the hardware id if the frame is an AUTOPILOT_VERSION of an autopilot."""
         if frame.message_id != m.AutopilotVersion.ID or frame.component_id != _AUTOPILOT:
             return
-        choice, message = self._choices.get(frame.system_id), self._bus.dialect.decode(frame)
+        choice = self._choices.get(frame.system_id)
+        message = self._bus.dialect.decode(frame)
         if isinstance(message, m.AutopilotVersion) and choice is not None and link in choice.candidates:
             choice.record_hardware(link, HardwareId.from_message(message))
             for candidate in choice.candidates.values():

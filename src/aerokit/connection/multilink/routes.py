@@ -47,7 +47,7 @@ class LinkStates:
     ) -> None:
         self._link, self._choices, self._publish = link, choices, publish
         self._states = [LinkState.LOST] * len(link.names)
-        self._updated_at = -math.inf
+        self._updated_at = -math.inf  # time of the last update of the cell; −inf: an update is due
         self.cell: StateCell[tuple[LinkStatus, ...]] = StateCell("links", clock, "frame")
 
     def update(self, now: float) -> None:
@@ -61,6 +61,7 @@ class LinkStates:
             self.set_cell(now)
 
     def set_state(self, link: int, state: LinkState, now: float) -> None:
+        """Record the state of one link, and publish a change. The next update then refreshes the cell at once."""
         before, self._states[link] = self._states[link], state
         if before is not state:
             self._updated_at = -math.inf
@@ -73,6 +74,7 @@ class LinkStates:
         self.cell.set(tuple(map(self._status, range(len(self._states)))), Source(0, 0, "link"))
 
     def _status(self, link: int) -> LinkStatus:
+        """Return the state of one link, and its quality for the systems that are received over it."""
         candidates = {
             system_id: choice.candidates[link]
             for system_id, choice in self._choices.items()
@@ -133,8 +135,8 @@ class MultiLinkRoutes:
     ) -> None:
         self._link, self._bus, self._now = link, bus, now
         self._own_source, self._attached = own_source, attached
-        self._routes = [make_routes() for _ in link.names]
-        self._choices: dict[int, LinkChoice] = {}
+        self._routes = [make_routes() for _ in link.names]  # by index of the link
+        self._choices: dict[int, LinkChoice] = {}  # system id → its links, and the link in use
         self._merged = MergedStreams(len(link.names), self._choices)
         self.copies: Copies = self._merged.copies
         # Maps (system id, link) to the counters of each component: component id → counters.
@@ -184,6 +186,7 @@ class MultiLinkRoutes:
             routes.exclude_pause(now, paused_s)
 
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
+        """Return the first peer, of any link, that :meth:`Routes.evictable_peers` would evict."""
         for index, routes in enumerate(self._routes):
             evictable = routes.evictable_peers((peer for peer in peers if _link_index(peer) == index), now)
             if evictable:
@@ -243,6 +246,7 @@ class MultiLinkRoutes:
     # ------------------------------------------------------------------ state of the links
 
     def link_changed(self, link: int, is_available: bool) -> None:
+        """Record that a link was lost or is available again, and choose the link for each of its systems."""
         now = self._now()
         for system_id, choice in self._choices.items():
             if (candidate := choice.candidates.get(link)) is not None:
@@ -325,6 +329,7 @@ class MultiLinkRoutes:
         return peers
 
     def _choose(self, system_id: int, choice: LinkChoice, now: float) -> None:
+        """Choose the link for a system. If it changes, discard unsent data of the link before, and publish it."""
         before = choice.used
         reason = choice.choose(now)
         used = choice.used
@@ -334,7 +339,8 @@ class MultiLinkRoutes:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
-            name, previous = self._link.names[used.link], self._link.names[before.link]
+            name = self._link.names[used.link]
+            previous = self._link.names[before.link]
             log = logger.info if reason in ("better", "cheaper") else logger.warning
             log(
                 "system %d: switched to %s, because %s is %s",
@@ -355,6 +361,7 @@ class MultiLinkRoutes:
         self._states.set_cell(now)
 
     def _probe(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
+        """Send the probes that are due to the system's autopilot over one link."""
         if choice.needs_proof and candidate.is_available and not candidate.is_stalled:
             is_attached = system_id in self._attached
             for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):

@@ -28,6 +28,7 @@ class VehicleClock:
     """Clock of one vehicle. ``at`` is our time, ``vehicle_s`` the vehicle's, in seconds."""
 
     def __init__(self) -> None:
+        # (our time, the vehicle's time) in seconds.
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
         """True if the last sample was as expected from the speed; False after a pause or reboot."""

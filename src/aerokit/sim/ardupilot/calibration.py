@@ -31,8 +31,8 @@ class AccelerometerCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.is_held_wrong = False  # If True, the calibration fails after the second position.
-        self._run_number = 0
-        self._requested: int | None = None
+        self._run_number = 0  # number of this calibration; timers of earlier ones do nothing
+        self._requested: int | None = None  # position or result that is sent repeatedly; None: nothing is sent
 
     @property
     def is_waiting(self) -> bool:
@@ -57,6 +57,7 @@ class AccelerometerCalibration:
         return MavResult.ACCEPTED
 
     def _on_sample(self, run_number: int, position: int) -> None:
+        """Continue after a position was measured: request the next one, or end the calibration."""
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         has_earlier_position = position != AccelcalVehiclePos.LEVEL  # The vehicle is level first.
@@ -101,11 +102,11 @@ class CompassCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turns_s: float = 30.0
-        self._compass_mask = 0
-        self._started_at = math.inf
-        self._saves_at_once = False
-        self._progress_compass = 0
-        self._reported_compass = 0
+        self._compass_mask = 0  # bit for each compass that is calibrated; 0: none
+        self._started_at = math.inf  # infinite: not started
+        self._saves_at_once = False  # True if the result needs no DO_ACCEPT_MAG_CAL
+        self._progress_compass = 0  # compass of the last progress message
+        self._reported_compass = 0  # compass of the last result message
 
     def reset(self) -> None:
         self._compass_mask = 0
@@ -179,7 +180,9 @@ class CompassCalibration:
         if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
-        offsets, diagonal, off_diagonal = (5.0, 13.0, -18.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+        offsets = (5.0, 13.0, -18.0)
+        diagonal = (1.0, 1.0, 1.0)
+        off_diagonal = (0.0, 0.0, 0.0)
         saved = int(self._saves_at_once)
         status = MagCalStatus.SUCCESS
         return m.MagCalReport(
@@ -229,6 +232,7 @@ class Calibrations:
         }
 
     def _calibrate(self, command: ReceivedCommand) -> int | CommandProgress:
+        """Handle PREFLIGHT_CALIBRATION. Only one kind of calibration is done, even if several are requested."""
         vehicle = self._vehicle
         if vehicle.motors.is_armed:
             vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
@@ -245,6 +249,7 @@ class Calibrations:
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
+        """Calibrate the accelerometers, or accept the present values, as parameter 5 (``command.x``) says."""
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")

@@ -31,10 +31,13 @@ class ArduPilotCamera:
         self.interval_s: float = 0.0  # Seconds between two images of a series.
         self.remaining = 0  # Number of images that the series still has to take; -1 is unlimited.
         self.trigger_distance_m: float = 0.0  # Metres between two images triggered by distance; 0 is off.
-        self._taken_at = -math.inf
-        self._taken_place: tuple[float, float] | None = None
-        self._is_update_scheduled = False
-        self.feedback: m.CameraFeedback = m.CameraFeedback(0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0)
+        self._taken_at = -math.inf  # time of the last image
+        self._taken_place: tuple[float, float] | None = None  # (north, east) of the last image
+        self._is_update_scheduled = False  # True while a call of `_update` is pending
+        self.feedback: m.CameraFeedback = m.CameraFeedback(
+            time_usec=0, target_system=0, cam_idx=0, img_idx=0, lat=0, lng=0, alt_msl=0.0, alt_rel=0.0, roll=0.0,
+            pitch=0.0, yaw=0.0, foc_len=0.0, flags=0,
+        )  # fmt: skip
         """CAMERA_FEEDBACK of the latest image; zeros before the first image."""
 
     @property
@@ -83,6 +86,7 @@ class ArduPilotCamera:
             self._vehicle.call_later(_PERIOD_S, self._update)
 
     def _update(self) -> None:
+        """Take the images that are due in a series or by distance. Called repeatedly while one is active."""
         self._is_update_scheduled = False
         if self.remaining:
             is_due = self._vehicle.now - self._taken_at > self.interval_s
@@ -181,6 +185,7 @@ class ArduPilotCamera:
         return self.feedback if self.is_fitted else None
 
     def information(self) -> m.CameraInformation | None:
+        """Return CAMERA_INFORMATION; None if no camera is fitted."""
         if not self.is_fitted:
             return None
         return m.CameraInformation(
@@ -196,6 +201,7 @@ class ArduPilotCamera:
         return m.CameraSettings(self._vehicle.time_boot_ms, mode_id=0, zoomLevel=math.nan, focusLevel=math.nan)
 
     def capture_status(self) -> m.CameraCaptureStatus | None:
+        """Return CAMERA_CAPTURE_STATUS; None if no camera is fitted."""
         if not self.is_fitted:
             return None
         # `remaining` is -1 during an unlimited series, which the firmware reports as idle (AP_Camera_Backend.cpp).

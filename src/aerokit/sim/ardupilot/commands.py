@@ -109,6 +109,8 @@ def commanded_heading(command: ReceivedCommand, yaw: float) -> float | None:
 
 
 class _CommonCommands:
+    """Handlers of the commands that all ArduPilot vehicles execute in the same way."""
+
     def __init__(self, vehicle: ArduPilotVehicle) -> None:
         self._vehicle = vehicle
 
@@ -123,6 +125,7 @@ class _CommonCommands:
         return handle
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int:
+        """Handle COMPONENT_ARM_DISARM. Arming an armed vehicle is accepted."""
         vehicle = self._vehicle
         must_arm, must_disarm = command.param1 == 1.0, command.param1 == 0.0
         if must_arm:
@@ -136,6 +139,7 @@ class _CommonCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
+        """Handle DO_SET_MISSION_CURRENT. The new current item is reported soon, not at once."""
         vehicle = self._vehicle
         resets_mission = command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
@@ -162,6 +166,7 @@ class _CommonCommands:
         return result
 
     def reposition(self, command: ReceivedCommand) -> int:
+        """Handle DO_REPOSITION: enter GUIDED, if the command allows it, and go to the point."""
         vehicle, guided = self._vehicle, self._vehicle.guided
         if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return Result.UNSUPPORTED
@@ -261,6 +266,7 @@ class HomeAndOrigin:
         vehicle.on(m.SetGpsGlobalOrigin, self._on_origin)
 
     def _set_home(self, command: ReceivedCommand) -> int:
+        """Handle DO_SET_HOME, for the current place or the place in the command."""
         vehicle, nav = self._vehicle, self._vehicle.navigation
         uses_current_place = command.param1 == 1.0 or command.place() == (0, 0)
         if uses_current_place:
@@ -336,6 +342,7 @@ class GimbalCommands:
         return Result.ACCEPTED
 
     def _control_mount(self, command: ReceivedCommand) -> int:
+        """Handle DO_MOUNT_CONTROL, whose last parameter (``command.z``) is the mount mode."""
         gimbal = self._gimbal()
         mode = to_int(command.z)
         if gimbal is None:
@@ -374,6 +381,7 @@ class GimbalCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
+        """Handle GIMBAL_MANAGER_SET_ATTITUDE, which contains angles or rates."""
         gimbal = self._gimbal(message.gimbal_device_id)
         rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
         has_angles = not any(map(math.isnan, message.q))
@@ -384,6 +392,7 @@ class GimbalCommands:
         gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
     def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
+        """Handle GIMBAL_MANAGER_SET_PITCHYAW, which contains angles or rates."""
         gimbal = self._gimbal(message.gimbal_device_id)
         values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
         has_angles_and_rates = not any(map(math.isnan, values))

@@ -44,7 +44,7 @@ class MotorTest:
     def __init__(self, copter: SimulatedCopter) -> None:
         self._copter = copter
         self.is_running: bool = False
-        self._test_number = 0
+        self._test_number = 0  # number of this test; the timer of an earlier one does nothing
 
     def command(self, command: ReceivedCommand) -> int:
         """Start a test, or replace the running test. A status text reports the end of the test."""
@@ -184,6 +184,7 @@ class SimulatedCopter(CopterHost):
     FENCE: ClassVar[type[ArduPilotFence[Any]]] = CopterFence
 
     def make_commands(self) -> dict[int, CommandHandler]:
+        """Return the handlers of the commands that ArduCopter knows."""
         return {
             **common_commands(self),
             MavCmd.NAV_TAKEOFF: self._take_off,
@@ -217,6 +218,7 @@ class SimulatedCopter(CopterHost):
 
     @property
     def base_mode(self) -> int:
+        """The field base_mode of HEARTBEAT."""
         if not self.has_left_boot:  # During the boot, GUIDED_ENABLED is set in every mode.
             return _BASE | _GUIDED
         flags = _BASE
@@ -229,6 +231,7 @@ class SimulatedCopter(CopterHost):
         return flags
 
     def move(self, dt: float) -> None:
+        """Move by ``dt`` seconds, and detect the landing."""
         motion = self.motion
         was_on_ground = motion.is_on_ground
         motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
@@ -244,6 +247,7 @@ class SimulatedCopter(CopterHost):
             motion.settle()
 
     def _take_off(self, command: ReceivedCommand) -> int:
+        """Handle NAV_TAKEOFF. The vehicle must be armed and on the ground."""
         if command.altitude_frame != MavFrame.GLOBAL_RELATIVE_ALT:
             return MavResult.DENIED
         is_upwards = command.z > self.navigation.altitude_above_home
@@ -260,6 +264,7 @@ class SimulatedCopter(CopterHost):
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
+        """Handle DO_CHANGE_SPEED, which sets a speed limit of the present mode."""
         mode = self.mode
         speed = command.param2
         if not speed > 0:  # also refuses NaN
@@ -279,6 +284,7 @@ class SimulatedCopter(CopterHost):
         return MavResult.ACCEPTED
 
     def _turn(self, command: ReceivedCommand) -> int:
+        """Handle CONDITION_YAW."""
         heading = commanded_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
@@ -290,6 +296,7 @@ class SimulatedCopter(CopterHost):
         return MavResult.ACCEPTED
 
     def _pause_or_continue(self, command: ReceivedCommand) -> int:
+        """Handle DO_PAUSE_CONTINUE."""
         if command.param1 not in (0.0, 1.0):
             return MavResult.DENIED
         is_pause = command.param1 == 0.0

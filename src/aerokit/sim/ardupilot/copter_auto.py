@@ -64,10 +64,10 @@ class _CircleLeg:
         self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0  # 0 selects the parameter.
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - self._centre_north, motion.east - self._centre_east
-        self._angle = math.atan2(east, north)
-        self._turned_rad = 0.0
+        self._angle = math.atan2(east, north)  # bearing of the point to follow, seen from the centre
+        self._turned_rad = 0.0  # angle flown so far, in both directions positive
         self._reported_turns = -1  # Not even turn 0 is reported yet.
-        self._approach: _FlyLeg | None = None
+        self._approach: _FlyLeg | None = None  # None once the copter is on the circle
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
         if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - self._centre_down) > _ON_CIRCLE_M:
             self._approach = _FlyLeg(auto, self._point(), stops=True)
@@ -77,6 +77,7 @@ class _CircleLeg:
         return self._approach is None and self._turned_rad / math.tau >= self._turns
 
     def update(self, dt: float) -> None:
+        """Fly by ``dt`` seconds: first to the circle, then around it."""
         if self._approach is not None:
             self._approach.update(dt)
             if self._approach.is_complete:
@@ -99,6 +100,7 @@ class _CircleLeg:
         )
 
     def _point(self) -> Ned:
+        """Return the point of the circle at the bearing `_angle`."""
         north = self._centre_north + self._radius * math.cos(self._angle)
         east = self._centre_east + self._radius * math.sin(self._angle)
         return (north, east, self._centre_down)
@@ -131,12 +133,16 @@ class _ClimbLeg:
 
 
 class _ReturnLeg(CopterRtl):
+    """Return to home and landing. Complete when the motors idle on the ground."""
+
     @property
     def is_complete(self) -> bool:
         return self.vehicle.is_landed and self.vehicle.motors.is_idle
 
 
 class _DescendLeg:
+    """Landing at the place where the leg begins. Complete when the motors idle on the ground."""
+
     def __init__(self, copter: CopterHost) -> None:
         self._copter = copter
 
@@ -178,10 +184,12 @@ class CopterAuto(MissionMode):
         self.climb: float = 0.0  # Maximum climb rate in m/s.
         self.descent: float = 0.0  # Maximum sink rate in m/s.
         self._leg: _Leg | None = None  # None: hold the position.
-        self._last_reached = 0
+        self._last_reached = 0  # index of the command to report in MISSION_ITEM_REACHED; 0: none
         self._reached_at: float | None = None  # None until the copter reaches the waypoint.
-        self._condition_started_at = self._delay_until = 0.0
-        self._list_version = -1
+        self._condition_started_at = 0.0
+        self._delay_until = 0.0
+        self._list_version = -1  # version of the command list from which `_upcoming` was read
+        # The current and the next navigation commands, to notice an upload that changes them.
         self._upcoming: tuple[MissionCommand, ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys(_TAKE_OFFS, self._take_off),
@@ -250,6 +258,7 @@ class CopterAuto(MissionMode):
         self._check_upcoming()  # records the commands that the next call compares
 
     def update(self, dt: float) -> None:
+        """Continue the mission, and fly the leg of the current command for ``dt`` seconds."""
         self.start_if_waiting()
         if not self.is_waiting:
             if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
@@ -279,6 +288,7 @@ class CopterAuto(MissionMode):
         return has_changed and has_same_index
 
     def _restart_command(self) -> None:
+        """Start the current command again, because an upload has changed what follows it."""
         run = self.vehicle.mission
         if not run.is_running:
             return
@@ -308,6 +318,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.hold()
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
+        """Return True if a running command is complete. Called at each tick."""
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
             return self._has_stayed(index, item.param1)
@@ -380,6 +391,7 @@ class CopterAuto(MissionMode):
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
+        """Start a leg to a waypoint, at which the copter stops unless the mission continues from there."""
         run = self.vehicle.mission
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
@@ -388,6 +400,7 @@ class CopterAuto(MissionMode):
         self._go(self._place(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
+        """Start the climb of a take-off command."""
         copter = self.vehicle
         point = copter.world_point(0, 0, item.z, item.frame)  # Only the altitude is used.
         copter.yaw.hold()
@@ -403,6 +416,7 @@ class CopterAuto(MissionMode):
         self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
 
     def _land(self, item: MissionItem) -> None:
+        """Start a landing, at the place of the command or at the present one."""
         self.vehicle.yaw.hold()
         if (item.x, item.y) == (0, 0):
             self._leg = _DescendLeg(self.vehicle)
@@ -411,7 +425,8 @@ class CopterAuto(MissionMode):
         self._go((north, east, self.vehicle.motion.down))
 
     def _return(self, _: MissionItem) -> None:
-        self._leg = leg = _ReturnLeg(self.vehicle)
+        leg = _ReturnLeg(self.vehicle)
+        self._leg = leg
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
@@ -430,6 +445,7 @@ class CopterAuto(MissionMode):
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
+        """Execute DO_CHANGE_SPEED of a mission."""
         if item.param2 <= 0:  # A value of -1 means no change.
             return
         if item.param1 == SpeedType.CLIMB_SPEED:

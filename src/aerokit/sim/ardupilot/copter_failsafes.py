@@ -39,6 +39,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return reasons
 
     def mandatory_reasons(self) -> list[str]:
+        """Return the failures that even a forced arming does not skip: no position or altitude."""
         copter, nav = self.vehicle, self.vehicle.navigation
         reasons = []
         is_position_usable = nav.has_position and not copter.failsafes.has_estimator_failed
@@ -52,6 +53,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
         self.vehicle.path.reset()
 
     def final_reasons(self) -> list[str]:
+        """Return the failures of the checks on a request to arm: the mode and the throttle stick."""
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
@@ -106,9 +108,10 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._radio_good_at = math.nan
+        self._radio_good_at = math.nan  # time since which the radio is good again; NaN while it is not
         self._position_lost = ConditionTimer()
-        self._had_position = self._acted_on_estimator = False
+        self._had_position = False  # True once the estimator has had a position
+        self._acted_on_estimator = False  # True if the failsafe of the estimator began while armed
         self._idling = ConditionTimer()
 
     def update(self) -> None:
@@ -145,6 +148,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self._set_radio_lost(is_lost=True)
 
     def _set_radio_lost(self, *, is_lost: bool) -> None:
+        """Record a change of the radio, and act on its loss."""
         if is_lost == self.is_radio_lost:
             return
         self.is_radio_lost = is_lost
@@ -229,6 +233,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self._lose_estimator()
 
     def _lose_estimator(self) -> None:
+        """Start the failsafe of the estimator: an armed copter lands, unless its mode needs no position."""
         copter = self.vehicle
         self.warn("EKF variance", MavSeverity.CRITICAL)
         self.has_estimator_failed: bool = True
@@ -271,6 +276,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return True
 
     def _execute(self, action: int) -> None:
+        """Execute a failsafe action: try its modes in order, until the copter accepts one."""
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
         if action == _AUTO:  # Landing sequences are not simulated, so the search of the firmware fails.

@@ -51,11 +51,12 @@ class CopterGuided(CopterModeBase):
         self.position: Ned = _ZERO
         self.velocity: Ned = _ZERO
         self.acceleration: Ned = _ZERO
-        self._attitude = (0.0, 0.0)
+        self._attitude = (0.0, 0.0)  # target roll and pitch in radians
+        # Target roll rate and pitch rate in rad/s, which change `_attitude`; None: no rates were commanded.
         self._body_rates: tuple[float, float] | None = None
-        self._attitude_climb = 0.0
-        self._updated_at = -math.inf
-        self._take_off: CopterTakeOff | None = None
+        self._attitude_climb = 0.0  # climb rate in m/s that goes with `_attitude`
+        self._updated_at = -math.inf  # time of the last target
+        self._take_off: CopterTakeOff | None = None  # the take-off that was commanded, if no other target replaced it
         self._is_paused = False
 
     def enter(self, *, force: bool) -> bool:
@@ -142,6 +143,7 @@ class CopterGuided(CopterModeBase):
         copter.yaw.apply_default()
 
     def update(self, dt: float) -> None:
+        """Follow the target of the present submode for ``dt`` seconds."""
         copter = self.vehicle
         self.is_taking_off = False
         if self._is_paused:
@@ -164,6 +166,7 @@ class CopterGuided(CopterModeBase):
         return self.vehicle.now - self._updated_at > self.vehicle.parameters["GUID_TIMEOUT"]
 
     def _run_attitude(self, dt: float) -> None:
+        """Follow the target attitude and climb rate. A copter on the ground lifts off if it is to climb."""
         copter = self.vehicle
         if self._body_rates is not None and not copter.is_landed:  # The body rates change the commanded attitude.
             roll, pitch = (angle + rate * dt for angle, rate in zip(self._attitude, self._body_rates, strict=True))
@@ -180,6 +183,7 @@ class CopterGuided(CopterModeBase):
         copter.motion.seek_attitude(roll, pitch, -climb)  # The motion model takes a velocity down.
 
     def _run_target(self) -> None:
+        """Follow a target of position, velocity, acceleration, or position with velocity."""
         motion = self.vehicle.motion
         if self._is_stale:
             self.vehicle.yaw.stop_turning()
@@ -241,6 +245,7 @@ class CopterSetpoints:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_GLOBAL_INT."""
         if not self._is_guided:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
@@ -273,6 +278,7 @@ class CopterSetpoints:
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
+        """Handle SET_ATTITUDE_TARGET, which contains an attitude or body rates."""
         copter, mask = self._copter, target.type_mask
         guided = copter.mode
         if not isinstance(guided, CopterGuided):

@@ -23,7 +23,7 @@ class AutoYaw:
         self._copter = copter
         self._control: Callable[[], None] = self._hold
         """The method that `update` calls at every tick."""
-        self._roi: tuple[float, float] | None = None
+        self._roi: tuple[float, float] | None = None  # (north, east) of the region of interest
         self._heading = 0.0
         self._rate = 0.0
         """Turn rate that `turn` has set, or `turn_to` for a turn by the longer way; otherwise 0."""
@@ -92,7 +92,7 @@ class AutoYaw:
         self._control()
 
     def _hold(self) -> None:
-        pass
+        """Do nothing: `Motion` keeps the heading."""
 
     def _turn(self) -> None:
         self._copter.motion.turn(self._rate)
@@ -103,6 +103,7 @@ class AutoYaw:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def _go_to_heading(self) -> None:
+        """Turn to the commanded heading, at first in the commanded direction."""
         motion = self._copter.motion
         offset = wrap_pi(self._heading - motion.yaw)
         if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
@@ -191,6 +192,7 @@ class CopterTakeOff:
         self.is_complete: bool = False
 
     def update(self, climb_m_s: float) -> None:
+        """Climb for one tick. The take-off is complete when the copter hovers at the target."""
         copter, motion = self._copter, self._copter.motion
         _, _, target_down = self.target
         copter.motors.spool_up_requested = True
@@ -222,7 +224,7 @@ class CopterPilotedMode(CopterModeBase):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._take_off: CopterTakeOff | None = None
+        self._take_off: CopterTakeOff | None = None  # None while no take-off runs
 
     def enter(self, *, force: bool) -> bool:
         self._take_off = None
@@ -238,6 +240,7 @@ class CopterPilotedMode(CopterModeBase):
         return math.copysign(min(1.0, share) * self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0, stick)
 
     def update(self, dt: float) -> None:
+        """Continue a take-off, or follow the sticks."""
         copter = self.vehicle
         if self._take_off is not None:
             self._take_off.update(copter.speed_limit("PILOT_SPEED_UP"))
@@ -320,13 +323,14 @@ class CopterRtl(CopterModeBase):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._phase = "climb"
-        self._return_down = 0.0
+        self._phase = "climb"  # "climb", "return", "wait" or "land"
+        self._return_down = 0.0  # altitude of the return
         self._waiting_since = 0.0
-        self._place: Ned = (0.0, 0.0, 0.0)
+        self._place: Ned = (0.0, 0.0, 0.0)  # place to which the copter returns
         self.speed: float = 0.0
 
     def enter(self, *, force: bool) -> bool:
+        """Start the return with a climb. Never refused."""
         copter = self.vehicle
         self._phase = "climb"
         self.is_landing = False
@@ -364,6 +368,7 @@ class CopterRtl(CopterModeBase):
         return (north, east, down if self._phase == "land" else self._return_down)
 
     def update(self, dt: float) -> None:
+        """Continue the present phase of the return."""
         copter, target = self.vehicle, self.destination
         if self._phase == "land":
             copter.land()
@@ -395,7 +400,7 @@ class CopterSmartRtl(CopterModeBase):
 
     def __init__(self, copter: CopterHost) -> None:
         super().__init__(copter)
-        self._way_back: list[Ned] = []
+        self._way_back: list[Ned] = []  # points to fly to, in order
 
     def enter(self, *, force: bool) -> bool:
         if not self.vehicle.path.is_active:
@@ -422,6 +427,7 @@ class CopterSmartRtl(CopterModeBase):
         return self._way_back[0] if self._way_back else None
 
     def update(self, dt: float) -> None:
+        """Fly to the next point of the way back, or land at its end."""
         copter = self.vehicle
         if copter.is_landed or not self._way_back:
             self.is_landing: bool = True

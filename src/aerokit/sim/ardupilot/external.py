@@ -58,6 +58,7 @@ class ArduPilotExternal:
         return velocity_to_landing_target(north - motion.north, east - motion.east)
 
     def _on_navigation(self, message: Message, _: Channel) -> None:
+        """Store a measurement of position or speed, if the firmware would use it."""
         if not self._vehicle.parameters.get("VISO_TYPE", 0.0):
             return
         frames = (MavFrame.LOCAL_FRD, MavFrame.BODY_FRD)  # The firmware ignores ODOMETRY in other frames.
@@ -70,6 +71,7 @@ class ArduPilotExternal:
         self.latest[type(message)] = message
 
     def _on_target(self, target: m.LandingTarget, _: Channel) -> None:
+        """Store the position of a landing target, if the firmware would use it."""
         parameters, motion = self._vehicle.parameters, self._vehicle.motion
         is_enabled = parameters.get("PLND_ENABLED", 0.0) and parameters.get("PLND_TYPE", 0.0) == _PLND_TYPE_MAVLINK
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):

@@ -185,7 +185,8 @@ class ArduPilotArming(Generic[HostT]):
         self.vehicle = vehicle
         self.passes: bool = False  # True if the last pre-arm checks have passed, as SYS_STATUS reports.
         self._reported_at = -math.inf
-        self._passed_common = self._has_new_failure = False
+        self._passed_common = False  # result of the common checks one second ago
+        self._has_new_failure = False  # True until the failure is reported
         self._was_always_armed = False
 
     def start(self) -> None:
@@ -268,6 +269,7 @@ class ArduPilotArming(Generic[HostT]):
         return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
 
     def _check(self) -> None:
+        """Run the arming checks, and report failures if a report is due. Called once a second."""
         self._apply_requirement()
         vehicle = self.vehicle
         if vehicle.motors.is_armed:  # The checks run only while disarmed.
@@ -277,10 +279,12 @@ class ArduPilotArming(Generic[HostT]):
         passes_common = not self.common_reasons()
         # After a new failure, the next report is due after `_MIN_REPORT_INTERVAL_S` instead of `_REPORT_INTERVAL_S`.
         self._has_new_failure |= self._passed_common and not passes_common
-        self._passed_common, self.passes = passes_common, not reasons
+        self._passed_common = passes_common
+        self.passes = not reasons
         waited = vehicle.now - self._reported_at
         if waited >= _REPORT_INTERVAL_S or (self._has_new_failure and waited > _MIN_REPORT_INTERVAL_S):
-            self._reported_at, self._has_new_failure = vehicle.now, False
+            self._reported_at = vehicle.now
+            self._has_new_failure = False
             self._send_reasons("PreArm", reasons)
 
     def report(self) -> None:

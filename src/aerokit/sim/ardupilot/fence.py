@@ -86,7 +86,10 @@ class PolygonZone:
 
 
 def _distance_to_side(place: Point, start: Point, end: Point) -> float:
-    (place_north, place_east), (start_north, start_east), (end_north, end_east) = place, start, end
+    """Return the distance from a place to the side between two corners."""
+    place_north, place_east = place
+    start_north, start_east = start
+    end_north, end_east = end
     north, east = end_north - start_north, end_east - start_east
     squared_length = north * north + east * east
     share = 0.0  # Point of the side that is nearest to the place: 0 is the start, 1 the end.
@@ -98,7 +101,9 @@ def _distance_to_side(place: Point, start: Point, end: Point) -> float:
 
 def _crosses(place: Point, start: Point, end: Point) -> bool:
     """Return True if a ray from ``place`` to the north crosses the side."""
-    (place_north, place_east), (start_north, start_east), (end_north, end_east) = place, start, end
+    place_north, place_east = place
+    start_north, start_east = start
+    end_north, end_east = end
     are_ends_on_same_side = (start_east > place_east) == (end_east > place_east)
     if are_ends_on_same_side:
         return False
@@ -152,10 +157,11 @@ class ArduPilotFence(Generic[HostT]):
         # True if the last command about the lower limit enabled the limit, False if it disabled it; None without a
         # command.
         self._floor_enabled_by_command: bool | None = None
-        self._recovering_since = -math.inf
-        self._reported_at = self._checked_at = -math.inf
+        self._recovering_since = -math.inf  # time of the last `recover_by_hand`
+        self._reported_at = -math.inf  # time of the last FENCE_STATUS about a breach
+        self._checked_at = -math.inf
         self._zones = FenceZones((), vehicle.frame)
-        self._zone_items: list[object] = []
+        self._zone_items: list[object] = []  # the items from which `_zones` was made
 
     @property
     def configured(self) -> int:
@@ -227,7 +233,9 @@ class ArduPilotFence(Generic[HostT]):
             self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
-        enable, auto_enable = int(self.vehicle.parameters["FENCE_ENABLE"]), int(self._value("FENCE_AUTOENABLE"))
+        """Enable or disable the fence when its parameters have changed."""
+        enable = int(self.vehicle.parameters["FENCE_ENABLE"])
+        auto_enable = int(self._value("FENCE_AUTOENABLE"))
         if (enable, auto_enable) != self._enabling_parameters:
             self._enabling_parameters = (enable, auto_enable)
             self.enabled = self.configured & ~_MIN_ALT if enable else 0
@@ -313,6 +321,7 @@ class ArduPilotFence(Generic[HostT]):
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
     def _record_breach(self, kind: int) -> None:
+        """Count a new breach of this kind of fence. FENCE_STATUS reports the first of several."""
         vehicle = self.vehicle
         self.breach_count += 1
         was_any_breached = self.breached != 0
@@ -327,6 +336,7 @@ class ArduPilotFence(Generic[HostT]):
                 vehicle.send(status)
 
     def _clear(self, kinds: int) -> None:
+        """End the breaches of these kinds."""
         self.breached &= ~kinds
         for kind in _NAMES:
             if kinds & kind:

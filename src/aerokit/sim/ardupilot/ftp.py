@@ -162,6 +162,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._terminate(peer, request)
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        """Open a file. Refused while another file is open, unless nothing was sent for a while."""
         is_reading = request.opcode == Op.OPENFILERO
         is_idle = self._host.now - self._sent_at > _SESSION_TIMEOUT_S
         if is_reading and is_idle:  # The client may have missed the reply to its previous request to open a file.
@@ -243,6 +244,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._unknown(request)
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
+        """Rename a file. The request contains both names, separated by NUL."""
         old_name, _, remainder = request.data.partition(b"\0")
         new_name, _, _ = remainder.partition(b"\0")
         length = len(old_name) + len(new_name)

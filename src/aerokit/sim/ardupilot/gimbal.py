@@ -74,9 +74,9 @@ class ArduPilotGimbal:
         self.is_yaw_locked: bool = False  # True if the pilot's stick controls yaw relative to north.
         self.in_control: tuple[int, int] = (0, 0)  # System id and component id that control the gimbal.
         self._target = MountTarget()
-        self._region: Ned | None = None
-        self._followed_id = 0
-        self._followed_place: Ned | None = None
+        self._region: Ned | None = None  # region of interest; None: there is none
+        self._followed_id = 0  # system id of the followed vehicle
+        self._followed_place: Ned | None = None  # None until its position is received
         vehicle.observe(GlobalPositionInt, self._on_global_position)
 
     @property
@@ -104,6 +104,7 @@ class ArduPilotGimbal:
 
     @property
     def target(self) -> MountTarget:
+        """The direction that the present mode commands."""
         if self.mode == MavMountMode.RC_TARGETING:  # The gimbal's sticks always rest in the middle.
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
@@ -243,6 +244,7 @@ class ArduPilotGimbal:
         self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
+        """Return GIMBAL_DEVICE_ATTITUDE_STATUS; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         roll, pitch, yaw = map(math.radians, self.angles)
@@ -262,6 +264,7 @@ class ArduPilotGimbal:
         )
 
     def manager_information(self) -> m.GimbalManagerInformation | None:
+        """Return GIMBAL_MANAGER_INFORMATION; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         limits = (
@@ -272,6 +275,7 @@ class ArduPilotGimbal:
         return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
     def manager_status(self) -> m.GimbalManagerStatus | None:
+        """Return GIMBAL_MANAGER_STATUS; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK

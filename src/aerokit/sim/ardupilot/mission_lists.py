@@ -114,6 +114,7 @@ class CommandList(ItemList):
         return target != 0 and (target < self.count or target <= last)
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
+        """Store an item at index ``seq``, or append it. Return a MAV_MISSION_RESULT."""
         count = len(self._commands)
         # A list with space only for home refuses every item, even item 0, which is never stored.
         has_space = self.capacity > 1 and seq < self.capacity
@@ -185,6 +186,7 @@ class RallyList(ItemList):
 
 
 def _stored_rally_point(item: MissionItem) -> MissionItem | int:
+    """Return an item as the firmware stores it, or the MAV_MISSION_RESULT of its refusal."""
     if item.command != Cmd.NAV_RALLY_POINT:
         return MavMissionResult.UNSUPPORTED
     result = check_place(item.x, item.y)
@@ -223,6 +225,7 @@ class FenceList(ItemList):
     def __init__(self, capacity: int = _STORAGE_BYTES // _BYTES_PER_POINT) -> None:
         super().__init__(capacity)
         self._stored: list[MissionItem] = []
+        # Items of a running upload, None for those that are missing; None without an upload.
         self._uploaded: list[MissionItem | None] | None = None
 
     @property
@@ -286,6 +289,7 @@ class FenceList(ItemList):
 
 
 def _stored_fence_item(item: MissionItem) -> MissionItem | int:
+    """Return an item as the firmware stores it, or the MAV_MISSION_RESULT of its refusal."""
     if item.frame == MavFrame.MISSION or altitude_frame(item.frame) is None:
         return MavMissionResult.UNSUPPORTED_FRAME
     size = 0.0

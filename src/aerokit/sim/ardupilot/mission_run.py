@@ -178,6 +178,7 @@ class MissionRun:
             index = command.seq + 1
 
     def _next_navigation(self, index: int) -> MissionCommand | None:
+        """Return the next navigation command from ``index`` on. None if there is none, or jumps form a loop."""
         for _ in range(1 + _MAX_STEPS):
             command = self._next(index, count_jumps=False)
             if command is None or is_navigation(command.item):
@@ -201,6 +202,7 @@ class MissionRun:
             self.set_current(resume_index)
 
     def _start(self) -> None:
+        """Start the mission at its first command. A mission without a navigation command is complete at once."""
         self._state = MissionState.ACTIVE
         self.reset()
         if not self._start_next_navigation():
@@ -319,6 +321,7 @@ class MissionRun:
         self._begin(*command)
 
     def _begin(self, index: int, item: MissionItem) -> bool:
+        """Start a command. Return False if the vehicle does not support it."""
         name = command_name(item.command)
         target = f" {item.param1:.0f}" if item.command in _WITH_TARGET else ""
         self._vehicle.info(f"Mission: {index} {name}{target}")

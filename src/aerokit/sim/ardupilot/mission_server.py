@@ -58,6 +58,7 @@ class ArduPilotMissionServer(MissionServer):
             MavMissionType.FENCE: self.fence,
             MavMissionType.RALLY: self.rally,
         }
+        # (message type, list type) of the warnings that were sent.
         self._warnings: set[tuple[type[Message], int]] = set()
 
     def listen(self) -> None:
@@ -90,6 +91,7 @@ class ArduPilotMissionServer(MissionServer):
         return Result.ACCEPTED
 
     def _home(self) -> MissionItem:
+        """Return item 0 of a download. Zeros if home is unknown."""
         home = self._vehicle.navigation.home
         if home is None:
             return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
@@ -120,6 +122,7 @@ class ArduPilotMissionServer(MissionServer):
         return mission_type
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
+        """Return the MAV_MISSION_RESULT with which a message is refused; None if it is not."""
         kind = message.mission_type
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
@@ -144,6 +147,7 @@ class ArduPilotMissionServer(MissionServer):
         return self._lists[mission_type].item(seq)
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
+        """Return the message that answers a request: MISSION_ITEM_INT or MISSION_ITEM."""
         client, kind = sender_of(request), request.mission_type
         # Reproduces a bug of the firmware, which compares the command of the item (instead of its index) with the index
         # of the current item.
@@ -162,11 +166,13 @@ class ArduPilotMissionServer(MissionServer):
         self._warn(f"Only {self.capacity(message.mission_type)} items are supported")
 
     def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
+        """Prepare the list for an upload. ``first`` and ``end`` are the range of the uploaded items."""
         if isinstance(message, m.MissionCount):
             self._lists[message.mission_type].begin(message.count)
         return super()._begin(message, channel, first, end)
 
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
+        """Start the upload of some items of a list."""
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
         # `end` may be equal to the number of items, because the item with this index is appended to the list.
@@ -198,6 +204,7 @@ class ArduPilotMissionServer(MissionServer):
         super()._time_out(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
+        """Handle an item of an upload, or one that is a target in GUIDED."""
         item = _with_integer_position(message)
         kind = message.mission_type
         if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
@@ -230,6 +237,7 @@ class ArduPilotMissionServer(MissionServer):
         """Do nothing: ArduPilot ignores this message."""
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
+        """Handle MISSION_CLEAR_ALL. A list that another client uploads is not cleared."""
         kind, client = request.mission_type, sender_of(request)
         upload = self._uploads.get(kind)
         result: int = Result.UNSUPPORTED

@@ -41,7 +41,7 @@ class ArduPilotNavigation:
         self.origin: Ned | None = None
         self.home: Ned | None = None
         self.home_is_locked: bool = False
-        self._gps_lost_at = math.nan
+        self._gps_lost_at = math.nan  # NaN while GPS is good
 
     def start(self) -> None:
         """Schedule the events of the boot timeline."""
@@ -168,6 +168,7 @@ class ArduPilotNavigation:
         self._vehicle.info("GPS 1: detected u-blox")
 
     def _get_fix(self) -> None:
+        """Get the first fix, unless GPS is missing, and watch GPS from now on."""
         if self.is_gps_detected and not self.gps_is_lost:
             self.fix_type = GpsFixType.RTK_FIXED
             if self._vehicle.timeline.uses_dcm_until_gps:
@@ -175,6 +176,7 @@ class ArduPilotNavigation:
         self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_gps)
 
     def _set_origin_when_possible(self) -> None:
+        """Set the estimator's origin and home, or check again in a second if there is no fix yet."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._vehicle.call_later(1.0, self._set_origin_when_possible)
             return
@@ -201,6 +203,7 @@ class ArduPilotNavigation:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
+        """React to a lost GPS, and use a returned one again."""
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
@@ -269,12 +272,13 @@ class SmartPath:
 
     def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
         self._vehicle = vehicle
-        self._only_armed = only_armed
+        self._only_armed = only_armed  # True: record only while the vehicle is armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
-        # Times of the last good position, the last recorded point and the last warning.
-        self._good_at = self._saved_at = self._warned_at = -math.inf
-        self._is_started = False
+        self._good_at = -math.inf  # time of the last good position
+        self._saved_at = -math.inf  # time of the last recorded point
+        self._warned_at = -math.inf
+        self._is_started = False  # True after the first `reset`
         self.is_active: bool = False  # True while SMART_RTL is possible.
 
     def __len__(self) -> int:
@@ -296,7 +300,8 @@ class SmartPath:
             return
         if self._vehicle.navigation.has_position:
             self._points.append(self._vehicle.motion.place)
-            self._good_at = self._saved_at = self._vehicle.now
+            self._good_at = self._vehicle.now
+            self._saved_at = self._vehicle.now
             self.is_active = True
 
     def take_way_back(self) -> list[Ned]:
@@ -394,15 +399,22 @@ def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
 
 
 def _vector(start: Ned, end: Ned) -> Ned:
-    return (end[0] - start[0], end[1] - start[1], end[2] - start[2])
+    start_north, start_east, start_down = start
+    north, east, down = end
+    return (north - start_north, east - start_east, down - start_down)
 
 
 def _dot(first: Ned, second: Ned) -> float:
-    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+    first_north, first_east, first_down = first
+    north, east, down = second
+    return first_north * north + first_east * east + first_down * down
 
 
 def _along(start: Ned, line: Ned, share: float) -> Ned:
-    return (start[0] + share * line[0], start[1] + share * line[1], start[2] + share * line[2])
+    """Return the point on a line after this share of the line, 0 to 1."""
+    start_north, start_east, start_down = start
+    north, east, down = line
+    return (start_north + share * north, start_east + share * east, start_down + share * down)
 
 
 def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:

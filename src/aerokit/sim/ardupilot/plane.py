@@ -36,6 +36,7 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
     """ArduPlane's arming checks. Every mode needs GPS, limits must be plausible, and the mode must be armable."""
 
     def own_reasons(self) -> list[str]:
+        """Return the texts of the checks that fail."""
         parameters, mode = self.vehicle.parameters, self.vehicle.mode
         max_roll = parameters["ROLL_LIMIT_DEG"]
         max_pitch, min_pitch = parameters["PTCH_LIM_MAX_DEG"], parameters["PTCH_LIM_MIN_DEG"]
@@ -123,6 +124,7 @@ class SimulatedPlane(PlaneHost):
     failsafes: PlaneFailsafes  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def make_commands(self) -> dict[int, CommandHandler]:
+        """Return the handlers of the commands that ArduPlane knows."""
         # NAV_TAKEOFF fails, because it needs the lifting rotors of a QuadPlane. ArduPlane has no command to land.
         return {
             **common_commands(self),
@@ -158,6 +160,7 @@ class SimulatedPlane(PlaneHost):
         return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
 
     def move(self, dt: float) -> None:
+        """Move by ``dt`` seconds. A plane that rests for a while counts as landed."""
         wing = self.wing
         was_on_ground = wing.is_on_ground
         wing.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)

@@ -36,12 +36,12 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
         self._manoeuvre = _LOITER
-        self._landing: PlaneLanding | None = None
-        self._on_circle_since = math.nan
-        self._turned_rad = 0.0
-        self._last_bearing = 0.0
+        self._landing: PlaneLanding | None = None  # set while `_manoeuvre` is `_LAND`
+        self._on_circle_since = math.nan  # NaN before the plane has reached the circle
+        self._turned_rad = 0.0  # angle flown around the circle
+        self._last_bearing = 0.0  # bearing from the centre of the circle at the last tick
         self._condition_started_at = 0.0
-        self._leg_start: Ned = (0.0, 0.0, 0.0)
+        self._leg_start: Ned = (0.0, 0.0, 0.0)  # start of the straight line to the current waypoint
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
             **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
@@ -82,6 +82,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         """Do nothing, because disarming has already reset the progress."""
 
     def update(self, dt: float) -> None:
+        """Continue the mission, and fly the present manoeuvre for ``dt`` seconds."""
         plane = self.vehicle
         plane.mission.update()
         if plane.mode is not self:  # The mission has changed the mode.
@@ -133,6 +134,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.set_mode(PlaneMode.RTL)
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
+        """Return True if a running command is complete, and report that. Called at each tick."""
         plane, command = self.vehicle, item.command
         if command == Cmd.NAV_TAKEOFF:
             is_altitude_reached = plane.wing.down <= self._place_down
@@ -200,6 +202,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.radius: float = item.param2 if item.command == Cmd.NAV_LOITER_TO_ALT else item.param3
 
     def _land(self, item: MissionItem) -> None:
+        """Start a landing at the position of the command."""
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
@@ -348,6 +351,7 @@ class PlaneSetpoints:
         plane.info(f"Change alt to {home_down - down:.1f}")
 
     def _on_global(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_GLOBAL_INT, which changes only the altitude."""
         plane = self._plane
         if not self._is_guided:
             return

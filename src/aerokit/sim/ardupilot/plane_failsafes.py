@@ -50,10 +50,12 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         super().__init__(plane)
         # The active failsafe: none, the short or the long failsafe of the radio, or that of the ground station.
         self.state: int = _NONE
-        self._short_since = math.nan
+        self._short_since = math.nan  # start of the short failsafe
         self._radio_bad = ConditionTimer()
-        self._mode_before = self._mode_after = 0
-        self._is_long_pending = False
+        # Numbers of the modes before and after the start of the short failsafe.
+        self._mode_before = 0
+        self._mode_after = 0
+        self._is_long_pending = False  # True if FS_LONG_ACTN waits for the end of the initial climb
 
     @property
     def is_any_active(self) -> bool:
@@ -78,6 +80,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         return is_throttle_low or plane.now - self.radio_received_at > _SILENT_S
 
     def _check_radio(self) -> None:
+        """Detect the loss of the radio, which must last for a while."""
         plane = self.vehicle
         if plane.rc.is_receiving:
             self.radio_received_at: float = plane.now
@@ -94,6 +97,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn(f"Throttle failsafe {'on' if is_lost else 'off'}")
 
     def _check_short(self) -> None:
+        """Start or end the short failsafe."""
         action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
         is_needed = self.is_radio_lost and action != _SHORT_DISABLED
         is_landing = self.vehicle.mode.is_landing
@@ -103,9 +107,12 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._end_short()
 
     def _start_short(self, action: int) -> None:
+        """Start the short failsafe of the radio. Some modes continue, depending on the action."""
         plane = self.vehicle
-        self.state, self._short_since = _SHORT, plane.now
-        mode = self._mode_before = plane.mode.number
+        self.state = _SHORT
+        self._short_since = plane.now
+        mode = plane.mode.number
+        self._mode_before = mode
         # A mode in `_NAVIGATING` continues if the action is "best guess" (events.cpp).
         if mode in _PILOTED or (mode in _NAVIGATING and action != _SHORT_BEST_GUESS):
             plane.set_mode(_SHORT_MODES.get(action, PlaneMode.CIRCLE))  # All other actions select CIRCLE.
@@ -116,6 +123,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn("RC Short Failsafe On")
 
     def _end_short(self) -> None:
+        """End the short failsafe, and restore the mode unless another one was selected meanwhile."""
         plane = self.vehicle
         self.warn("Short Failsafe Cleared")
         self.state = _NONE
@@ -124,6 +132,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn(f"Flight mode {plane.mode.name} restored", MavSeverity.INFO)
 
     def _check_long(self) -> None:
+        """Start the long failsafe if the radio or the ground station is lost long enough, or end it."""
         if self.state in (_LONG, _GCS):
             self._check_end_of_long()
             return
@@ -155,7 +164,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._end_long("RC Long Failsafe Cleared")
 
     def _end_long(self, text: str) -> None:
-        self.state, self._is_long_pending = _NONE, False
+        self.state = _NONE
+        self._is_long_pending = False
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
@@ -192,6 +202,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
                 self._start_long(_LONG)
 
     def act_on_battery(self, action: int) -> None:
+        """Execute BATT_FS_LOW_ACT or BATT_FS_CRT_ACT. A running landing continues."""
         is_landing = self.vehicle.mode.is_landing
         # The Q modes need lifting rotors. A plane without them executes all three actions as LAND.
         lands = action in (_LAND, _QLAND, _LOITER_QLAND)
@@ -240,7 +251,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self._mode_before: int | None = None
+        self._mode_before: int | None = None  # mode before the last return; None before the first
 
     def update(self) -> None:
         super().update()
@@ -250,6 +261,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             self.caused_mode = False
 
     def act(self, new_breaches: int) -> None:
+        """Execute FENCE_ACTION after a new breach."""
         plane = self.vehicle
         if self.caused_mode:  # The plane already returns from an earlier breach.
             return
@@ -270,9 +282,9 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
         or half-way between the altitude limits.
         """
         plane, parameters = self.vehicle, self.vehicle.parameters
-        home = plane.home_or_ground
+        home_north, home_east, home_down = plane.home_or_ground
         if parameters["FENCE_RET_RALLY"]:
-            return best_return_place(plane, (home[0], home[1], home[2] - parameters["RTL_ALTITUDE"]))
+            return best_return_place(plane, (home_north, home_east, home_down - parameters["RTL_ALTITUDE"]))
         lowest = parameters["FENCE_ALT_MIN"] + parameters["FENCE_MARGIN"]
         highest = parameters["FENCE_ALT_MAX"] - parameters["FENCE_MARGIN"]
         height = parameters["FENCE_RET_ALT"]
@@ -283,8 +295,8 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             for item in plane.missions.items(MavMissionType.FENCE)
             if item.command == MavCmd.NAV_FENCE_RETURN_POINT
         )
-        north, east = next(points, home[:2])  # a fence has at most one return point
-        return (north, east, home[2] - height)
+        north, east = next(points, (home_north, home_east))  # A fence has at most one return point.
+        return (north, east, home_down - height)
 
     def on_cleared(self) -> None:
         if self.vehicle.is_armed and not self.caused_mode:

@@ -84,10 +84,12 @@ class PlaneLanding:
         self.point: Ned = point
         self._fly_to_first = start  # Place to fly to before the approach; None once the approach has begun.
         self._approach_start: Ned = plane.wing.place
-        self._is_flaring = self._is_distance_reported = False
-        self._stopped_at = math.nan
+        self._is_flaring = False
+        self._is_distance_reported = False
+        self._stopped_at = math.nan  # NaN until the plane has stopped after the landing
 
     def update(self, dt: float) -> None:
+        """Continue the landing for one tick."""
         plane, wing = self._plane, self._plane.wing
         if plane.is_landed:
             self._disarm_after_stop()
@@ -99,6 +101,7 @@ class PlaneLanding:
             self._approach()
 
     def _fly_to_start(self, start: Ned) -> None:
+        """Fly to the start of the approach, which begins when the plane is there."""
         wing = self._plane.wing
         north, east, down = start
         distance = math.hypot(north - wing.north, east - wing.east)
@@ -187,6 +190,7 @@ class PlanePilotedMode(PlaneModeBase):
     has_manual_throttle = True
 
     def update(self, dt: float) -> None:
+        """Follow the sticks. On the ground, the plane rolls out with a low throttle, and takes off otherwise."""
         plane, wing = self.vehicle, self.vehicle.wing
         limits = wing.wing_limits
         throttle_pulse = plane.rc[RC_THROTTLE]
@@ -208,7 +212,7 @@ class PlaneAltitudeMode(PlaneModeBase):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self._down = 0.0
+        self._down = 0.0  # altitude to hold
 
     def enter(self, *, force: bool) -> bool:
         self._down = self.vehicle.wing.down
@@ -237,9 +241,10 @@ class PlaneCruise(PlaneAltitudeMode):
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
-        self._course: float | None = None
+        self._course: float | None = None  # course to hold, in radians from north; None while the pilot turns
 
     def steer(self, climb: float) -> None:
+        """Hold the course, unless the pilot turns."""
         wing = self.vehicle.wing
         if abs(self.stick(RC_ROLL)) > _CENTRED_STICK:  # The pilot turns, so no course is held.
             self._course = None
@@ -272,7 +277,7 @@ class PlaneNavigatingMode(PlaneModeBase):
         super().__init__(plane)
         self.speed: float = 0.0  # Commanded airspeed in m/s; 0 selects AIRSPEED_CRUISE.
         self.radius: float = 0.0  # Radius of the circle in metres; 0 selects WP_LOITER_RAD.
-        self._place: Ned | None = None
+        self._place: Ned | None = None  # centre of the circle, or end of the line, to fly
 
     def enter(self, *, force: bool) -> bool:
         self.speed = self.radius = 0.0
@@ -327,6 +332,7 @@ class PlaneTakeOff(PlaneNavigatingMode):
         return self._is_climbing
 
     def update(self, dt: float) -> None:
+        """Climb out, then circle at the take-off position."""
         plane = self.vehicle
         if self._place is None:
             self._start()
@@ -368,6 +374,7 @@ class PlaneAutoland(PlaneNavigatingMode):
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
+        """Plan the landing. Refused on the ground, or if the direction of the take-off is unknown."""
         plane = self.vehicle
         if plane.mode is self and plane.is_landed:  # Arming enters the current mode again.
             return True
@@ -377,7 +384,8 @@ class PlaneAutoland(PlaneNavigatingMode):
         if plane.take_off_yaw is None:
             plane.send_text(MavSeverity.WARNING, "Takeoff initial direction not set")
             return False
-        home = north, east, down = plane.home_or_ground
+        home = plane.home_or_ground
+        north, east, down = home
         distance, height = plane.parameters["AUTOLAND_WP_DIST"], plane.parameters["AUTOLAND_WP_ALT"]
         # The landing has the direction of the take-off, so the approach starts on the other side of home.
         start_north = north - distance * math.cos(plane.take_off_yaw)

@@ -181,6 +181,7 @@ class SubJoystick(ArduPilotJoystick):
     """
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
+        """Return the pulse of each RC channel that the joystick controls."""
         gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
         scale = _SUB_SCALE * gain
         throttle_scale = 2 * scale * self.setting("JS_THR_GAIN", 1.0)

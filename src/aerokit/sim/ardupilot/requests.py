@@ -95,6 +95,7 @@ class ArduPilotMessageRequests:
         return self._send_interval(to_int(command.param1), command.channel)
 
     def _send_interval(self, message_id: int, channel: Channel) -> int:
+        """Send MESSAGE_INTERVAL. Return a MAV_RESULT."""
         is_supported = message_id in self._supported
         interval_us = round(channel.streams.interval(message_id) * 1e6)
         if interval_us == 0:
@@ -142,6 +143,7 @@ class ArduPilotMessageRequests:
         channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)
 
     def _on_group(self, request: m.RequestDataStream, channel: Channel) -> None:
+        """Handle REQUEST_DATA_STREAM for one group of messages or for all groups."""
         if request.start_stop not in (0, 1):
             return
         rate = request.req_message_rate if request.start_stop else 0
@@ -173,6 +175,7 @@ class ArduPilotMessageRequests:
         self._changed_rates.clear()
 
     def _store_rate(self, name: str, rate: int) -> None:
+        """Store the rate of a group in the parameter that holds it."""
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
@@ -185,6 +188,7 @@ class ArduPilotMessageRequests:
             self._changed_rates[name] = (value_after_reboot, rate)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
+        """Stream the messages of a group at ``rate`` Hz from the time ``first`` on; 0 stops them."""
         group_interval = max(1.0 / rate, _MIN_INTERVAL_S) if rate > 0 else 0.0
         for message_id in self._groups[stream]:
             interval = group_interval

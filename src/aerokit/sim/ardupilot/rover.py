@@ -98,9 +98,9 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
 
     def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
-        self._lost: set[str] = set()
-        self._triggered: set[str] = set()
-        self._lost_since = math.nan
+        self._lost: set[str] = set()  # links that are lost at present
+        self._triggered: set[str] = set()  # lost links whose failsafe was executed
+        self._lost_since = math.nan  # time since which at least one link is lost
         self._position_lost, self._stuck = ConditionTimer(), ConditionTimer()
 
     @property
@@ -116,6 +116,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         super().update()
 
     def _check_radio(self) -> None:
+        """Detect the loss of the radio: silence, or a throttle below FS_THR_VALUE."""
         rover, parameters = self.vehicle, self.vehicle.parameters
         if rover.rc.is_receiving:
             self.radio_received_at: float = rover.now
@@ -170,6 +171,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.change_to(*_MODES.get(action, ()))
 
     def _check_estimator(self) -> None:
+        """Act if an armed rover has had no position for a while, and report when the position is back."""
         rover = self.vehicle
         is_lost = rover.is_armed and not rover.navigation.has_position
         lost_for = self._position_lost.seconds(is_lost, rover.now)
@@ -216,6 +218,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
+        """Execute FENCE_ACTION after a new breach."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if action == REPORT_ONLY:

@@ -87,7 +87,7 @@ class _Rtl(_Mode):
     def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed = 0.0
-        self._path: list[Ned] = []
+        self._path: list[Ned] = []  # places to drive to, in order
 
     def enter(self, *, force: bool) -> bool:
         rover, home = self.vehicle, self.vehicle.navigation.home
@@ -106,6 +106,7 @@ class _Rtl(_Mode):
         return self._path[0] if self._path else None
 
     def update(self, dt: float) -> None:
+        """Drive to the next place, or stay at the last one."""
         rover = self.vehicle
         if not self._path:
             rover.motion.stop()
@@ -184,9 +185,9 @@ class RoverGuided(_Mode):
     def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed: float = 0.0
-        self._place: Ned | None = None
+        self._place: Ned | None = None  # place to drive to; None: follow `_target`
         self._has_arrived = False
-        self._target: GuidedTarget | None = None
+        self._target: GuidedTarget | None = None  # None: stop
         self._target_at = 0.0
 
     @property
@@ -217,6 +218,7 @@ class RoverGuided(_Mode):
         self._target_at = self.vehicle.now
 
     def update(self, dt: float) -> None:
+        """Drive to the place or follow the velocity that was commanded last; otherwise stop."""
         rover, target = self.vehicle, self._target
         if self._place is not None:
             self._drive_to(self._place)
@@ -230,6 +232,7 @@ class RoverGuided(_Mode):
             rover.motion.stop()
 
     def _drive_to(self, place: Ned) -> None:
+        """Drive to a place and stop there. The arrival is reported once."""
         rover = self.vehicle
         if not self._has_arrived and rover.has_arrived(place):
             self._has_arrived = True
@@ -241,6 +244,7 @@ class RoverGuided(_Mode):
             rover.motion.drive_to(north, east, speed=self.speed)
 
     def _follow(self, target: GuidedTarget) -> None:
+        """Drive with the commanded speed and turn rate, or in the commanded direction."""
         north, east, _ = target.velocity or (0.0, 0.0, 0.0)
         motion = self.vehicle.motion
         speed = min(self.vehicle.waypoint_speed, math.hypot(north, east))

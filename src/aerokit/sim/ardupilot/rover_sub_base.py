@@ -95,6 +95,10 @@ class GuidedSetpoints:
             self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
 
     def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
+        """Convert a set-point to a target of GUIDED. ``point`` is its position in the world frame.
+
+        Set-points with an acceleration, with a number that is not finite, or with too few parts are ignored.
+        """
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
             return
@@ -163,6 +167,7 @@ class RoverSubVehicle(ArduPilotVehicle):
         return {**common_commands(self), Cmd.DO_CHANGE_SPEED: self._change_speed}
 
     def _change_speed(self, command: ReceivedCommand) -> int:
+        """Handle DO_CHANGE_SPEED, which sets a speed limit of the present mode."""
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
             return MavResult.DENIED
         is_horizontal = command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
@@ -188,10 +193,10 @@ class RoverSubAuto(MissionMode):
 
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
-        self._place: Ned | None = None
-        self._stops = True
-        self._reached_at: float | None = None
-        self._wait_until = 0.0
+        self._place: Ned | None = None  # place of the current command; None: stay
+        self._stops = True  # True if the vehicle stops at `_place`
+        self._reached_at: float | None = None  # time of arrival at `_place`; None before
+        self._wait_until = 0.0  # end of a delay command
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys((*_WAYPOINTS, Cmd.NAV_RETURN_TO_LAUNCH), self._go),
             **dict.fromkeys((Cmd.NAV_DELAY, Cmd.CONDITION_DELAY), self._wait),
@@ -227,6 +232,7 @@ class RoverSubAuto(MissionMode):
         return self._place
 
     def enter(self, *, force: bool) -> bool:
+        """Start the mission. Refused without a mission."""
         if self.vehicle.mode is self:  # Arming enters the current mode again, which must not restart the mission.
             return True
         if not self.vehicle.mission.is_present:
@@ -238,6 +244,7 @@ class RoverSubAuto(MissionMode):
         return True
 
     def update(self, dt: float) -> None:
+        """Continue the mission, and travel to the place of the current command."""
         self.start_if_waiting()
         if not self.is_waiting:
             self.vehicle.mission.update()
@@ -259,6 +266,7 @@ class RoverSubAuto(MissionMode):
         self.finish()
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
+        """Return True if a running command is complete. Called at each tick."""
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
             # NAV_LOITER_UNLIM never ends, but its arrival is reported.
@@ -286,6 +294,7 @@ class RoverSubAuto(MissionMode):
         return now - self._reached_at >= delay_s
 
     def _go(self, item: MissionItem) -> None:
+        """Travel to the position of a command. The vehicle stops there unless another waypoint follows."""
         vehicle = self.vehicle
         current: Ned = self._place or vehicle.motion.place
         self._reached_at = None

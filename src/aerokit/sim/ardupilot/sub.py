@@ -115,6 +115,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             sub.set_mode(SubMode.SURFACE)
 
     def _check_pilot(self) -> None:
+        """Detect the loss of the pilot's input and apply FS_PILOT_INPUT: 1 warns, 2 disarms."""
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
         silence = sub.now - self.radio_received_at
         is_silent = silence >= sub.parameters["FS_PILOT_TIMEOUT"]  # false for a pilot that was never received (NaN)
@@ -157,6 +158,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             self.vehicle.arming.disarm()
 
     def _check_leak(self) -> None:
+        """Report a leak repeatedly, and apply FS_LEAK_ENABLE once: 1 warns, 2 surfaces."""
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_LEAK_ENABLE"])
         if not sub.faults.leak or not action:
             self.is_leak_detected = False
@@ -179,14 +181,16 @@ class _HullLimit:
     def __init__(self, quantity: str, prefix: str) -> None:
         self.is_exceeded: bool = False
         self._quantity, self._prefix = quantity, prefix
-        self._good_at = self._reported_at = 0.0
+        self._good_at = 0.0  # time at which the limit was last kept
+        self._reported_at = 0.0
 
     def update(self, sub: SubHost, value: float) -> None:
         """Compare a measured value with its maximum. Values above the maximum must last for `_HULL_TIMEOUT_S`."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:
-            self._good_at = self._reported_at = sub.now
+            self._good_at = sub.now
+            self._reported_at = sub.now
             self.is_exceeded = False
             return
         if sub.now - self._good_at > _HULL_TIMEOUT_S:

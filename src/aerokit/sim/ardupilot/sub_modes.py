@@ -61,6 +61,8 @@ class SubHost(RoverSubVehicle):
 
 
 class _Mode(ArduPilotMode):
+    """Base of ArduSub's modes, with the pilot's sticks."""
+
     vehicle: SubHost
 
     def stick(self, index: int) -> float:
@@ -152,10 +154,10 @@ class SubGuided(_Mode):
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
         self.speed: float = 0.0
-        self._place: Ned | None = None
-        self._target: GuidedTarget | None = None
+        self._place: Ned | None = None  # place to move to; None: follow `_target`
+        self._target: GuidedTarget | None = None  # None: stop
         self._target_at = 0.0
-        self._heading: float | None = None
+        self._heading: float | None = None  # heading to hold, in radians; None: follow `_target`
 
     @property
     def destination(self) -> Ned | None:
@@ -188,6 +190,7 @@ class SubGuided(_Mode):
         self._heading = wrap_pi(heading)
 
     def update(self, dt: float) -> None:
+        """Move to the place or with the velocity that was commanded last; otherwise stop."""
         motion, target = self.vehicle.motion, self._target
         if target is not None and self.vehicle.now - self._target_at > target.timeout_s:
             target = None  # An expired target stops the vehicle.

@@ -117,11 +117,13 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
     if nav.is_gps_detected:
         present |= _GPS
         enabled |= _GPS
-        health |= 0 if nav.gps_is_lost else _GPS
+        if not nav.gps_is_lost:
+            health |= _GPS
     if nav.is_healthy:
         enabled |= _AHRS
         is_estimator_in_use = nav.has_position or not vehicle.timeline.uses_dcm_until_gps
-        health |= _AHRS if is_estimator_in_use else 0
+        if is_estimator_in_use:
+            health |= _AHRS
     # The firmware continues its log for `_LOG_AFTER_DISARMING_S` after disarming.
     if vehicle.motors.is_armed or vehicle.now - vehicle.motors.disarmed_at < _LOG_AFTER_DISARMING_S:
         enabled |= _LOGGING
@@ -130,10 +132,14 @@ def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
         enabled |= _LASER
         health |= _LASER
     has_fence, is_fence_enabled, is_fence_healthy = vehicle.fence.health
-    present |= _FENCE if has_fence else 0
-    enabled |= _FENCE if is_fence_enabled else 0
-    health |= _FENCE if is_fence_healthy else 0
-    health |= _PREARM if vehicle.arming.passes else 0
+    if has_fence:
+        present |= _FENCE
+    if is_fence_enabled:
+        enabled |= _FENCE
+    if is_fence_healthy:
+        health |= _FENCE
+    if vehicle.arming.passes:
+        health |= _PREARM
     if not vehicle.failsafes.is_radio_healthy:
         health &= ~_RADIO
     if vehicle.failsafes.battery_is_low:
@@ -197,6 +203,7 @@ def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
 
 
 def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
+    """Build BATTERY_STATUS."""
     battery = vehicle.battery
     voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)  # The first cell has the whole voltage.
     charge = MavBatteryChargeState.LOW if vehicle.failsafes.battery_is_low else MavBatteryChargeState.OK
@@ -235,13 +242,14 @@ def _rc_channels_raw(vehicle: ArduPilotVehicle) -> m.RcChannelsRaw:
 def _vibration(vehicle: ArduPilotVehicle) -> m.Vibration:
     deviation = 0.003 + 0.3 * vehicle.motors.throttle
     x, y, z = (abs(vehicle.rng.gauss(0.0, deviation)) for _ in range(3))
-    return m.Vibration(vehicle.time_boot_us, x, y, z, 0, 0, 0)
+    return m.Vibration(vehicle.time_boot_us, x, y, z, clipping_0=0, clipping_1=0, clipping_2=0)
 
 
 _FULL_THROTTLE_RPM, _ESC_PACKETS_PER_S, _ESC_TEMPERATURE_C = 15000, 100, 32
 
 
 def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
+    """Build ESC_TELEMETRY_1_TO_4. Outputs without a motor report zeros."""
     has_motor = [index in _MOTORS[vehicle.KIND] for index in range(4)]
 
     def per_motor(value: int) -> list[int]:
@@ -279,7 +287,8 @@ def _angle_of_attack(plane: PlaneHost) -> m.AoaSsa:
 
 def _airspeed(plane: PlaneHost) -> m.Airspeed:
     speed = plane.motion.airspeed_m_s
-    return m.Airspeed(0, speed, _UNKNOWN_TEMPERATURE, 0.5 * _AIR_DENSITY * speed * speed / 100.0, 2)
+    pressure_hpa = 0.5 * _AIR_DENSITY * speed * speed / 100.0
+    return m.Airspeed(id=0, airspeed=speed, temperature=_UNKNOWN_TEMPERATURE, raw_press=pressure_hpa, flags=2)
 
 
 def _display_value(sub: SubHost) -> m.NamedValueFloat:
@@ -293,7 +302,9 @@ def _rover_hud(rover: RoverHost) -> m.VfrHud:
     heading = int(math.degrees(motion.yaw) % 360.0)
     throttle = round(abs(rover.motors.throttle) * 100)
     altitude = 0.0 if place is None else place.altitude_m
-    return m.VfrHud(0.0, motion.ground_speed_m_s, heading, throttle, altitude, 0.0)
+    return m.VfrHud(
+        airspeed=0.0, groundspeed=motion.ground_speed_m_s, heading=heading, throttle=throttle, alt=altitude, climb=0.0
+    )
 
 
 _MIDDLE, _STICK_RANGE = 1500, 500
@@ -391,7 +402,9 @@ _ALL: Builders = {
     m.EscTelemetry1To4.ID: _esc_telemetry,
     m.AutopilotVersion.ID: _autopilot_version,
     m.RelayStatus.ID: _relay_status,
-    m.FlightInformation.ID: lambda vehicle: m.FlightInformation(vehicle.time_boot_ms, 0, 0, 0),
+    m.FlightInformation.ID: lambda vehicle: m.FlightInformation(
+        vehicle.time_boot_ms, arming_time_utc=0, takeoff_time_utc=0, flight_uuid=0
+    ),
     m.GimbalDeviceAttitudeStatus.ID: lambda vehicle: vehicle.gimbal.attitude_status(),
     m.GimbalManagerInformation.ID: lambda vehicle: vehicle.gimbal.manager_information(),
     m.GimbalManagerStatus.ID: lambda vehicle: vehicle.gimbal.manager_status(),

@@ -113,6 +113,7 @@ def _int16(value: float) -> int:
 
 
 def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
+    """Build HIGHRES_IMU."""
     motion = vehicle.motion
     x, y, z = (value * (GRAVITY_M_S2 / 1000.0) for value in _acceleration(vehicle))
     # The firmware multiplies milligauss by 1000, although the fields are in gauss (GCS_Common.cpp).
@@ -152,10 +153,12 @@ _UNDEFINED_BITS = 0xF000
 # Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 _GRIDS_PER_BLOCK = 56  # The mask of TERRAIN_REQUEST has one bit for each grid of a block.
+_REQUESTED_BLOCKS = 9  # The firmware requests the vehicle's block and its neighbours (TerrainGCS.cpp).
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
+    """Build GLOBAL_POSITION_INT. Latitude and longitude are 0 before the first position, as in the firmware."""
     motion, nav = vehicle.motion, vehicle.navigation
     time = vehicle.time_boot_ms
     place = nav.position  # None until the estimator knows the position
@@ -168,8 +171,9 @@ def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
     altitude = round(place.altitude_m * 1000)
     north, east, down = (round(speed * 100) for speed in _velocity(motion))
     return m.GlobalPositionInt(
-        time, place.latitude_e7, place.longitude_e7, altitude, relative, north, east, down, heading
-    )
+        time, lat=place.latitude_e7, lon=place.longitude_e7, alt=altitude, relative_alt=relative, vx=north, vy=east,
+        vz=down, hdg=heading,
+    )  # fmt: skip
 
 
 def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
@@ -180,6 +184,7 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
 
 
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
+    """Build GPS_RAW_INT."""
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
         return _gps_without_fix(GpsFixType.NO_GPS, dilution=65535, satellites=0)  # 65535: unknown
@@ -203,6 +208,7 @@ def _gps_without_fix(fix_type: int, *, dilution: int, satellites: int) -> m.GpsR
 
 
 def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
+    """Build EKF_STATUS_REPORT; None before the estimator runs."""
     flags = vehicle.navigation.flags
     if flags is None:
         return None
@@ -236,6 +242,7 @@ def _global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
 
 
 def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | None:
+    """Build POSITION_TARGET_GLOBAL_INT; None without a destination, or while disarmed."""
     target = vehicle.mode.destination
     if target is None or not vehicle.motors.is_armed:
         return None
@@ -246,13 +253,14 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
 
 
 def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
+    """Build POSITION_TARGET_LOCAL_NED of GUIDED; None in other modes."""
     guided, time = vehicle.mode, vehicle.time_boot_ms
     if not isinstance(guided, CopterGuided):
         return None
     target = guided.destination
     if target is None:  # The submode follows a velocity, not a position.
         vectors = (0.0, 0.0, 0.0, *guided.velocity, *guided.acceleration)
-        return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _VELOCITY_ONLY, *vectors, 0.0, 0.0)
+        return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _VELOCITY_ONLY, *vectors, yaw=0.0, yaw_rate=0.0)
     local = vehicle.navigation.local(target)
     return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _POSITION_ONLY, *local, *(0.0,) * 8)
 
@@ -266,6 +274,7 @@ def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
 
 
 def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
+    """Build NAV_CONTROLLER_OUTPUT, which is sent only in modes that navigate."""
     if not _is_navigating(vehicle):
         return None
     motion, target = vehicle.motion, vehicle.mode.destination
@@ -284,14 +293,17 @@ def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
 
 
 def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
+    """Build TERRAIN_REPORT of a vehicle that receives no terrain data."""
     place = vehicle.navigation.position
     if place is None:
         return m.TerrainReport(
             lat=0, lon=0, spacing=_GRID_M, terrain_height=0.0, current_height=0.0, pending=_GRIDS_PER_BLOCK, loaded=0
         )
+    pending = 0 if vehicle.KIND == "sub" else _REQUESTED_BLOCKS * _GRIDS_PER_BLOCK
+    # A spacing of 0 means that no terrain data is available for this place.
     return m.TerrainReport(
         lat=place.latitude_e7, lon=place.longitude_e7, spacing=0, terrain_height=0.0, current_height=place.altitude_m,
-        pending=0 if vehicle.KIND == "sub" else 9 * _GRIDS_PER_BLOCK, loaded=0,
+        pending=pending, loaded=0,
     )  # fmt: skip
 
 
@@ -339,10 +351,15 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), id=0, temperature=3500),
     m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), temperature=3500),
     m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), temperature=3500),
-    m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, 0, 0, 0, 0, 0, 0, *_magnetic_field(v)),
+    # The third compass has no accelerometers and gyroscopes.
+    m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, *(0,) * 6, *_magnetic_field(v)),
     m.HighresImu.ID: _highres_imu,
-    m.ScaledPressure.ID: lambda v: m.ScaledPressure(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),
-    m.ScaledPressure2.ID: lambda v: m.ScaledPressure2(v.time_boot_ms, _pressure_hpa(v), 0.0, 2800, 0),
+    m.ScaledPressure.ID: lambda v: m.ScaledPressure(
+        v.time_boot_ms, _pressure_hpa(v), press_diff=0.0, temperature=2800, temperature_press_diff=0
+    ),
+    m.ScaledPressure2.ID: lambda v: m.ScaledPressure2(
+        v.time_boot_ms, _pressure_hpa(v), press_diff=0.0, temperature=2800, temperature_press_diff=0
+    ),
     m.Wind.ID: _wind,
     m.GlobalPositionInt.ID: _global_position,
     m.LocalPositionNed.ID: _local_position,

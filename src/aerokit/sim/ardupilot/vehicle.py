@@ -292,6 +292,7 @@ class ArduPilotVehicle(ArduPilotHost):
             super().send_text(severity, text)
 
     def set_mode(self, number: int) -> bool:
+        """Enter a mode. Return False, and report the reason, if the mode is unknown or refused."""
         if number == self.mode.number:
             return True
         mode = self._modes.get(number)

@@ -81,8 +81,11 @@ class CameraBody(SimulatedComponent, CameraDevice):
         self.shutter_s: float = shutter_s
         self.thermal_celsius: tuple[float, float] | None = thermal_celsius
         self.picture = picture
-        self.capabilities: int = capabilities | (CameraCapFlags.HAS_VIDEO_STREAM if streams else 0)
-        self.capabilities |= CameraCapFlags.HAS_THERMAL_RANGE if thermal_celsius else 0
+        self.capabilities: int = capabilities
+        if streams:
+            self.capabilities |= CameraCapFlags.HAS_VIDEO_STREAM
+        if thermal_celsius:
+            self.capabilities |= CameraCapFlags.HAS_THERMAL_RANGE
         self.definition_version: int = self.definition.version
         self.sensor_mm: tuple[float, float] = _SENSOR_MM
         self.focal_length_mm: float = FOCAL_LENGTH_MM

@@ -138,7 +138,12 @@ class SimulatedComponent:
         self.start()
 
     def _send_heartbeat(self) -> None:
-        self.send(Heartbeat(self.TYPE, MavAutopilot.INVALID, 0, 0, MavState.ACTIVE, _MAVLINK_VERSION))
+        self.send(
+            Heartbeat(
+                self.TYPE, MavAutopilot.INVALID, base_mode=0, custom_mode=0, system_status=MavState.ACTIVE,
+                mavlink_version=_MAVLINK_VERSION,
+            )
+        )  # fmt: skip
 
     def on(self, message_class: type[Message], handler: Callable[[Any, Channel], None]) -> None:
         """Handle messages of a class that are addressed to this component."""
@@ -159,7 +164,7 @@ class SimulatedComponent:
 
     def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT of at most 50 characters."""
-        self.send(Statustext(severity, text[:50], 0, 0))
+        self.send(Statustext(severity, text[:50], id=0, chunk_seq=0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
         """Call a function after ``delay`` simulated seconds. A reboot cancels the call."""

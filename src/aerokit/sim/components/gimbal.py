@@ -67,6 +67,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self._reset()
 
     def _reset(self) -> None:
+        """Set the state after a power-on: no component is in control, and the gimbal points forward."""
         self.primary: tuple[int, int] = (0, 0)
         self.secondary: tuple[int, int] = (0, 0)
         self.flags: int = 0

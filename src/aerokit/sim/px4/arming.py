@@ -49,8 +49,8 @@ class Px4Calibration:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.side_s: float = math.inf
-        self._sensor = ""
-        self._run_number = 0
+        self._sensor = ""  # sensor that is being calibrated; "": none
+        self._run_number = 0  # number of this calibration; timers of earlier ones do nothing
 
     @property
     def is_running(self) -> bool:
@@ -101,6 +101,7 @@ class Px4Calibration:
             self._px4.info(f"[cal] {text}")
 
     def _begin_side(self, sides_done: int, run_number: int) -> None:
+        """Measure the next side, or end the calibration after the last one."""
         if not self.is_running or run_number != self._run_number:  # The calibration was cancelled.
             return
         if sides_done == len(_SIDES):
@@ -161,6 +162,7 @@ class Px4Arming:
         self._reported_failures: list[str] = []
 
     def reasons(self) -> list[str]:
+        """Return the texts of the failed arming checks."""
         px4 = self._px4
         reasons = list(px4.faults.prearm_failures)
         if not px4.is_ready:
@@ -248,8 +250,12 @@ class Px4Arming:
         px4.is_in_failsafe = True
         px4.send_text(MavSeverity.CRITICAL, "Failsafe activated")
         px4.send_text(MavSeverity.CRITICAL, "Preflight Fail: Flight termination active")
-        release = float(ParachuteAction.RELEASE)
-        px4.send(CommandLong(px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, 0, release, *(0.0,) * 6))
+        release, unused_params, confirmation = float(ParachuteAction.RELEASE), (0.0,) * 6, 0
+        px4.send(
+            CommandLong(
+                px4.system_id, MavComponent.PARACHUTE, MavCmd.DO_PARACHUTE, confirmation, release, *unused_params
+            )
+        )
 
     def start_first_log(self) -> None:
         """Start a log at the boot. This log also records the first flight."""

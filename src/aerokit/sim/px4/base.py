@@ -100,7 +100,7 @@ class Px4Vehicle(Px4Host):
         self.rates: Px4StreamRates = Px4StreamRates(link_modes, self.can_build, fast_rate_hz)
         self.events = Px4Events(self)
         self._next_text_id = 0
-        self._pings = 0
+        self._pings = 0  # number of PINGs sent
         self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points, which survive a reboot."""
@@ -133,6 +133,7 @@ class Px4Vehicle(Px4Host):
         return Px4Mission(self)
 
     def _reset(self) -> None:
+        """Set the state after a power-on."""
         self.is_ready: bool = False
         self.is_armed: bool = False
         self.is_landed: bool = True
@@ -160,6 +161,7 @@ class Px4Vehicle(Px4Host):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
+        """Create the parts that receive messages. They exist once, also after a reboot."""
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
         self.external: Px4External = Px4External(self)
@@ -250,6 +252,7 @@ class Px4Vehicle(Px4Host):
         self.text_links.send(chunks)
 
     def on_armed(self) -> None:
+        """Start the mode that was entered while disarmed, and set home."""
         self.is_armed = True
         self._has_flown = False
         self._landed_at = math.nan
@@ -315,7 +318,10 @@ class Px4Vehicle(Px4Host):
         self.mode = mode
         self.flight.enter(mode)
         if mode == modes.RTL and self.is_armed:  # PX4 informs the other components of the vehicle about a return.
-            self.send(m.CommandLong(self.system_id, 0, MavCmd.NAV_RETURN_TO_LAUNCH, 0, *(0.0,) * 7))
+            all_components, confirmation, unused_params = 0, 0, (0.0,) * 7
+            self.send(
+                m.CommandLong(self.system_id, all_components, MavCmd.NAV_RETURN_TO_LAUNCH, confirmation, *unused_params)
+            )
 
     def leave_ground(self) -> None:
         self.is_landed = False
@@ -377,6 +383,7 @@ class Px4Vehicle(Px4Host):
             self.mission.on_landed()
 
     def _auto_disarm(self) -> None:
+        """Disarm some time after a landing, or after arming without a take-off."""
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown:

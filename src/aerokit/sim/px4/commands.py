@@ -49,6 +49,7 @@ _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
+    """Return the handlers of the commands that have no object of their own."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None: send no acknowledgement.
     handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
@@ -109,6 +110,7 @@ _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
+    """Return the handlers of all commands."""
     flight = _Flight(px4)
     return {
         **message_requests(px4),
@@ -151,6 +153,7 @@ def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | N
 
 
 def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
+    """Enter a mode, given as MAV_MODE_FLAG bits and PX4's main and sub mode. Return a MAV_RESULT."""
     if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
         px4.send_text(MavSeverity.CRITICAL, "Unsupported base mode")
         return MavResult.TEMPORARILY_REJECTED
@@ -172,11 +175,14 @@ def _change(px4: Px4Vehicle, mode: Px4Mode) -> int:
 
 
 class _Flight:
+    """Handlers of the commands that arm, move or restart the vehicle."""
+
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
-        self._tuning_since = math.nan
+        self._tuning_since = math.nan  # start of the autotuning; NaN while it does not run
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
+        """Handle COMPONENT_ARM_DISARM."""
         force = command.param2 == _FORCE_MAGIC
         arm = round(command.param1) if math.isfinite(command.param1) else None
         if arm == 1:
@@ -227,6 +233,7 @@ class _Flight:
         return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
+        """Handle MISSION_START: select the first item, enter MISSION, and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
@@ -339,6 +346,7 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def set_home(self, command: ReceivedCommand) -> int:
+        """Handle DO_SET_HOME, for the current place or the place in the command."""
         px4, motion = self._px4, self._px4.motion
         uses_current_place = command.param1 > 0.5
         if uses_current_place:
@@ -356,6 +364,7 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def reboot(self, command: ReceivedCommand) -> int:
+        """Handle PREFLIGHT_REBOOT_SHUTDOWN. The reboot follows a moment after the acknowledgement."""
         if command.param1 == 0.0:
             return MavResult.ACCEPTED
         if self._px4.is_armed or command.param1 not in (1.0, 2.0):
@@ -392,6 +401,8 @@ _LEGACY_REQUESTS = {
 
 
 class _Requests:
+    """Handlers of the commands that request messages once or periodically."""
+
     def __init__(self, px4: Px4Vehicle) -> None:
         self._px4 = px4
 
@@ -406,6 +417,7 @@ class _Requests:
         return MavResult.ACCEPTED
 
     def request_message(self, command: ReceivedCommand) -> int:
+        """Handle REQUEST_MESSAGE. Some messages have a second parameter."""
         message_id = _number(command.param1)
         if message_id == m.MessageInterval.ID:
             return self._send_interval(_number(command.param2), command)

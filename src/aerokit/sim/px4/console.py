@@ -25,7 +25,7 @@ class Px4Shell:
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4
-        self._line = b""
+        self._line = b""  # characters received since the last line end
         self.is_open: bool = False
         px4.on(m.SerialControl, self._on_input)
 
@@ -64,12 +64,16 @@ class Px4LogStream:
 
     def __init__(self, px4: SimulatedVehicle) -> None:
         self._px4 = px4
+        # (system id, component id) of the client; None while no log is streamed.
         self._station: tuple[int, int] | None = None
         self._channel: Channel | None = None
-        self._sequence = self._tries = self._acknowledged = 0
+        self._sequence = 0  # number of the next block
+        self._tries = 0  # how often this block was sent
+        self._acknowledged = 0  # number of definition blocks that were acknowledged
         px4.on(m.LoggingAck, self._on_ack)
 
     def start(self, command: ReceivedCommand) -> int:
+        """Handle LOGGING_START."""
         if self._station is not None:
             return MavResult.TEMPORARILY_REJECTED
         log_format = command.param1

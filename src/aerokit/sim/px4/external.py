@@ -98,7 +98,7 @@ class PrecisionLanding:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._search_began_at: float | None = None
+        self._search_began_at: float | None = None  # None while the target is visible
         self._search_count = 0
 
     def enter(self) -> None:
@@ -106,6 +106,7 @@ class PrecisionLanding:
         self._search_count = 0
 
     def update(self) -> None:
+        """Approach the target, and descend while the vehicle is above it. Search it if it is lost."""
         px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
         if target is None or self._search_count > parameters["PLD_MAX_SRCH"]:
@@ -120,6 +121,7 @@ class PrecisionLanding:
         motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
 
     def _search(self) -> None:
+        """Climb and wait for the target. After too many or too long searches, land without it."""
         px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         if self._search_began_at is None:
             self._search_began_at = px4.now

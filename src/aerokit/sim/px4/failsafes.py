@@ -40,8 +40,8 @@ class Px4Fence:
 
     def on_uploaded(self) -> None:
         """Use the uploaded areas. If they exclude home, send a text and ignore them."""
-        home = self._px4.home
-        self._is_valid = self._areas_allow(home[0], home[1])
+        home_north, home_east, _ = self._px4.home
+        self._is_valid = self._areas_allow(home_north, home_east)
         if not self._is_valid:
             self._px4.send_text(MavSeverity.CRITICAL, "Geofence invalid, doesn't contain Home position")
 
@@ -60,13 +60,15 @@ class Px4Fence:
 
     def breaches_at(self, place: Ned) -> list[str]:
         """Return the texts of breaches at a point (metres north, east, down)."""
-        px4, (north, east, down) = self._px4, place
+        px4 = self._px4
+        north, east, down = place
+        home_north, home_east, home_down = px4.home
         # The value 0 of these parameters means that there is no limit.
         max_distance, max_height = px4.parameters["GF_MAX_HOR_DIST"], px4.parameters["GF_MAX_VER_DIST"]
         breaches = []
-        if 0 < max_distance < math.hypot(north - px4.home[0], east - px4.home[1]):
+        if 0 < max_distance < math.hypot(north - home_north, east - home_east):
             breaches.append(TOO_FAR)
-        if 0 < max_height < px4.home[2] - down:
+        if 0 < max_height < home_down - down:
             breaches.append(TOO_HIGH)
         if not self._is_inside(north, east):
             breaches.append(OUTSIDE)
@@ -78,6 +80,7 @@ class Px4Fence:
         return self._areas_allow(north, east)
 
     def _areas_allow(self, north: float, east: float) -> bool:
+        """Return True for a place outside all exclusions, and inside one of the inclusions if there are any."""
         areas = list(self._areas(north, east))
         is_inside_inclusions = [is_inside for is_inclusion, is_inside in areas if is_inclusion]
         is_inside_exclusions = [is_inside for is_inclusion, is_inside in areas if not is_inclusion]
@@ -111,15 +114,16 @@ class Px4Fence:
 
 def _is_in_polygon(corners: Sequence[tuple[float, float]], north: float, east: float) -> bool:
     """Return True if a ray from the point to the north crosses the border an odd number of times."""
-    is_inside, previous = False, corners[-1]
-    for corner in corners:
-        side_spans_ray = (corner[1] > east) != (previous[1] > east)
+    is_inside = False
+    previous_north, previous_east = corners[-1]
+    for corner_north, corner_east in corners:
+        side_spans_ray = (corner_east > east) != (previous_east > east)
         if side_spans_ray:
-            share = (east - corner[1]) / (previous[1] - corner[1])
-            crossing_north = corner[0] + share * (previous[0] - corner[0])
+            share = (east - corner_east) / (previous_east - corner_east)
+            crossing_north = corner_north + share * (previous_north - corner_north)
             if north < crossing_north:
                 is_inside = not is_inside
-        previous = corner
+        previous_north, previous_east = corner_north, corner_east
     return is_inside
 
 
@@ -163,16 +167,16 @@ class Px4Failsafes:
         self.battery_state = MavBatteryChargeState.OK
         """MAV_BATTERY_CHARGE_STATE, which never improves while the vehicle is armed."""
         self.has_station: bool = False  # True while heartbeats of a ground station are received.
-        self._station_at = -math.inf
-        self._had_manual_control = False
+        self._station_at = -math.inf  # time of the last heartbeat of a ground station
+        self._had_manual_control = False  # True once sticks were received since arming
         self._position_at = -math.inf  # Time at which the estimator had a position last.
         self._battery_at_arming = MavBatteryChargeState.OK
         self._reported_battery_level = MavBatteryChargeState.OK
-        self._breaches: list[str] = []
+        self._breaches: list[str] = []  # texts of the present breaches of the fence
         # Actions by cause. A cause that has ended stays in this dictionary while its action lasts.
         self._active: dict[str, FailsafeAction] = {}
         self._failing: frozenset[str] = frozenset()  # The causes that exist at present.
-        self._holds_until = -math.inf
+        self._holds_until = -math.inf  # end of the delay in which the vehicle holds instead of returning or landing
         self._is_overridden = False  # True after the user has changed the mode during a failsafe.
 
     def listen(self) -> None:
@@ -192,7 +196,8 @@ class Px4Failsafes:
         self._px4.text_links.on_station_heartbeat(channel)
         if not self.has_station and math.isfinite(self._station_at):
             self._px4.info("GCS connection regained")
-        self.has_station, self._station_at = True, self._px4.now
+        self.has_station = True
+        self._station_at = self._px4.now
 
     def _watch_station(self) -> None:
         timeout = self._px4.parameters["COM_DL_LOSS_T"]
@@ -237,20 +242,29 @@ class Px4Failsafes:
         reasons = list(self.fence.breaches)
         level = self._battery_level()
         if level >= MavBatteryChargeState.CRITICAL:
-            reasons.append(_BATTERY_TEXTS[level][1])
+            _, text = _BATTERY_TEXTS[level]
+            reasons.append(text)
         if round(self._px4.parameters["NAV_DLL_ACT"]) and not self.has_station:
             reasons.append(NO_STATION)
         return reasons
 
     def on_armed(self) -> None:
         """Reset all actions. A failure that exists at arming does not trigger a failsafe."""
-        self._had_manual_control, self._position_at = self._px4.sticks.are_fresh, self._px4.now
-        self._battery_at_arming = self._reported_battery_level = self.battery_state = self._battery_level()
+        self._had_manual_control = self._px4.sticks.are_fresh
+        self._position_at = self._px4.now
+        level = self._battery_level()
+        self.battery_state = level
+        self._battery_at_arming = level
+        self._reported_battery_level = level
         self._reset()
 
     def _reset(self) -> None:
-        self.action, self._is_overridden, self._holds_until = Action.NONE, False, -math.inf
-        self._active, self._breaches, self._failing = {}, [], frozenset()
+        self.action = Action.NONE
+        self._is_overridden = False
+        self._holds_until = -math.inf
+        self._active = {}
+        self._failing = frozenset()
+        self._breaches = []
 
     def _active_failures(self) -> dict[str, FailsafeAction]:
         actions = {
@@ -290,7 +304,8 @@ class Px4Failsafes:
         """Return True if a stick movement ends the current mode. ``moved`` is its size: 2 is from end to end."""
         parameters, mode = self._px4.parameters, self._px4.mode
         mode_bit = 0  # Bit of COM_RC_OVERRIDE that allows an override in the present mode.
-        if mode[0] == AUTO or mode == ORBIT:
+        main_mode, _ = mode
+        if main_mode == AUTO or mode == ORBIT:
             mode_bit = 1
         elif mode == OFFBOARD:
             mode_bit = 2
@@ -303,16 +318,18 @@ class Px4Failsafes:
         The bits are 1 for MISSION, 2 for other automatic modes and 4 for OFFBOARD.
         """
         mode = self._px4.intended_mode
+        main_mode, _ = mode
         mode_bit = 0
         if mode == MISSION:
             mode_bit = 1
         elif mode == OFFBOARD:
             mode_bit = 4
-        elif mode[0] == AUTO:
+        elif main_mode == AUTO:
             mode_bit = 2
         return bool(round(self._px4.parameters[parameter]) & mode_bit)
 
     def _fence_action(self) -> FailsafeAction:
+        """Return the action for a breach of the fence. Each new breach is also reported by a text."""
         breaches = self.fence.breaches
         for text in breaches:
             if text not in self._breaches:
@@ -349,7 +366,8 @@ class Px4Failsafes:
             if is_worse and self.action <= Action.HOLD and has_delay_ended:
                 self._holds_until = self._px4.now + self._px4.parameters["COM_FAIL_ACT_T"]
         still_acting = {cause: action for cause, action in self._active.items() if action >= Action.HOLD}
-        self._active, self._failing = {**still_acting, **failing}, frozenset(failing)
+        self._active = {**still_acting, **failing}
+        self._failing = frozenset(failing)
 
     def _choose(self) -> FailsafeAction:
         """Return the action to execute: the most severe one of the active failures, or a reduced action.
@@ -372,6 +390,7 @@ class Px4Failsafes:
         return worst
 
     def _execute(self, action: FailsafeAction) -> None:
+        """Start an action that differs from the present one, or end the failsafe (`Action.NONE`)."""
         if action == self.action:
             return
         px4, previous, self.action = self._px4, self.action, action

@@ -40,6 +40,7 @@ class Px4Orbit:
         return True
 
     def update(self) -> None:
+        """Fly along the circle for one tick, and back to it if the vehicle is off the circle."""
         motion = self._px4.motion
         middle_north, middle_east = self.middle
         north, east = motion.north - middle_north, motion.east - middle_east
@@ -61,7 +62,12 @@ class Px4Orbit:
         px4 = self._px4
         place = px4.frame.to_global(*self.middle, self.down)
         return m.OrbitExecutionStatus(
-            px4.time_boot_us, self.radius_m, 0, place.latitude_e7, place.longitude_e7, place.altitude_m
+            px4.time_boot_us,
+            self.radius_m,
+            frame=MavFrame.GLOBAL,
+            x=place.latitude_e7,
+            y=place.longitude_e7,
+            z=place.altitude_m,
         )
 
 
@@ -107,9 +113,9 @@ class Px4Flight:
         self.manual_flight: Px4ManualFlight = Px4ManualFlight(vehicle)
         self.precision_landing: PrecisionLanding = PrecisionLanding(vehicle)
         self.orbit: Px4Orbit = Px4Orbit(vehicle)
-        self._phase = ""
-        self._ramp_began_at = 0.0
-        self._is_default_height = False
+        self._phase = ""  # phase of a return: "climb", "return" or "land"
+        self._ramp_began_at = 0.0  # time of the lift-off, from which the climb rate grows
+        self._is_default_height = False  # True if the take-off command had no altitude
 
     @property
     def cruise_speed_m_s(self) -> float:
@@ -122,6 +128,7 @@ class Px4Flight:
         return self._vehicle.parameters["MPC_XY_VEL_MAX"]
 
     def enter(self, mode: Px4Mode) -> None:
+        """Prepare the flight in a new mode."""
         self.speed_m_s = self.cruise_speed_m_s
         self.heading = None
         self._phase = "climb"
@@ -138,6 +145,7 @@ class Px4Flight:
         self.target = motion.place
 
     def update(self) -> None:
+        """Fly for one tick as the present mode commands."""
         vehicle = self._vehicle
         mode = vehicle.mode
         self.lifts_off = (
@@ -177,6 +185,7 @@ class Px4Flight:
             vehicle.leave_ground()
 
     def _take_off(self) -> None:
+        """Climb to the target, with a rate that grows at first. Afterwards, hold there."""
         vehicle = self._vehicle
         ramp_duration_s = max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])  # The parameter may be 0.
         ramp = (vehicle.now - self._ramp_began_at) / ramp_duration_s
@@ -252,6 +261,7 @@ class Px4Flight:
         vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after the text of the command.
 
     def _return(self) -> None:
+        """Continue the phase of the return: climb, fly to the destination, land."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         if self._phase == "land":
             self.descend()

@@ -108,7 +108,8 @@ class Px4TextLinks:
         self._px4 = px4
         self.speedup: float = 1.0
         """Simulated seconds per second of the clients, whose heartbeats are then this much less frequent."""
-        self._station_at: dict[Channel, float] = {}
+        self._station_at: dict[Channel, float] = {}  # time of the last heartbeat of a ground station on each link
+        # Queued texts of each link without a ground station, as (time, chunks).
         self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}
 
     def on_station_heartbeat(self, channel: Channel) -> None:

@@ -55,6 +55,7 @@ class Px4Sticks:
         self._move(roll=control.y / 1000, pitch=control.x / 1000, yaw=control.r / 1000, throttle=control.z / 500 - 1.0)
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
+        """Handle RC_CHANNELS_OVERRIDE. Parameters map the channels to sticks."""
         values = [getattr(override, f"chan{number}_raw") for number in range(1, _CHANNELS + 1)]
         self.channels = tuple(values)
         self._channels_at = self._px4.now
@@ -64,6 +65,7 @@ class Px4Sticks:
             self._move(roll, pitch, yaw, throttle)
 
     def _move(self, roll: float, pitch: float, yaw: float, throttle: float) -> None:
+        """Store new stick positions, and report how far the sticks have moved."""
         previous = (self.roll, self.pitch, self.yaw, self.throttle)
         were_fresh = self.are_fresh
         self.roll = roll
@@ -108,8 +110,8 @@ class Px4ManualFlight:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._place: tuple[float, float] | None = None
-        self._down: float | None = None
+        self._place: tuple[float, float] | None = None  # place to hold; None while the vehicle moves
+        self._down: float | None = None  # height to hold; None while the vehicle moves vertically
         self._turn_rate_rad_s = px4.motion.limits.turn_rate_rad_s
 
     def enter(self) -> None:
@@ -127,6 +129,7 @@ class Px4ManualFlight:
         return self._thrust > 1.0
 
     def update(self) -> None:
+        """Follow the sticks for one tick, as the present manual mode interprets them."""
         px4, sticks = self._px4, self._px4.sticks
         max_rate = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
         px4.motion.limits.turn_rate_rad_s = max_rate
@@ -140,6 +143,7 @@ class Px4ManualFlight:
         px4.motion.seek_attitude(tilt * sticks.roll, pitch, down)
 
     def _fly_velocity(self) -> None:
+        """Fly with the velocity that the sticks command, or hold the place while they are centred."""
         px4, sticks, motion = self._px4, self._px4.sticks, self._px4.motion
         max_speed = px4.parameters["MPC_VEL_MANUAL"] * (_SLOW_SHARE if px4.mode == POSITION_SLOW else 1.0)
         forward = max_speed * curved(sticks.pitch, _EXPO, _DEAD_ZONE)
@@ -152,6 +156,7 @@ class Px4ManualFlight:
             self._hold_position(down)
 
     def _hold_position(self, down: float) -> None:
+        """Hold the horizontal place, with the vertical velocity ``down``."""
         motion = self._px4.motion
         if self._place is None:  # After a movement, the vehicle first stops, and then holds the place of its stop.
             if motion.ground_speed_m_s > _AT_REST_M_S:

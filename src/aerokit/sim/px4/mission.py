@@ -142,11 +142,11 @@ class Px4Mission:
         self.is_finished: bool = False  # True after the last item was completed.
         self.is_valid: bool = False  # True if there is a mission and it can be flown.
         self._phase = ""  # Phase of the current item: "climb", "go" or "land".
-        self._arrived_at = math.nan
+        self._arrived_at = math.nan  # time of arrival at the current item; NaN before
         self._jumps: dict[int, int] = {}  # Number of jumps that each DO_JUMP has done, by its index.
-        self._state = int(MissionState.NO_MISSION)
-        self._repeats_left = 0
-        self._is_report_scheduled = False
+        self._state = int(MissionState.NO_MISSION)  # MissionState
+        self._repeats_left = 0  # how often MISSION_ITEM_REACHED is still repeated
+        self._is_report_scheduled = False  # True while a repetition is due
 
     def start(self) -> None:
         """Called at boot. Check the mission, and from then on report the last reached item once a second."""
@@ -286,12 +286,14 @@ class Px4Mission:
         return int(item.param1) if is_target_valid else index + 1
 
     def _aim(self, item: MissionItem) -> None:
+        """Set the flight's target for an item that begins."""
         px4, motion = self._px4, self._px4.motion
         self._phase = "go"
         if item.command == Cmd.NAV_DELAY:
             px4.flight.stay_here()
             return
-        target = north, east, down = self._place(item)
+        target = self._place(item)
+        north, east, down = target
         px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None: look ahead.
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(down if item.command in _TAKE_OFFS else None)
@@ -352,6 +354,7 @@ class Px4Mission:
                 self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
+        """Return True if the vehicle is within the acceptance radius of an item, and at its height."""
         if item.command == Cmd.NAV_DELAY:
             return True
         motion = self._px4.motion

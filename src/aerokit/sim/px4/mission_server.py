@@ -45,11 +45,12 @@ class _Link(ListUpload):
     """State of the latest upload or download of a link, which the firmware also uses after the end of the transfer."""
 
     state: TransferState = TransferState.IDLE
-    opaque_id: int = 0
-    current: int = -1
+    opaque_id: int = 0  # checksum of the items received so far
+    current: int = -1  # index of the item that the client marked as current; -1: none
 
     @property
     def is_retried(self) -> bool:
+        """True if the firmware repeats its last message: a request for an item, or the count of a download."""
         return self.state is TransferState.GETTING or self.next == 0
 
 
@@ -156,6 +157,7 @@ class Px4MissionServer(MissionServer):
         self._px4.send(m.MissionCount(*link.client, link.end, kind, self.id(kind)), link.channel)
 
     def _send_item(self, link: _Link, seq: int) -> None:
+        """Send the item ``seq`` to the client of a link, in the kind of message that it requested."""
         item = self.item(link.mission_type, seq)
         assert item is not None
         link.requested_at = self._px4.now
@@ -172,16 +174,19 @@ class Px4MissionServer(MissionServer):
         self._px4.send(message, link.channel)
 
     def _watch(self, upload: ListUpload) -> None:
+        """Check a transfer later: whether it has timed out, or its last message must be repeated."""
         due = upload.received_at + self.timeout_s
         if self._link(upload.channel).is_retried:
             due = min(due, self._px4.now + self.retry_interval_s)
         self._px4.call_at(due, lambda: self._check(upload))
 
     def _is_watched(self, upload: ListUpload) -> bool:
+        """Return True if this is still the transfer of its link."""
         link = self._link(upload.channel)
         return link is upload and link.state is not TransferState.IDLE
 
     def _repeat(self, upload: ListUpload) -> None:
+        """Repeat the last message of a transfer, if the firmware would."""
         link = self._link(upload.channel)
         if link.state is TransferState.GETTING:
             self._request_item(link)
@@ -303,6 +308,7 @@ class Px4MissionServer(MissionServer):
             self._answer(link, Result.ERROR)
 
     def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
+        """Store an item of an upload. Return a MAV_MISSION_RESULT."""
         link = self._link(upload.channel)
         item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)

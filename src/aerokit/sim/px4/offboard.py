@@ -43,12 +43,15 @@ class Px4Offboard:
     def __init__(self, vehicle: Px4Host) -> None:
         self._vehicle = vehicle
         self.updated_at: float = -math.inf
+        # A component that is not commanded is NaN.
         self._position, self._velocity, self._acceleration = _NAN3, _NAN3, _NAN3
-        self._yaw = self._yaw_rate = math.nan
+        self._yaw = math.nan
+        self._yaw_rate = math.nan
+        # Target attitude and body rates of SET_ATTITUDE_TARGET; None without such a target.
         self._attitude: tuple[float, float, float] | None = None
         self._body_rates: tuple[float, float, float] | None = None
-        self._flown_at = 0.0
-        self._thrust = 0.0
+        self._flown_at = 0.0  # time of the last call of `fly`
+        self._thrust = 0.0  # 0 to 1, with `_attitude`
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
@@ -66,6 +69,7 @@ class Px4Offboard:
 
     @property
     def wants_up(self) -> bool:
+        """True if the set-point leads upwards, so that a landed vehicle takes off."""
         if self._attitude is not None:
             return self._thrust > 0.5
         _, _, position_down = self._position
@@ -75,6 +79,7 @@ class Px4Offboard:
         return any(down < -_UPWARDS for down in components)  # False for components that are NaN
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_LOCAL_NED."""
         frame = target.coordinate_frame
         if frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
             self._warn(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
@@ -86,6 +91,7 @@ class Px4Offboard:
             self._warn("SET_POSITION_TARGET_LOCAL_NED invalid")
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
+        """Handle SET_POSITION_TARGET_GLOBAL_INT."""
         if target.coordinate_frame not in _GLOBAL_FRAMES:
             frame = target.coordinate_frame
             self._warn(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
@@ -118,6 +124,7 @@ class Px4Offboard:
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
+        """Handle SET_ATTITUDE_TARGET, which contains an attitude or body rates."""
         motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
             if self._attitude is None or self._body_rates is None:  # Rates start from the present attitude.
@@ -156,6 +163,7 @@ class Px4Offboard:
             vehicle.switch_to(OFFBOARD)
 
     def fly(self) -> None:
+        """Follow the latest set-point for one tick."""
         motion = self._vehicle.motion
         # `fly` is called only in OFFBOARD. If the last call was before another mode, the elapsed time is limited to
         # MAX_TICK_S.
@@ -174,10 +182,12 @@ class Px4Offboard:
             motion.turn(self._yaw_rate if math.isfinite(self._yaw_rate) else 0.0)
 
     def _fly_attitude(self, attitude: tuple[float, float, float], elapsed: float) -> None:
+        """Follow the target attitude, which the body rates have changed for ``elapsed`` seconds."""
         motion = self._vehicle.motion
         if self._body_rates is not None:
             angles_and_rates = zip(attitude, self._body_rates, strict=True)
-            attitude = self._attitude = _vector(angle + rate * elapsed for angle, rate in angles_and_rates)
+            attitude = _vector(angle + rate * elapsed for angle, rate in angles_and_rates)
+            self._attitude = attitude
         roll, pitch, yaw = attitude
         # In the simulation, a thrust of 0.5 holds the height.
         climb_share = (max(0.0, min(1.0, self._thrust)) - 0.5) * 2.0

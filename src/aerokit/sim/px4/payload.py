@@ -52,9 +52,9 @@ class Px4Gimbal:
         # At the time `_target_at`, the set-point was `_target`. From then on, it turns at `_rates`.
         self._target = self._rates = _NEUTRAL
         self._target_at = 0.0
-        self._flags = 0
-        self._place: tuple[int, int, float] | None = None
-        self._was_returning = False
+        self._flags = 0  # GIMBAL_MANAGER_FLAGS
+        self._place: tuple[int, int, float] | None = None  # region of interest; None: follow the set-point
+        self._was_returning = False  # True if the vehicle was returning at the last check
         self.is_fitted: bool = False  # True if MNT_MODE_IN enabled the gimbal at power-on.
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
@@ -200,6 +200,7 @@ def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _id_in_control(requested: int, present: int, own: int, sender: int) -> int:
+    """Return the id in control after a request for an id: −2 is the own id, −3 releases control, −1 changes nothing."""
     if requested == _SELF:
         return own
     if requested == _RELEASE:
@@ -257,8 +258,8 @@ class Px4CameraTrigger:
         self.sends_image_captured = True  # False simulates a PX4 without the geotag module.
         self._is_enabled = False
         self._is_paused = False
-        self._series_number = 0
-        self._last_at = -math.inf
+        self._series_number = 0  # number of this series; timers of earlier ones do nothing
+        self._last_at = -math.inf  # time of the last image
 
     @property
     def is_fitted(self) -> bool:
@@ -282,6 +283,7 @@ class Px4CameraTrigger:
         }
 
     def _digicam_control(self, command: ReceivedCommand) -> int | None:
+        """Handle DO_DIGICAM_CONTROL. Return None, for no answer, without a trigger."""
         if not self.is_fitted:
             return None
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.
@@ -332,6 +334,7 @@ class Px4CameraTrigger:
             px4.call_later(_GEOTAG_DELAY_S, lambda: self._send_captured(number))
 
     def _send_captured(self, number: int) -> None:
+        """Send CAMERA_IMAGE_CAPTURED for an image; nothing while the position is unknown."""
         px4, pose = self._px4, pose_of(self._px4)
         if pose is None:
             return

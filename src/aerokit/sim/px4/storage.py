@@ -74,16 +74,17 @@ class _Writer(FileHandle):
         self._parameters = parameters
         self._apply = apply
         self._pending = b""  # Received bytes that are not yet a complete entry.
-        self._written = 0
+        self._written = 0  # number of bytes received so far
         self._announced: tuple[int, int] | None = None  # Number of entries and file size; None before the header.
         self._count = 0  # number of entries that were applied
-        self._previous_name = b""
-        self._is_rejected = False
+        self._previous_name = b""  # name in the last entry, with which the next one may share its beginning
+        self._is_rejected = False  # True once the upload has failed
 
     def read(self, offset: int, size: int) -> bytes:
         raise FileFault(EINVAL)
 
     def write(self, offset: int, data: bytes) -> None:
+        """Receive bytes at a position of the file, and apply the entries that are complete."""
         new_bytes = data[max(0, self._written - offset) :]  # A repeated write contains bytes that were received before.
         has_gap = offset > self._written
         if self._is_rejected or has_gap:

@@ -54,6 +54,7 @@ _POSITION_FLAGS = Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | E
 
 
 def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
+    """Build HEARTBEAT."""
     mode = modes.TERMINATION if px4.arming.is_terminated else px4.mode
     base_mode = modes.MODES[mode].base_mode
     if px4.is_armed:
@@ -65,6 +66,7 @@ def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
 
 
 def _state(px4: Px4Vehicle) -> MavState:
+    """Return the field system_status of HEARTBEAT."""
     if px4.arming.is_terminated:
         return MavState.FLIGHT_TERMINATION
     if px4.is_in_failsafe:
@@ -78,6 +80,7 @@ def _state(px4: Px4Vehicle) -> MavState:
 
 
 def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
+    """Build SYS_STATUS."""
     health = _HEALTHY if px4.is_ready else _BOOTING
     if not px4.is_armed and not px4.arming.is_possible:
         health &= ~_PREARM_BIT
@@ -101,12 +104,14 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
 
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
+    """Build ESTIMATOR_STATUS."""
     flags = _ALL_BUT_STILL
     if not px4.is_armed:
         flags |= Ekf.CONST_POS_MODE
     if not px4.has_position:
         flags &= ~_POSITION_FLAGS
-        flags |= Ekf.POS_HORIZ_REL if px4.external.has_vision else 0
+        if px4.external.has_vision:
+            flags |= Ekf.POS_HORIZ_REL
     if not px4.is_ready:
         flags = _BOOT_FLAGS
     ratio = 0.02 if px4.is_ready else math.nan  # The test ratio of velocity, position and magnetometer.
@@ -128,6 +133,7 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
 
 
 def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
+    """Build BATTERY_STATUS."""
     battery = px4.battery
     voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)  # 0xFFFF: there is no such cell.
     return m.BatteryStatus(
@@ -177,9 +183,9 @@ def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
     motion = px4.motion
     place = px4.frame.to_global(motion.north, motion.east, motion.down)
     return m.GlobalPositionInt(
-        px4.time_boot_ms, place.latitude_e7, place.longitude_e7, round(place.altitude_m * 1000),
-        round(px4.altitude_m * 1000), round(motion.velocity_north * 100), round(motion.velocity_east * 100),
-        round(motion.velocity_down * 100), centidegrees(motion.yaw),
+        px4.time_boot_ms, lat=place.latitude_e7, lon=place.longitude_e7, alt=round(place.altitude_m * 1000),
+        relative_alt=round(px4.altitude_m * 1000), vx=round(motion.velocity_north * 100),
+        vy=round(motion.velocity_east * 100), vz=round(motion.velocity_down * 100), hdg=centidegrees(motion.yaw),
     )  # fmt: skip
 
 
@@ -203,11 +209,13 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
     heading = int(math.degrees(motion.yaw) % 360.0)
     amsl = px4.frame.origin.altitude_m - motion.down
     return m.VfrHud(
-        px4.airspeed_m_s, motion.ground_speed_m_s, heading, round(px4.throttle * 100), amsl, -motion.velocity_down,
+        airspeed=px4.airspeed_m_s, groundspeed=motion.ground_speed_m_s, heading=heading,
+        throttle=round(px4.throttle * 100), alt=amsl, climb=-motion.velocity_down,
     )  # fmt: skip
 
 
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
+    """Build GPS_RAW_INT."""
     motion = px4.motion
     if px4.faults.gps_lost:
         worst, unknown = 9999, 65535
@@ -226,6 +234,7 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
 
 
 def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
+    """Build HOME_POSITION; None while the vehicle boots."""
     if not px4.is_ready:
         return None
     place = px4.frame.to_global(*px4.home)
@@ -260,14 +269,16 @@ def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
         acceleration = (0.0, 0.0, 100.0)
         mask = _IGNORE_POSITION_AND_VELOCITY
         return m.PositionTargetLocalNed(
-            px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw, 0.0
+            px4.time_boot_ms, MavFrame.LOCAL_NED, mask, *unknown, *unknown, *acceleration, yaw=yaw, yaw_rate=0.0
         )
     # Apart from the position, the simulation sends the present values as the targets.
     velocity = (motion.velocity_north, motion.velocity_east, motion.velocity_down)
     acceleration = (motion.acceleration_north, motion.acceleration_east, motion.acceleration_down)
+    nothing_ignored = 0
     return m.PositionTargetLocalNed(
-        px4.time_boot_ms, MavFrame.LOCAL_NED, 0, *px4.flight.target, *velocity, *acceleration, yaw, motion.yaw_rate
-    )
+        px4.time_boot_ms, MavFrame.LOCAL_NED, nothing_ignored, *px4.flight.target, *velocity, *acceleration, yaw=yaw,
+        yaw_rate=motion.yaw_rate,
+    )  # fmt: skip
 
 
 def _servo_output(px4: Px4Vehicle) -> m.ServoOutputRaw:
@@ -283,7 +294,8 @@ def _mission_current(px4: Px4Vehicle) -> m.MissionCurrent:
 
 
 def _vibration(px4: Px4Vehicle) -> m.Vibration:
-    return m.Vibration(px4.time_boot_us, 0.0, 0.1, 1.4 if px4.is_armed else 0.1, 0, 0, 0)
+    vibration_z = 1.4 if px4.is_armed else 0.1
+    return m.Vibration(px4.time_boot_us, 0.0, 0.1, vibration_z, clipping_0=0, clipping_1=0, clipping_2=0)
 
 
 def _system_time(px4: Px4Vehicle) -> m.SystemTime:
@@ -295,7 +307,7 @@ def _current_mode(px4: Px4Vehicle) -> m.CurrentMode:
 
 
 def _ping(px4: Px4Vehicle) -> m.Ping:
-    return m.Ping(px4.time_boot_us, px4.next_ping(), 0, 0)
+    return m.Ping(px4.time_boot_us, px4.next_ping(), target_system=0, target_component=0)
 
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:

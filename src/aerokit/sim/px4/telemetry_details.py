@@ -71,6 +71,7 @@ _BROADCAST_ID = bytes(20)
 
 
 def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
+    """Build OPEN_DRONE_ID_LOCATION; None while the position is unknown."""
     if not px4.has_position:
         return None
     motion = px4.motion
@@ -89,6 +90,7 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
 
 
 def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
+    """Build OPEN_DRONE_ID_SYSTEM; None while the vehicle boots."""
     if not px4.is_ready:
         return None
     home = px4.frame.to_global(*px4.home)
@@ -181,6 +183,7 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
 
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
+    """Build SCALED_IMU."""
     motion = px4.motion
     # The fields of SCALED_IMU are in milli-g, mrad/s and milligauss.
     force_x, force_y, force_z = (round(axis / GRAVITY_M_S2 * 1000) for axis in _measured_acceleration(px4))

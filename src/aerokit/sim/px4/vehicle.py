@@ -110,6 +110,7 @@ class Px4PlaneFlight(Px4Flight):
         super().enter(mode)
 
     def update(self) -> None:
+        """Fly for one tick as the present mode commands."""
         plane = self._plane
         mode, mission = plane.mode, plane.mission
         self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)
@@ -178,6 +179,7 @@ class Px4PlaneFlight(Px4Flight):
         self._touch_down(self._glide)
 
     def _touch_down(self, approach: Callable[[], None]) -> None:
+        """Land: call ``approach`` until the flare, then touch down and roll out."""
         motion = self._motion
         height = motion.ground_down - motion.down
         if motion.is_on_ground:
@@ -245,6 +247,7 @@ class Px4PlaneMission(Px4Mission):
         self._plane.flight.course = self._plane.motion.yaw
 
     def _aim(self, item: MissionItem) -> None:
+        """Set the flight's target and the radius of its circle for an item that begins."""
         super()._aim(item)
         flight = self._plane.flight
         radius = 0.0
@@ -281,6 +284,7 @@ class Px4PlaneMission(Px4Mission):
             self._plane.flight.target = self._place(item)
 
     def _go(self, item: MissionItem) -> None:
+        """Fly to an item for one tick, and complete the item when it is done."""
         flight = self._plane.flight
         if item.command in _CIRCLES or item.command == Cmd.NAV_DELAY:
             flight.circle()
@@ -299,6 +303,7 @@ class Px4PlaneMission(Px4Mission):
             self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
+        """Return True if the plane is close enough to an item, so that it turns to the next one."""
         if item.command == Cmd.NAV_DELAY:
             return True
         plane, motion = self._plane, self._plane.motion

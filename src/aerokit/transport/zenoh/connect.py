@@ -87,8 +87,8 @@ class ZenohConnect(NetworkLink):
         self._takes_control = control == "take"
         self._tracker = VehicleSideTracker(random.getrandbits(32), "never" if control == "never" else "free")
         self._vehicle_tokens: set[str] = set()  # keys of the vehicle sides that are alive, as reported by the network
-        self._publisher: Any = None
-        self._first_beacon = asyncio.Event()
+        self._publisher: Any = None  # None while the link is not open
+        self._first_beacon = asyncio.Event()  # set once the vehicle side was found
 
     @property
     def lease_holder(self) -> str | None:
@@ -108,6 +108,7 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
+        """Open the session, and wait for the first beacon of the vehicle side."""
         self._first_beacon.clear()
         self._queue = LoopQueue(call)
         with anyio.move_on_after(self._open_timeout_s):
@@ -116,18 +117,23 @@ class ZenohConnect(NetworkLink):
             await self._first_beacon.wait()
             self._schedule_poll()
             return
-        # The time-out has ended the block above.
+        # The block above returns after a success, so these lines are reached only after the time-out.
         if self._session is None:
             reason = f"the zenoh network was not reached within {self._open_timeout_s:g} s"
             raise LinkOpenError(f"cannot open {self.address}: {reason}")
         raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
     def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # This function and its callbacks run on threads of zenoh, so each callback posts its sample to the event loop.
+        """Declare the subscribers, the token and the publisher of this client.
+
+        This function and its callbacks run on threads of zenoh, so each callback posts its sample to the event loop.
+        """
+
         # A sample that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
         def callback_for(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
-                is_put, payload = sample.kind == zenoh.SampleKind.PUT, payload_of(sample)
+                is_put = sample.kind == zenoh.SampleKind.PUT
+                payload = payload_of(sample)
                 if len(payload) <= MAX_PAYLOAD_BYTES:
                     queue.post(partial(process, payload, attachment_of(sample), is_put))
 
@@ -138,7 +144,8 @@ class ZenohConnect(NetworkLink):
             queue.post(partial(self._on_liveliness, str(sample.key_expr), is_put))
 
         keys, client = self._keys, self.client
-        on_frames, liveliness = callback_for(self._on_frames), session.liveliness()
+        on_frames = callback_for(self._on_frames)
+        liveliness = session.liveliness()
         self._declared = [
             session.declare_subscriber(keys.to_all_clients, on_frames),
             session.declare_subscriber(keys.from_vehicle(client), on_frames),
@@ -165,13 +172,14 @@ class ZenohConnect(NetworkLink):
                 self._deliver(data)
 
     def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
+        """Record a sign of life of the vehicle side. End the link if the vehicle side has deleted its beacon."""
         if not is_put:  # A vehicle side that closes deletes its beacon.
-            closed_epoch = None
-            if (sent_at := decode_sent_at(attachment)) is not None:
+            sent_at = decode_sent_at(attachment)
+            if sent_at is not None:
                 closed_epoch, _ = sent_at
-            if closed_epoch is not None and closed_epoch == self._tracker.epoch:
-                self._tracker.reset()
-                self._lose("the vehicle side was closed")
+                if closed_epoch == self._tracker.epoch:
+                    self._tracker.reset()
+                    self._lose("the vehicle side was closed")
             return
         beacon = Beacon.decode(data)
         if beacon is None or not self._tracker.receive_beacon(beacon, self._now()):
@@ -204,6 +212,7 @@ class ZenohConnect(NetworkLink):
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
+        """Send a datagram to the vehicle side. It is dropped while beacons are missing."""
         stamp = self._tracker.make_stamp(self._now(), mode)
         if stamp is None:
             self._drop(1)
@@ -222,6 +231,7 @@ class ZenohConnect(NetworkLink):
         self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll)
 
     def _poll(self) -> None:
+        """End the link if the vehicle side has gone. Called every `_POLL_INTERVAL_S`."""
         tracker, now = self._tracker, self._now()
         if tracker.epoch is not None and tracker.is_silent(now):
             # The end of the liveliness token shows a loss earlier than a long silence does.
@@ -234,6 +244,7 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
+        """Return why the vehicle side was not found, with the names that were found instead."""
         names = sorted({key.split("/")[2] for key in self._vehicle_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:

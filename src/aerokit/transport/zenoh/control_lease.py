@@ -114,8 +114,8 @@ class ControlLease:
     """
 
     def __init__(self) -> None:
-        self._holder: str | None = None
-        self._received_at = 0.0
+        self._holder: str | None = None  # None: no client had the lease yet, or it was released
+        self._received_at = 0.0  # time of the last data of the holder
 
     def holder(self, now: float) -> str | None:
         if self._holder is not None and now - self._received_at > LEASE_TIMEOUT_S:
@@ -151,6 +151,7 @@ class ClientFilter:
         """Time of the last data of the client; set by the link that owns this filter."""
         self._client, self._lease = client, lease
         self._framer = _framer()
+        # Nonce of the program that uses this client name; None before its first datagram.
         self._nonce: int | None = None  # nonce of the program that uses this client name
         self._nonce_at = 0.0  # time of the last datagram from that program
         # Message name → time of the last notice, and the number of refused messages since then.
@@ -288,9 +289,9 @@ class FreshnessChecker:
         """Datagrams refused because their stamp was too old, or from another vehicle side."""
         self.duplicates: int = 0
         """Datagrams refused because the same or a later datagram of the client was already received."""
-        self._number = 0
+        self._number = 0  # number of the last beacon
         self._sent: deque[tuple[int, float]] = deque()  # (number, send time) of the beacons that stamps may refer to
-        self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()
+        self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()  # (client, nonce) → last sequence number
 
     def make_beacon(self, now: float, lease_holder: str | None = None) -> Beacon:
         self._expire(now)
@@ -336,7 +337,7 @@ class DelayEstimator:
 
     def __init__(self) -> None:
         self._min_offset: float | None = None  # smallest difference so far of our time and the sender's send time
-        self._measured_at = 0.0
+        self._measured_at = 0.0  # time at which `_min_offset` was measured
 
     def delay(self, sent_s: float, now: float) -> float:
         """Return the delay in seconds of data sent at ``sent_s`` on the sender's clock and received at ``now``."""

@@ -114,6 +114,7 @@ class Beacon(Snapshot):
 
     @classmethod
     def decode(cls, data: bytes) -> Beacon | None:
+        """Decode a beacon; return None if the data is not a valid one."""
         fields = _decode_object(data)
         epoch, number, holder = fields.get("epoch"), fields.get("number"), fields.get("holder")
         clock = fields.get("clock_s")
@@ -177,6 +178,7 @@ class RefusalNotice(Snapshot):
 
     @classmethod
     def decode(cls, data: bytes) -> RefusalNotice | None:
+        """Decode a notice; return None if the data is not a valid one."""
         fields = _decode_object(data)
         if fields.get("event") != "order_refused":
             return None

@@ -68,11 +68,12 @@ class ZenohListen(NetworkLink):
         self._lease = ControlLease()
         self._clients: dict[Peer, ClientFilter] = {}
         self._refused = 0  # number of frames refused from clients that have left
-        self._zenoh: Any = None
-        self._publisher: Any = None
-        self._may_have_rival = self._is_serving = False
+        self._zenoh: Any = None  # the imported module; None before the opening
+        self._publisher: Any = None  # sends to all clients; None while the link is not open
+        self._may_have_rival = False  # True if a liveliness token shows that the name may be in use
+        self._is_serving = False  # True from the end of the opening on
         self._rival_found = asyncio.Event()  # set when another vehicle side sends a beacon under this name
-        self._beacon_at = 0.0
+        self._beacon_at = 0.0  # time of the last own beacon
 
     @property
     def peers(self) -> tuple[Peer, ...]:
@@ -112,6 +113,7 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
+        """Open the session, and serve clients unless another program already serves this name."""
         self._queue = LoopQueue(call)
         self._session = await open_session(self.address, self._options, partial(self._find_rivals, self._queue))
         self._released.clear()
@@ -125,8 +127,12 @@ class ZenohListen(NetworkLink):
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        # This function runs on a thread of its own. A liveliness token alone does not prove that the name is in use,
-        # because the token of a killed program remains for a while. A beacon proves it.
+        """Find out whether the name may be in use, and subscribe to beacons. Runs on a thread of its own.
+
+        A liveliness token alone does not prove that the name is in use, because the token of a killed program remains
+        for a while. A beacon proves it.
+        """
+
         def on_beacon(sample: Any) -> None:
             payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -145,13 +151,13 @@ class ZenohListen(NetworkLink):
         zenoh, session, keys = self._zenoh, self._session, self._keys
 
         def on_datagram(sample: Any) -> None:
-            client, payload = str(sample.key_expr).rpartition("/")[2], payload_of(sample)
+            payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
-                queue.post(partial(self._on_datagram, client, payload, attachment_of(sample)))
+                queue.post(partial(self._on_datagram, _client_of(sample), payload, attachment_of(sample)))
 
         def on_liveliness(sample: Any) -> None:
-            client, is_put = str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT
-            queue.post(partial(self._on_client_joined if is_put else self._remove_client, client))
+            has_joined = sample.kind == zenoh.SampleKind.PUT
+            queue.post(partial(self._on_client_joined if has_joined else self._remove_client, _client_of(sample)))
 
         liveliness = session.liveliness()
         self._publisher = session.declare_publisher(
@@ -177,7 +183,9 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- receiving
 
     def _on_datagram(self, name: str, data: bytes, attachment: bytes) -> None:
-        client, now = self._add_client(name), self._now()
+        """Deliver the frames of a client that may be sent, and notify the client of refused ones."""
+        now = self._now()
+        client = self._add_client(name)
         if client is None:
             return
         client.received_at = now
@@ -197,6 +205,7 @@ class ZenohListen(NetworkLink):
             self._deliver(accepted, name)
 
     def _add_client(self, name: str) -> ClientFilter | None:
+        """Return the client of this name, new or known; None if there are too many."""
         client = self._clients.get(name)
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
@@ -207,13 +216,16 @@ class ZenohListen(NetworkLink):
         return client
 
     def _remove_silent_client(self) -> None:
-        # New clients must not be blocked by a client that has left without a notice of its liveliness token.
+        """Remove the client that has been silent longest, if this is long enough.
+
+        New clients must not be blocked by a client that has left without a notice of its liveliness token.
+        """
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        # An extra beacon is sent now, so that the client need not wait for the next periodic one.
+        """Add a client that has come online, and send an extra beacon, so that it need not wait for the next one."""
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
@@ -226,6 +238,7 @@ class ZenohListen(NetworkLink):
             self._lease.release(name)
 
     def _on_beacon(self, data: bytes) -> None:
+        """Detect another vehicle side with the same name. Our own beacons arrive here, too."""
         beacon = Beacon.decode(data)
         if beacon is None or beacon.epoch == self._freshness.epoch:  # A beacon with this epoch is our own.
             return
@@ -260,3 +273,8 @@ class ZenohListen(NetworkLink):
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
+
+
+def _client_of(sample: Any) -> str:
+    """Return the name of the client, which is the last part of the sample's key."""
+    return str(sample.key_expr).rpartition("/")[2]

@@ -37,8 +37,8 @@ class LoopQueue(Generic[ItemT]):
         self._process: Callable[[ItemT], object] | None = process  # None after close()
         self._limit = limit
         self._waiting: deque[ItemT] = deque()
-        self._is_scheduled = False
-        self._lock = threading.Lock()
+        self._is_scheduled = False  # True while a call of `_drain` is pending
+        self._lock = threading.Lock()  # protects all of these attributes
 
     def post(self, item: ItemT) -> None:
         """Add an item. Never blocks or raises; ignored after :meth:`close`."""
@@ -61,6 +61,7 @@ class LoopQueue(Generic[ItemT]):
             self._waiting.clear()
 
     def _drain(self) -> None:
+        """Process waiting items on the loop. After `_MAX_PER_ITERATION` items, continue in the next iteration."""
         for _ in range(_MAX_PER_ITERATION):
             with self._lock:
                 process = self._process
@@ -139,9 +140,9 @@ class NetworkLink(BaseLink):
 
     def __init__(self, address: str) -> None:
         super().__init__(address)
-        self._session: Any = None
+        self._session: Any = None  # None while the link is not open
         self._declared: list[Any] = []  # references to all declarations, which would end when garbage-collected
-        self._queue: LoopQueue[Callable[[], object]] | None = None
+        self._queue: LoopQueue[Callable[[], object]] | None = None  # passes calls of zenoh's threads to the loop
         self._timer: asyncio.TimerHandle | None = None
 
     def _on_release(self, session: Any) -> None:
@@ -222,6 +223,7 @@ def attachment_of(sample: Any) -> bytes:
 
 
 def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
+    """Build zenoh's configuration from the file, the options and aerokit's settings, in this order."""
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
     except zenoh.ZError as error:
@@ -239,6 +241,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
 
 
 def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
+    """Yield the keys and values of zenoh's configuration that the options determine."""
     if options.mode or not options.config:  # Without `mode`, a configuration file determines the mode.
         is_client = bool(options.connect) and not options.listen
         yield "mode", options.mode or ("client" if is_client else "peer")
