@@ -153,7 +153,7 @@ _UNDEFINED_BITS = 0xF000
 # Spacing of the terrain grid in metres, and the offset in degrees from the vehicle to the corner of its terrain block.
 _GRID_M, _GRID_CORNER = 100, (0.0115, 0.0104)
 _GRIDS_PER_BLOCK = 56  # The mask of TERRAIN_REQUEST has one bit for each grid of a block.
-_REQUESTED_BLOCKS = 9  # The firmware requests the vehicle's block and its neighbours (TerrainGCS.cpp).
+_REQUESTED_BLOCKS = 9  # The firmware requests the vehicle's block and its neighbours (AP_Terrain.cpp).
 _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which the vehicle stands.
 
 
@@ -351,8 +351,8 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), id=0, temperature=3500),
     m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), temperature=3500),
     m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), temperature=3500),
-    # The third compass has no accelerometers and gyroscopes.
-    m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, *(0,) * 6, *_magnetic_field(v)),
+    # The third compass has no accelerometers and gyroscopes, whose six values are 0.
+    m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, 0, 0, 0, 0, 0, 0, *_magnetic_field(v)),
     m.HighresImu.ID: _highres_imu,
     m.ScaledPressure.ID: lambda v: m.ScaledPressure(
         v.time_boot_ms, _pressure_hpa(v), press_diff=0.0, temperature=2800, temperature_press_diff=0
