@@ -108,7 +108,8 @@ class Channels(_ChannelDict):
 
     # --------------------------------------------------------------------------------- private
 
-    if not TYPE_CHECKING:  # A dict has these methods with other types, so type checkers do not see these.
+    # dict declares these methods with other types. Type checkers do not see the assignments, or they would complain.
+    if not TYPE_CHECKING:
         __setitem__, __delitem__, __ior__ = map(_unsupported, ("__setitem__", "__delitem__", "__ior__"))
         clear, pop, popitem = map(_unsupported, ("clear", "pop", "popitem"))
         setdefault, update = map(_unsupported, ("setdefault", "update"))

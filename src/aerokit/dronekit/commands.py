@@ -264,7 +264,7 @@ class CommandSequence:
             return (state.home, *state.items)
         if not state.items:
             return ()
-        unknown_home = _commands_of(Mission(), (0, 0))
+        unknown_home = _commands_of(Mission(), (0, 0))  # only the home row, with zeros
         return (*unknown_home, *state.items)
 
     def _append(self, cmd: Command) -> int:

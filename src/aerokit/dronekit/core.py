@@ -92,7 +92,8 @@ class LatestMessage(Generic[MessageT]):
         self._decode: Callable[[bytes, Frame], MessageT] = decoder_of(message_type)
         self._ready_names = ready  # names of the attributes that have a value
         self._listeners = [listeners]
-        # Attributes that the handlers only announce; empty: a handler needs each message.
+        # Attributes whose change the handlers only report, so that the message may be decoded later. If a handler needs
+        # each message, this set is empty.
         self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival

@@ -156,9 +156,9 @@ def shift_jumps(items: Iterable[MissionItem], offset: int) -> tuple[MissionItem,
 def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
     """Convert the items of a mission that was made for ArduPilot, so that another autopilot accepts them.
 
-    ArduPilot accepts commands without a place in any frame, PX4 only in MAV_FRAME_MISSION. ArduPilot takes the place
-    0°, 0° for the current position. This place is replaced by the destination of the previous item, in the first item
-    by ``here`` (latitude and longitude in degrees, None if unknown).
+    For a command that has no position, ArduPilot accepts any frame, PX4 only MAV_FRAME_MISSION. In ArduPilot, the
+    position 0°, 0° means the current position. It is replaced by the destination of the previous item, or in the first
+    item by ``here`` (latitude and longitude in degrees, None if unknown).
     """
     current_xy: tuple[int, int] | None = None
     if here is not None:

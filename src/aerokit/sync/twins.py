@@ -4966,7 +4966,7 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.land, timeout=timeout, max_silence_s=max_silence_s)
 
     def return_to_launch(self, *, timeout: float | None = 600.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Return to launch. Returns on the ground, or above home if the autopilot does not land by itself.
+        """Return to launch. Wait until the vehicle has landed, or is above home if it does not land by itself.
 
         Raises the same errors as :meth:`land`.
         """

@@ -138,5 +138,9 @@ def _report_text(report: Report) -> str:
         for failsafe in failsafes:
             lines.append(f"{clock(failsafe.time_s)} {failsafe.title}: {failsafe.reaction}")
             lines += [f"  {fact}" for fact in failsafe.context]
-    fall_texts = [f"; {fall_text(fall)}" for flight_falls in report.falls for fall in flight_falls]
-    return "\n".join([*lines, f"{report.target}: {report.bytes / 1e6:.1f} MB{''.join(fall_texts)}"])
+    last_line = f"{report.target}: {report.bytes / 1e6:.1f} MB"
+    for falls_of_flight in report.falls:
+        for fall in falls_of_flight:
+            last_line += f"; {fall_text(fall)}"
+    lines.append(last_line)
+    return "\n".join(lines)

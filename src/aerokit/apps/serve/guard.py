@@ -106,8 +106,8 @@ def content_policy(tiles: str | None) -> str:
 class SecurityMiddleware:
     """ASGI middleware that rejects foreign hosts and origins, and adds security headers to every response.
 
-    A Host that is an IP address or ``localhost`` cannot be a foreign name that resolves to this machine (DNS
-    rebinding); other names must be in ``hosts``. Browsers send the Origin of the page that makes a request.
+    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``, which prevents DNS rebinding. If a
+    browser sends an Origin, it must be this server, so that pages of other sites cannot make requests.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], tile_url: str | None) -> None:

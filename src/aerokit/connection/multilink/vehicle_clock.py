@@ -74,7 +74,7 @@ class VehicleClock:
         advance_s = vehicle_s - last_vehicle_s
         speed = self._measured_speed
         if speed is None:
-            # The speed is unknown, so any speed of a simulation is possible.
+            # The speed of the vehicle's clock is not measured yet. In a simulation, it may be up to MAX_SPEED.
             max_advance_s = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
             return -TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
         tolerance_s = self._tolerance_s(at, round_trip_s, speed)

@@ -105,7 +105,7 @@ class TlogReader(LogReader):
             for unix_s, raw in read_tlog(file):
                 count += 1
                 if count % 4096 == 0:
-                    on_bytes(file.tell())
+                    on_bytes(file.tell())  # reports the progress
                 for frame in framer.receive(raw, unix_s):
                     message = decode(frame)
                     system_id, component_id = frame.system_id, frame.component_id

@@ -325,7 +325,7 @@ class CopterAuto(MissionMode):
         if command in _UNTIL_LEG_ENDS:
             return self._is_leg_complete
         if command in _LANDINGS:
-            return self._has_landed(index)
+            return self._continues_after_landing(index)
         if command == Cmd.NAV_LOITER_UNLIM:
             return False
         if command == Cmd.NAV_GUIDED_ENABLE:
@@ -353,8 +353,8 @@ class CopterAuto(MissionMode):
         self.vehicle.info(f"Reached command #{index}")
         return True
 
-    def _has_landed(self, index: int) -> bool:
-        """Disarm the copter after landing. Return True if it continues with a take-off instead (MIS_OPTIONS)."""
+    def _continues_after_landing(self, index: int) -> bool:
+        """Land, and disarm the copter. Return True if it continues with a take-off instead (MIS_OPTIONS)."""
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
             if self._leg.is_complete:

@@ -110,7 +110,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Return the answer with the offset and the data that the firmware sends for this opcode."""
         is_acknowledged = answer.opcode == Op.ACK
         is_transfer = request.opcode in (Op.READFILE, Op.WRITEFILE) and is_acknowledged
-        # The firmware sends 0 as the offset of other replies.
+        # Only file transfers and directory listings have an offset. In all other replies, the firmware sends 0.
         offset = request.offset if is_transfer or request.opcode == Op.LISTDIRECTORY else 0
         if is_acknowledged and request.opcode in _WITHOUT_DATA:
             answer = request.acknowledge()  # an acknowledgement without data

@@ -107,7 +107,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._end_short()
 
     def _start_short(self, action: int) -> None:
-        """Start the short failsafe of the radio. Some modes continue, depending on the action."""
+        """Start the short failsafe of the radio. With some values of ``action``, the plane stays in its mode."""
         plane = self.vehicle
         self.state = _SHORT
         self._short_since = plane.now

@@ -169,15 +169,16 @@ class CameraLink(CameraOrders):
             self.bind(AUTOPILOT_CAMERA_IDS[0])
 
     async def _request_information(self) -> None:
-        """Request CAMERA_INFORMATION; raise only if a camera with its own component id does not identify itself."""
+        """Request CAMERA_INFORMATION. Raise if a camera with its own component id has never identified itself."""
+        # An autopilot may have no information about a camera that is attached to it.
+        must_identify = not self.is_autopilot_attached
         try:
             await self.requests.request(m.CameraInformation, self.device_id, where=self._is_from_this_camera)
         except CommandRejected:
-            # An autopilot may have no information about its camera. Information that was received earlier stays valid.
-            # In both cases, the refusal is no error.
-            if not self.is_autopilot_attached and not self.information.is_known:
+            # Information that was received earlier stays valid, so the refusal is then no error.
+            if must_identify and not self.information.is_known:
                 raise
-        if not self.information.is_known and not self.is_autopilot_attached:
+        if must_identify and not self.information.is_known:
             raise self.timeout_error("did not identify itself")
 
     async def require_capability(self, action: str, *capabilities: str) -> None:
