@@ -258,7 +258,7 @@ class Routes:
             self._publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
 
     def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
-        """Return a list with the first peer without a live component, if there is one, and forget its claims.
+        """Return the first peer without a live component, as a list of at most one peer, after dropping its claims.
 
         A component is live if it has a vehicle object, or sent a heartbeat in the last 30 s.
         """

@@ -208,7 +208,7 @@ class TcpListen(_TcpLink):
             self._kept.add(peer)
 
     def forget_peer(self, peer: Peer) -> None:
-        """See `Link.forget_peer`. The client may then be replaced by a new client."""
+        """See `Link.forget_peer`. Afterwards, a new client may take its place."""
         self._kept.discard(peer)
 
     def has_peer(self, peer: Peer) -> bool:

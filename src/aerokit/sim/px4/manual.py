@@ -191,7 +191,7 @@ class Px4ManualFlight:
         return (hover + throttle * thrust_range) / hover
 
     def _velocity_of_thrust(self) -> float:
-        """Return the target velocity (m/s down) towards which `Motion` accelerates as the thrust does."""
+        """Return the target velocity (m/s down) that makes `Motion` accelerate as much as the thrust would."""
         motion = self._px4.motion
         lift = self._thrust * math.cos(motion.roll) * math.cos(motion.pitch)
         return motion.velocity_down + (1.0 - lift) * GRAVITY_M_S2 * _VELOCITY_TIME_CONSTANT_S
