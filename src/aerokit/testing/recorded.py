@@ -25,6 +25,7 @@ from aerokit.protocols.servers.missions import (
     MissionServer,
     item_from,
     item_message_float,
+    item_message_int,
 )
 from aerokit.protocols.servers.parameters import ParameterProtocolServer
 from aerokit.sim.channel import Channel
@@ -189,24 +190,10 @@ def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, as_float:
     if as_float:
         place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
         return item_message_float(item_from(item), place, seq, client, item.mission_type, item.current)
-    client_system, client_component = client
-    return m.MissionItemInt(
-        target_system=client_system,
-        target_component=client_component,
-        seq=seq,
-        frame=item.frame,
-        command=item.command,
-        current=item.current,
-        autocontinue=item.autocontinue,
-        param1=item.param1,
-        param2=item.param2,
-        param3=item.param3,
-        param4=item.param4,
-        x=round(item.x * scale) if is_float else int(item.x),
-        y=round(item.y * scale) if is_float else int(item.y),
-        z=item.z,
-        mission_type=item.mission_type,
-    )
+    converted = item_from(item)
+    if is_float:
+        converted = converted.replace(x=round(item.x * scale), y=round(item.y * scale))
+    return item_message_int(converted, seq, client, item.mission_type, current=bool(item.current))
 
 
 _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)

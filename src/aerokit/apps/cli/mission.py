@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 PARTS = ("mission", "fence", "rally")
 _TAKE_OFFS = (MavCmd.NAV_TAKEOFF, MavCmd.NAV_TAKEOFF_LOCAL, MavCmd.NAV_VTOL_TAKEOFF)
 _LANDINGS = (MavCmd.NAV_LAND, MavCmd.NAV_VTOL_LAND)
-_FRAMES_RELATIVE_TO_HOME = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def read_plan(path: str) -> Plan:
@@ -72,13 +71,16 @@ def plan_warnings(plan: Plan) -> list[str]:
 
 def _altitude_warnings(plan: Plan) -> list[str]:
     """Return warnings about altitudes below home, which are usual only for submarines and for landings."""
+    from aerokit.missions.item import canonical_frame
+
     if plan.vehicle_type == MavType.SUBMARINE:
         return []
     warnings = []
     for index, item in enumerate(plan.mission.items):
         is_take_off = item.command in _TAKE_OFFS
         # A take-off has an altitude even without a position. In other commands without a position, z is no altitude.
-        has_altitude = item.frame in _FRAMES_RELATIVE_TO_HOME and (is_take_off or item.position is not None)
+        is_above_home = canonical_frame(item.frame) == MavFrame.GLOBAL_RELATIVE_ALT
+        has_altitude = is_above_home and (is_take_off or item.position is not None)
         is_too_low = item.z < 0.0 or (is_take_off and item.z == 0.0)
         if has_altitude and is_too_low and item.command not in _LANDINGS:
             warnings.append(f"mission item {index}: {item.name} at {item.z:g} m above home")

@@ -6,7 +6,6 @@ import math
 import re
 import time
 from collections import Counter, defaultdict, deque
-from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
@@ -86,7 +85,7 @@ class MonitorModel:
                     track.append(point)
 
     def rates(self, system_id: int) -> list[tuple[str, float]]:
-        """Return names and rates in Hz of a system's messages in the last five seconds, the highest rate first."""
+        """Return names and rates in Hz of a system's messages in the last five seconds, in any order."""
         first = self._count_samples[0]
         last = self._count_samples[-1]
         duration_s = last.at - first.at
@@ -100,8 +99,7 @@ class MonitorModel:
                 name = f"message {message_id}" if message is None else message.NAME
                 received = count - first.counts[sender_id, message_id]
                 rates.append((name, received / duration_s))
-        rates.sort()  # by name, which decides between equal rates
-        return sorted(rates, key=itemgetter(1), reverse=True)
+        return rates
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """Convert a position to metres north and east of ``reference``. The first position becomes the reference."""

@@ -24,6 +24,7 @@ from aerokit.errors import AerokitError, InvalidArgument
 from aerokit.events import Event, LinkReport, LinkState, StatusTextReceived
 from aerokit.vehicle.commanding.ground import VELOCITY_MAX_AGE_S
 from aerokit.vehicle.connect import vehicles_on
+from aerokit.vehicle.parameters.return_altitude import known_return_altitude
 from aerokit.vehicle.vehicle import Vehicle, overview
 
 if TYPE_CHECKING:
@@ -235,7 +236,7 @@ class ServedVehicles:
             "disarm_parameter": watch.disarm_parameter,
             "disarm_delay_s": watch.disarm_delay_s,
             "unread": unread,
-            "return_altitude_m": _return_altitude_m(vehicle),
+            "return_altitude_m": known_return_altitude(vehicle.parameters, vehicle.autopilot, is_vtol=vehicle.is_vtol),
             "failsafe": ground_station_failsafe(vehicle),
             "active_failsafe": active_failsafe(vehicle),
             "mission_item": vehicle.mission.current.latest,
@@ -248,14 +249,6 @@ class ServedVehicles:
 async def _read_return_altitude(vehicle: Vehicle) -> None:
     with suppress(AerokitError):  # the altitude then stays unknown
         await vehicle.return_altitude()
-
-
-def _return_altitude_m(vehicle: Vehicle) -> float | None:
-    """Return the known result of `Vehicle.return_altitude`; None if it was not read."""
-    for name, scale in vehicle.autopilot.return_altitude_parameters(is_vtol=vehicle.is_vtol):
-        if (known := vehicle.parameters.known(name)) is not None:
-            return round(known.value / scale, 3)
-    return None
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:

@@ -9,16 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.flight import Waypoint
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
+from aerokit.missions.item import GLOBAL_FRAMES, canonical_frame
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from aerokit.logs.flights.records import LogReader, LogRecord
     from aerokit.position import Position
-
-_AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
-_RELATIVE_FRAMES = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
-_GLOBAL_FRAMES = _AMSL_FRAMES | _RELATIVE_FRAMES | {MavFrame.GLOBAL_TERRAIN_ALT, MavFrame.GLOBAL_TERRAIN_ALT_INT}
 
 
 def _waypoint_name(waypoint: Waypoint) -> str:
@@ -29,9 +26,10 @@ def _waypoint_name(waypoint: Waypoint) -> str:
 
 
 def _altitude_amsl_m(waypoint: Waypoint, home_amsl_m: float | None) -> float | None:
-    if waypoint.frame in _AMSL_FRAMES:
+    frame = canonical_frame(waypoint.frame)
+    if frame == MavFrame.GLOBAL:
         return waypoint.altitude_m
-    if waypoint.frame in _RELATIVE_FRAMES and home_amsl_m is not None:
+    if frame == MavFrame.GLOBAL_RELATIVE_ALT and home_amsl_m is not None:
         return waypoint.altitude_m + home_amsl_m
     return None
 
@@ -77,7 +75,7 @@ class _TrackWriter:
     def _add_item(self, record: LogRecord) -> None:
         """Add a mission item that has a position to the vehicle that received or sent it."""
         item: Any = record.message
-        if item is None or item.mission_type != MavMissionType.MISSION or item.frame not in _GLOBAL_FRAMES:
+        if item is None or item.mission_type != MavMissionType.MISSION or item.frame not in GLOBAL_FRAMES:
             return
         if item.target_system in self._tracks:  # sent to the vehicle
             system_id = item.target_system

@@ -8,6 +8,7 @@ from aerokit._internal.arguments import check_range
 from aerokit.errors import NotSupported, ParameterRejected, ParameterTimeout
 
 if TYPE_CHECKING:
+    from aerokit.autopilots import Autopilot
     from aerokit.vehicle.parameters.parameters import Parameters
     from aerokit.vehicle.session.session import VehicleSession
 
@@ -19,6 +20,14 @@ async def read_return_altitude(parameters: Parameters, session: VehicleSession) 
     """Read the altitude; see :meth:`aerokit.Vehicle.return_altitude`."""
     _, value, scale = await _find("return_altitude", parameters, session)
     return round(value / scale, 3)
+
+
+def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vtol: bool) -> float | None:
+    """Return the altitude if its parameter was read, without requesting it; otherwise None."""
+    for name, scale in autopilot.return_altitude_parameters(is_vtol=is_vtol):
+        if (known := parameters.known(name)) is not None:
+            return round(known.value / scale, 3)
+    return None
 
 
 async def write_return_altitude(parameters: Parameters, session: VehicleSession, altitude_m: float) -> None:
