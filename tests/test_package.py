@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from pathlib import Path
@@ -36,6 +37,17 @@ def test_import_is_lazy() -> None:
 
 
 SOURCE = Path(aerokit.__file__).parent
+LEAFLET_SHA256 = {
+    "leaflet.js": "db49d009c841f5ca34a888c96511ae936fd9f5533e90d8b2c4d57596f4e5641a",
+    "leaflet.css": "a7837102824184820dfa198d1ebcd109ff6d0ff9a2672a074b9a1b4d147d04c6",
+    "LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
+}
+"""Files of the npm package leaflet 1.9.4."""
+
+
+def test_leaflet_is_vendored_unchanged() -> None:
+    folder = SOURCE / "apps" / "serve" / "static" / "vendor" / "leaflet"
+    assert {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()} == LEAFLET_SHA256
 
 
 def mixed(folder: Path, init: str | None) -> Path:

@@ -46,7 +46,8 @@ def opened(browser: Any, url: str, wide: int = 1360, high: int = 820, scheme: st
     page.goto(url)
     page.wait_for_selector(".vehicle[aria-pressed=true]")
     yield page
-    assert [each for each in mistakes if "Failed to load resource" not in each] == []  # refused orders
+    mistakes = [each for each in mistakes if "Failed to load resource" not in each]  # refused orders
+    assert mistakes == [], mistakes
     context.close()
 
 

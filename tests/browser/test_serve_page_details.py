@@ -143,22 +143,6 @@ def test_toast_breaks_no_line_inside_option(browser: Any, copters: Copters) -> N
         assert set(counts) == {1}
 
 
-def test_fitted_map_is_left_of_zoom_buttons(browser: Any, copters: Copters) -> None:
-    for size in ((1360, 820), (390, 844)):
-        with serving(copters[1]) as server, opened(browser, server["page"], *size) as page:
-            right, width = page.evaluate("""async () => {
-                const { MapView } = await import("/static/map.js");
-                const map = new MapView(document.getElementById("map"), () => {});
-                const at = (east) => ({ latitude_deg: -35.36, longitude_deg: 149.165 + east * 1e-5 });
-                const home = at(100), vehicle = { id: 1, position: home, home, age: 0, heading: 0, labels: ["1"] };
-                const items = [{ index: 0, position: at(0) }];
-                map.draw([vehicle], 1, { items, current: null }, null, { polygons: [], circles: [], rally: [] });
-                return [map.place(home).x + 15, map.width];
-            }""")
-            buttons = page.locator("#map-tools").bounding_box()["x"] - page.locator("#map").bounding_box()["x"]
-            assert right < buttons < width
-
-
 def test_dialog_words_share_line_and_tiles_are_apart(browser: Any, copters: Copters) -> None:
     with serving(copters[1]) as server, opened(browser, server["page"], 1280, 900) as page:
         page.locator("#readiness.good", has_text="Ready to arm").wait_for(timeout=30_000)

@@ -134,9 +134,9 @@ def make_app(
 def _static_routes() -> list[Route]:
     # Files are read only here, at the start, so that no request can reach other files.
     routes = []
-    for path in sorted(STATIC.iterdir()):
+    for path in sorted(STATIC.rglob("*.*")):
         if path.suffix in MEDIA_TYPES:
-            url_path = "/" if path.name == "index.html" else f"/static/{path.name}"
+            url_path = "/" if path.name == "index.html" else f"/static/{path.relative_to(STATIC).as_posix()}"
             routes.append(Route(url_path, _file(path.read_bytes(), MEDIA_TYPES[path.suffix]), methods=["GET"]))
     return routes
 

@@ -2,7 +2,7 @@
 
 import { drawAttitude } from "./attitude.js";
 import { age, byId, element, number, show, unbroken } from "./dom.js";
-import { colourOf, MapView } from "./map.js";
+import { MapView } from "./map.js";
 import { Orders } from "./orders.js";
 import { targetAltitude } from "./facts.js";
 import { currentItem, MissionPanel, OrderPanel, ParameterPanel, shownState, TextPanel } from "./panels.js";
@@ -13,7 +13,9 @@ import { ageOf, BigValues, bitNames, StateTable } from "./state.js";
 const page = { vehicles: new Map(), selected: undefined, receivedAt: 0, atSeconds: null, isOpen: false, isReadOnly: false, modesOf: undefined };
 const selected = () => page.vehicles.get(page.selected);
 
-const map = new MapView(byId("map"), (place, y) => { pick(false); orders.goTo(place, targetAltitude(page.running(page.selected)) ?? heightNow(), y); });
+const map = new MapView(byId("map"), {
+  picked: (place, y) => { pick(false); orders.goTo(place, targetAltitude(page.running(page.selected)) ?? heightNow(), y); }, changed: draw,
+});
 const big = new BigValues(byId("tiles-of-state"));
 const table = new StateTable();
 const missions = new MissionPanel(draw, (file) => orders.upload(file));
@@ -178,9 +180,9 @@ window.addEventListener("drop", (event) => {
   if (file && !page.isReadOnly) orders.upload(file);
 });
 
-byId("zoom-in").onclick = () => map.zoom(1.5);
-byId("zoom-out").onclick = () => map.zoom(1 / 1.5);
-byId("fit").onclick = () => { map.isMoved = false; map.follows = null; };
+byId("zoom-in").onclick = () => map.leaflet.zoomIn(0.6);
+byId("zoom-out").onclick = () => map.leaflet.zoomOut(0.6);
+byId("fit").onclick = () => { Object.assign(map, { isMoved: false, follows: null, isFitted: false }); draw(); };
 byId("follow").onclick = () => { map.follows = map.follows === null ? page.selected : null; map.isMoved = true; };
 window.addEventListener("keydown", (event) => { if (event.key === "Escape") pick(false); });
 
@@ -342,7 +344,7 @@ function showServer() {
 }
 
 ask("GET", "api").then((about) => {
-  map.tiles = about.tiles;
+  if (about.tiles) map.showTiles(about.tiles);
   Object.assign(bitNames, about.bits);
   show(byId("attribution"), about.tiles ? about.attribution : "");
   byId("server").title = `aerokit ${about.aerokit}`;
