@@ -243,12 +243,12 @@ class CurrentCommand:
     async def _set_current(self, seq: int) -> None:
         """Set the current command on the vehicle.
 
-        Like DroneKit, sends ArduPilot one MISSION_SET_CURRENT. If that is not confirmed, sends a command with retries.
+        Like DroneKit, send ArduPilot one MISSION_SET_CURRENT. If it is not confirmed, send a command with retries.
         """
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
-            self._requested_index = seq - 1  # -1 is the index of no item
+            self._requested_index = seq - 1  # -1 is not the index of an item.
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
@@ -276,7 +276,7 @@ class Maintenance(VehicleCore):
 
     # -------------------------------------------------------------------------- calibrations
 
-    # Parameters of PREFLIGHT_CALIBRATION: gyroscopes, compasses, pressure, radio, accelerometers.
+    # The parameters of PREFLIGHT_CALIBRATION stand for gyroscopes, compasses, pressure, radio and accelerometers.
 
     def send_calibrate_gyro(self) -> None:
         """Calibrate the gyroscopes: keep the vehicle still."""

@@ -183,7 +183,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
 # MISSION_ITEM_INT, not truncated. Missions have home as item 0.
 MAGIC = 0x763D
 HEADER = struct.Struct("<5H")
-NO_CLEAR = 1  # option of a packed plan: replace only the items that are in the file, and keep all others
+NO_CLEAR = 1  # option of a packed plan that replaces only the items in the file, and keeps all others
 PACKED_PATHS = {0: "@MISSION/mission.dat", 1: "@MISSION/fence.dat", 2: "@MISSION/rally.dat"}
 
 _ITEM_LENGTH = messages.MissionItemInt.LENGTH

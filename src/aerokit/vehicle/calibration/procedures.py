@@ -198,7 +198,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         return bool(compasses) and all(number in reports for number in compasses)
 
     with ExitStack() as cleanup:
-        # The mask 0 means all compasses. The other zeros: no retry, no automatic saving, no delay, no reboot.
+        # The mask 0 means all compasses. The other zeros mean no retry, no automatic saving, no delay and no reboot.
         await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
         session = run.session
         for message_type in (MagCalProgress, MagCalReport):
@@ -262,7 +262,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 raise run.failure("the calibration failed; keep the vehicle still in each pose")
             if request in POSES:
                 pose = POSES[AccelcalVehiclePos(request)]
-                remaining = tuple(POSES.values())[request - 1 :]  # ArduPilot requests the poses 1 to 6 in this order.
+                remaining = tuple(POSES.values())[request - 1 :]  # POSES has the order of ArduPilot's requests.
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
                 yield run.new_step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
