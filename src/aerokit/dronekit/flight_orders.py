@@ -254,10 +254,10 @@ class CurrentCommand:
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
-        # MISSION_SET_CURRENT was not confirmed in time, so a command, which the vehicle acknowledges, sets the item.
+        # MISSION_SET_CURRENT was not confirmed in time, so send a command instead, which the vehicle acknowledges.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:  # 0 is home, for which `mission.set_current` has no number: its 0 is the first item after home.
+        if seq == 0:  # `mission.set_current` cannot select home, because its 0 is the first item after home.
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)

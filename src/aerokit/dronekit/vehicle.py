@@ -420,6 +420,7 @@ def connect(
     except BaseException as error:
         handler.close()
         if isinstance(error, KeyboardInterrupt) and vehicle_class is None:
+            # After Ctrl-C, frames of this package do not help the user either.
             raise error.with_traceback(None) from error.__cause__
         raise
     return vehicle

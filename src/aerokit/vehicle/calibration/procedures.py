@@ -204,12 +204,13 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         for message_type in (MagCalProgress, MagCalReport):
             cleanup.callback(session.connection.bus.attach(message_type, on_message, system_id=session.system_id))
             cleanup.callback(session.rates.request(message_type, REPORT_HZ, is_optional=True))
-        yield run.new_step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
+        instruction = "turn the vehicle slowly in all directions, about each of its axes"
+        yield run.new_step(0.0, instruction)
         while not is_complete():
             await run.wait(was_reported)
             has_changed = False
             progress = min(percents.values(), default=0) / 100
-            yield run.new_step(progress, "turn the vehicle slowly in all directions, about each of its axes")
+            yield run.new_step(progress, instruction)
     failures = [
         f"compass {report.compass_id} {_status_name(report.cal_status)} (fitness {report.fitness:.1f} mgauss)"
         for report in reports.values()

@@ -206,8 +206,8 @@ class PhotoInterval:
 
     def __init__(self, shutter: Shutter, seconds: float, count: int) -> None:
         self._shutter = shutter
-        self._seconds = seconds
-        self._count = count
+        self._seconds = seconds  # interval between two pictures
+        self._count = count  # number of ordered pictures; 0 for a series without an end
         self._link = shutter.link
         self._log = shutter.log
         self._new_captures = CaptureQueue(self._log.cell)

@@ -451,8 +451,8 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                # No refusals are watched here. Only PX4 refuses a command that it has accepted before, and PX4 does not
-                # get MISSION_START.
+                # No refusals are watched here, because only PX4 refuses a command after it has accepted it, and PX4
+                # does not get MISSION_START.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )

@@ -230,6 +230,7 @@ class Telemetry(States):
         """Return the function that updates one cell from one type of message.
 
         A decoder returns None if the message does not have the value. The cell then keeps its previous value.
+        A fallback message updates the cell only if no better message has reported the value recently.
         """
         decode, context = message_source.decode, self._context
         assert decode is not None
