@@ -90,11 +90,11 @@ ARDUPILOT_EXTERNAL = ExternalRules(
         "optical_flow": ExternalRule(((("FLOW_TYPE",), (5.0,)),)),
     },
     ned_frame=MavFrame.LOCAL_FRD,  # GCS_Common.cpp, handle_odometry accepts only this frame and treats it as NED.
-    origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin
+    origin_is_final=True,  # GCS_Common.cpp, set_ekf_origin ignores a second origin.
 )
 
-# EKF2_EV_CTRL: 1 horizontal position, 2 vertical position, 4 velocity, 8 yaw. EKF2_GPS_CTRL: 1 position, 2 altitude,
-# 4 velocity.
+# Bits of EKF2_EV_CTRL: 1 horizontal position, 2 vertical position, 4 velocity, 8 yaw.
+# Bits of EKF2_GPS_CTRL: 1 position, 2 altitude, 4 velocity.
 _EV_ANY = tuple(float(bits) for bits in range(1, 16))
 _EV_VELOCITY = tuple(bits for bits in _EV_ANY if int(bits) & 4)
 _NO_GPS_POSITION = tuple(float(bits) for bits in range(0, 16, 2))
@@ -119,5 +119,5 @@ PX4_EXTERNAL = ExternalRules(
     has_vision_speed=False,
     flow_in_radians=True,
     constant_position_at_rest=True,  # Measured in flight. ArduPilot sets the flag only if no sensor supplies positions.
-    target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target
+    target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target refuses positions in other frames.
 )

@@ -44,7 +44,7 @@ def _auto(sub: int) -> int:
     return px4_custom_mode(MAIN_AUTO, sub)
 
 
-# From px4_custom_mode.h. Names are those of pymavlink; names that QGroundControl uses are aliases.
+# The numbers are from px4_custom_mode.h, the names from pymavlink. Names that QGroundControl uses are aliases.
 MODES = ModeTable(
     {
         px4_custom_mode(1): "MANUAL",
@@ -101,7 +101,7 @@ class Px4(Autopilot):
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
     external: ExternalRules = PX4_EXTERNAL
-    actuators_until: tuple[int, int] | None = (1, 14)  # commit 27658354 of 2023-03-06 (MavlinkReceiver.cpp)
+    actuators_until: tuple[int, int] | None = (1, 14)  # Commit 27658354 removed the message.
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(
         has_secondary=False,
@@ -127,15 +127,16 @@ class Px4(Autopilot):
         ("MANUAL", "ALTCTL", "POSCTL", "POSITION_SLOW", "ALTITUDE_CRUISE", "ACRO", "STABILIZED", "RATTITUDE", "SIMPLE")
     )
     auto_disarm_parameter: ClassVar[str | None] = "COM_DISARM_PRFLT"
-    has_status_text_id_0 = True  # The first text after the start of a link (STATUSTEXT.hpp).
+    has_status_text_id_0 = True  # The first text after the start of a link has id 0 (STATUSTEXT.hpp).
     calibration_protocol = "texts"
     camera_by_trigger_only = True
     arming_mode: ClassVar[str | None] = "LOITER"
-    # Commander.cpp of 1.17. External modes are selectable by the names that the vehicle reports.
+    # Commander.cpp of 1.17 refuses these modes. External modes can be selected by the names that the vehicle reports,
+    # but not as EXTERNAL1 to EXTERNAL8.
     unselectable_modes: frozenset[str] = frozenset(
         ("ORBIT", "RATTITUDE", "READY", "RTGS", "SIMPLE", "TERMINATION", "VTOL_TAKEOFF")
     ).union(f"EXTERNAL{number}" for number in range(1, 9))
-    # OFFBOARD needs a stream of set-points.
+    # OFFBOARD is listed, because it needs a stream of set-points.
     unarmable_modes: frozenset[str] = frozenset(("LAND", "OFFBOARD", "PRECLAND", "RTL", "TERMINATION"))
     purposes: ClassVar[Mapping[str, str]] = {
         "hold": "LOITER",

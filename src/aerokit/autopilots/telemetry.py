@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import MavDataStream
 from aerokit.mavlink.enums import MavSysStatusSensor as Sensor
 from aerokit.mavlink.messages import INDEX
 
-# The summary of all checks, not a sensor.
+# This bit is the summary of all checks, and not a sensor.
 PREARM_CHECK = Sensor.MAV_SYS_STATUS_PREARM_CHECK.value
 
 POS_HORIZ_ABS = Estimate.POS_HORIZ_ABS.value

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.runner import install
     from aerokit.dronekit.vehicle import Vehicle, connect, default_still_waiting_callback
 
-monotonic = time  # DroneKit exports the package `monotonic`, whose only function `time` has, too
+monotonic = time  # DroneKit exports the package `monotonic`. Its only function is also in `time`.
 
 basestring: tuple[type[str], type[bytes]] = (str, bytes)
 """The string types, for ``isinstance`` checks in programs that were written for Python 2."""

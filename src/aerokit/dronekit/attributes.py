@@ -231,7 +231,7 @@ class VehicleAttributes(VehicleCore):
             # On PX4, a bit of SYS_STATUS has the result of the checks.
             status = self._dk_sys_status.message
             return status is not None and bool(status.onboard_control_sensors_health & PREARM_CHECK)
-        # Like DroneKit: any fix (2D or better), and a predicted position of the estimator.
+        # Like DroneKit, require any fix (2D or better) and a predicted position of the estimator.
         gps = self._dk_gps.message
         return gps is not None and gps.fix_type > 1 and bool((self._dk_ekf_flags or 0) & PRED_POS_HORIZ_ABS)
 
@@ -270,7 +270,7 @@ class VehicleAttributes(VehicleCore):
         self._dk.ready.mark("last_heartbeat")
 
     def _dk_on_distance_sensor(self, message: m.DistanceSensor) -> None:
-        has_rangefinder_message = self._dk_rangefinder.message is not None  # RANGEFINDER takes precedence
+        has_rangefinder_message = self._dk_rangefinder.message is not None  # RANGEFINDER takes precedence.
         if message.orientation == FACING_DOWN and not has_rangefinder_message:
             self._dk_distance_down = message.current_distance / 100.0
             self._dk.listeners.announce("rangefinder")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
 
 MIN_CHANNELS, MAX_CHANNELS = 8, 18
-UNUSED = 0xFFFF  # RC_CHANNELS: the channel does not exist; RC_CHANNELS_OVERRIDE: the channel stays unchanged
+UNUSED = 0xFFFF  # The channel does not exist (RC_CHANNELS), or stays unchanged (RC_CHANNELS_OVERRIDE).
 NUMBERS = tuple(str(number) for number in range(1, MAX_CHANNELS + 1))
 ALL_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS))
 FIRST_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS[:MIN_CHANNELS]))
@@ -52,7 +52,8 @@ class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
 
     @classmethod
     def fromkeys(cls, channels: Iterable[Any], value: Any = None) -> dict[Any, Any]:
-        return dict.fromkeys(channels, value)  # A plain dict: instances of this class belong to a vehicle.
+        # Return a plain dict, because instances of this class belong to a vehicle.
+        return dict.fromkeys(channels, value)
 
 
 def _unsupported(name: str) -> Any:
@@ -108,7 +109,7 @@ class Channels(_ChannelDict):
 
     # --------------------------------------------------------------------------------- private
 
-    # dict declares these methods with other types. Type checkers do not see the assignments, or they would complain.
+    # The class dict declares the methods below with other types, so the assignments are hidden from type checkers.
     if not TYPE_CHECKING:
         __setitem__, __delitem__, __ior__ = map(_unsupported, ("__setitem__", "__delitem__", "__ior__"))
         clear, pop, popitem = map(_unsupported, ("clear", "pop", "popitem"))

@@ -424,7 +424,7 @@ def _item_of(cmd: Command, index: int) -> MissionItem:
 
 
 def _wire_number(value: Any, command: int, frame: int) -> int | float:
-    """Convert x or y to the value for MISSION_ITEM_INT. Like ArduPilot, truncates values that are not coordinates."""
+    """Convert x or y to the value for MISSION_ITEM_INT. Like ArduPilot, truncate values that are not coordinates."""
     number = from_degrees(float(value), command, frame)
     return int(number) if isinstance(number, float) and abs(number) < 1e9 else number
 

@@ -310,7 +310,7 @@ class VehicleCore(HasObservers):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        # Wraps the properties of our own classes only, not those of a program's subclass.
+        # Wrap the properties of our own classes only, not those of a program's subclass.
         if cls.__module__.startswith("aerokit."):
             for name, member in list(vars(cls).items()):
                 if isinstance(member, property) and not name.startswith("_"):

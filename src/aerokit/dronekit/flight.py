@@ -143,7 +143,8 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
         order_take_off = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
-        if not aio.autopilot.repositions_amsl:  # ArduPilot: altitude above home; the command does not change the mode
+        if not aio.autopilot.repositions_amsl:
+            # ArduPilot takes the altitude above home, and does not change the mode when it gets this command.
             params = (0, 0, 0, 0, 0, 0, altitude)
             return order_take_off((), MavCmd.NAV_TAKEOFF, *params)
         plan = aio.autopilot.take_off(altitude, self._dk_known_home().alt, is_vtol=aio.is_vtol)
@@ -346,7 +347,7 @@ class FlightMethods(VehicleAttributes):
         def is_over() -> bool:
             if is_done():
                 return True
-            # Calls is_done again, because the effect may have been reported between the first call and the failure.
+            # Call is_done again, because the effect may have been reported between the first call and the failure.
             if order.done() and order.exception() is not None and not is_done():
                 self._dk.check_link()  # If the link is lost, this raises a more useful error.
                 raise TimeoutError(f"{failure_text}: {order.exception()}") from order.exception()

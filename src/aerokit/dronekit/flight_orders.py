@@ -243,21 +243,21 @@ class CurrentCommand:
     async def _set_current(self, seq: int) -> None:
         """Set the current command on the vehicle.
 
-        Like DroneKit, sends ArduPilot one MISSION_SET_CURRENT. If that is not confirmed, sends a command with retries.
+        Like DroneKit, send ArduPilot one MISSION_SET_CURRENT. If it is not confirmed, send a command with retries.
         """
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
-            self._requested_index = seq - 1  # -1 is the index of no item
+            self._requested_index = seq - 1  # -1 is not the index of an item.
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
             await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
             return
-        # MISSION_SET_CURRENT was not confirmed in time, so a command, which the vehicle acknowledges, sets the item.
+        # MISSION_SET_CURRENT was not confirmed in time, so send a command instead, which the vehicle acknowledges.
         if aio.heartbeat_age > MODE_MAX_AGE_S:
             raise APIException(f"the vehicle is silent; it may or may not have set the next command to {seq}")
-        if seq == 0:  # 0 is home, for which `mission.set_current` has no number: its 0 is the first item after home.
+        if seq == 0:  # `mission.set_current` cannot select home, because its 0 is the first item after home.
             await aio.command(MavCmd.DO_SET_MISSION_CURRENT, 0)
         else:
             await aio.mission.set_current(seq - 1)
@@ -276,7 +276,7 @@ class Maintenance(VehicleCore):
 
     # -------------------------------------------------------------------------- calibrations
 
-    # Parameters of PREFLIGHT_CALIBRATION: gyroscopes, compasses, pressure, radio, accelerometers.
+    # The parameters of PREFLIGHT_CALIBRATION stand for gyroscopes, compasses, pressure, radio and accelerometers.
 
     def send_calibrate_gyro(self) -> None:
         """Calibrate the gyroscopes: keep the vehicle still."""

@@ -77,7 +77,7 @@ class ListenerThread:
 
         self.post(call_and_finish)
         deadline = time.monotonic() + CALL_TIMEOUT_S
-        # Waits in short steps, because on some systems Ctrl-C does not interrupt a long wait.
+        # Wait in short steps, because on some systems Ctrl-C does not interrupt a long wait.
         while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= deadline:
             pass
 

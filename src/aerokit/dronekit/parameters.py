@@ -349,7 +349,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
         if not isinstance(name, str):
             return None
         name = name.upper()
-        is_settled = self._is_settled  # Read before `find`: the last value may arrive in between.
+        is_settled = self._is_settled  # Read it before `find`, because the last value may arrive in between.
         resolved = self._values.find(name)
         if resolved is None and waits and not is_settled and _is_valid_name(name):
             self._core.run(self._wait_for, name)

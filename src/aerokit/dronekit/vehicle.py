@@ -82,7 +82,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._channels = Channels(self, 8)
         self._gimbal = Gimbal(self)
         self._parameters = Parameters(self)
-        self._dk.ready.mark("commands")  # An empty mission is their valid value until download() is called.
+        self._dk.ready.mark("commands")  # Until download() is called, an empty mission is a valid value of `commands`.
 
     # --------------------------------------------------------------------------------- parts
 
@@ -420,6 +420,7 @@ def connect(
     except BaseException as error:
         handler.close()
         if isinstance(error, KeyboardInterrupt) and vehicle_class is None:
+            # After Ctrl-C, frames of this package do not help the user either.
             raise error.with_traceback(None) from error.__cause__
         raise
     return vehicle

@@ -63,7 +63,7 @@ def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:
     """
     return action_item(
         MavCmd.NAV_DELAY,
-        -1.0,  # There is no duration, but a time of day.
+        -1.0,  # -1 means that a time of day follows instead of a duration.
         whole_number("hour", hour, 0, 23),
         whole_number("minute", minute, 0, 59),
         whole_number("second", second, 0, 59),
@@ -193,7 +193,7 @@ def set_camera_trigger_distance(distance_m: float, *, trigger_now: bool = False)
     return action_item(
         MavCmd.DO_SET_CAM_TRIGG_DIST,
         in_range("distance_m", distance_m, 0, 1e5),
-        0.0,  # the shutter time: unchanged
+        0.0,  # leaves the shutter time unchanged
         float(trigger_now),
     )
 
@@ -250,7 +250,7 @@ def trigger_camera() -> MissionItem:
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_DIGICAM_CONTROL
     """
-    return action_item(MavCmd.DO_DIGICAM_CONTROL).replace(x=1)  # param5 = 1: take a picture.
+    return action_item(MavCmd.DO_DIGICAM_CONTROL).replace(x=1)  # param5 = 1 takes a picture.
 
 
 @overload

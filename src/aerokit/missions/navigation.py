@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
 _MAX_RADIUS_M = 65_535.0  # ArduPilot stores metres in 16 bits
-# Value of the parameters of a command that have no meaning, or that these functions leave at their default.
+# Value of parameters that have no meaning in a command, or that the functions below leave at their default.
 _UNSET = 0.0
 
 

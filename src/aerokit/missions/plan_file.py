@@ -166,7 +166,7 @@ def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:
     yield _missing_in("rallyPoints", rally, "version")
 
 
-# Values of an unexpected type are ignored here: an error about them is raised when they are read.
+# These three functions ignore values of an unexpected type. Reading such a value raises an error about it later.
 
 
 def _member(value: Any, key: str) -> Any:

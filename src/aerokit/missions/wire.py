@@ -31,21 +31,21 @@ def to_wire(
     https://mavlink.io/en/messages/common.html#MISSION_ITEM_INT
     """
     return messages.MissionItemInt(
-        target_system,
-        target_component,
-        seq,
-        int(item.frame),
-        int(item.command),
-        int(current),
-        int(item.autocontinue),
-        item.param1,
-        item.param2,
-        item.param3,
-        item.param4,
-        item.x,  # type: ignore[arg-type]
-        item.y,  # type: ignore[arg-type]
-        item.z,
-        mission_type,
+        target_system=target_system,
+        target_component=target_component,
+        seq=seq,
+        frame=int(item.frame),
+        command=int(item.command),
+        current=int(current),
+        autocontinue=int(item.autocontinue),
+        param1=item.param1,
+        param2=item.param2,
+        param3=item.param3,
+        param4=item.param4,
+        x=item.x,  # type: ignore[arg-type]
+        y=item.y,  # type: ignore[arg-type]
+        z=item.z,
+        mission_type=mission_type,
     )
 
 
@@ -64,21 +64,21 @@ def to_wire_float(
     """
     x, y = in_degrees(item)
     return messages.MissionItem(
-        target_system,
-        target_component,
-        seq,
-        int(item.frame),
-        int(item.command),
-        int(current),
-        int(item.autocontinue),
-        item.param1,
-        item.param2,
-        item.param3,
-        item.param4,
-        x,
-        y,
-        item.z,
-        mission_type,
+        target_system=target_system,
+        target_component=target_component,
+        seq=seq,
+        frame=int(item.frame),
+        command=int(item.command),
+        current=int(current),
+        autocontinue=int(item.autocontinue),
+        param1=item.param1,
+        param2=item.param2,
+        param3=item.param3,
+        param4=item.param4,
+        x=x,
+        y=y,
+        z=item.z,
+        mission_type=mission_type,
     )
 
 
@@ -183,7 +183,7 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
 # MISSION_ITEM_INT, not truncated. Missions have home as item 0.
 MAGIC = 0x763D
 HEADER = struct.Struct("<5H")
-NO_CLEAR = 1  # option of a packed plan: replace only the items that are in the file, and keep all others
+NO_CLEAR = 1  # option of a packed plan that replaces only the items in the file, and keeps all others
 PACKED_PATHS = {0: "@MISSION/mission.dat", 1: "@MISSION/fence.dat", 2: "@MISSION/rally.dat"}
 
 _ITEM_LENGTH = messages.MissionItemInt.LENGTH

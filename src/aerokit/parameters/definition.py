@@ -463,7 +463,7 @@ def _number(text: str | None) -> int | float | None:
     try:
         number = None if text is None else parse_number(text.strip())
         return None if number is None or not math.isfinite(number) else number
-    except (ValueError, OverflowError):  # OverflowError: the number is too large for a float.
+    except (ValueError, OverflowError):  # OverflowError means that the number is too large for a float.
         return None
 
 

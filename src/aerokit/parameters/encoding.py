@@ -39,7 +39,7 @@ _M = TypeVar("_M", ParamSet, ParamValue)
 
 def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa: A002
     """Encode a value as the four bytes of ``param_value``. :func:`checked_value` must have accepted the value."""
-    if not bytewise or type is ParameterType.REAL32:  # Integers are also sent as the float of the same value.
+    if not bytewise or type is ParameterType.REAL32:  # Without `bytewise`, integers are sent as floats.
         return _FLOAT.pack(value)
     if type not in _FORMATS:
         raise InvalidArgument(

@@ -59,7 +59,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
     async def __anext__(self) -> CalibrationStep:
         if self._is_over:
             raise StopAsyncIteration
-        self._loop = asyncio.get_running_loop()  # for `__del__`, which may run on another thread
+        self._loop = asyncio.get_running_loop()  # `__del__` needs it, and may run on another thread.
         try:
             return await self._steps.__anext__()
         except BaseException:  # No step follows. `abandon` does nothing if the calibration has ended on the vehicle.
@@ -166,7 +166,7 @@ class CalibrationControl:
         Raises:
             InvalidArgument: the intent is another text. Nothing was sent.
         """
-        # `checks_arguments` has refused every other intent.
+        # The decorator `checks_arguments` has refused every other intent.
         return self._start("escs", procedures.ardupilot_escs, command_param=7)
 
     def _start(

@@ -198,18 +198,19 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         return bool(compasses) and all(number in reports for number in compasses)
 
     with ExitStack() as cleanup:
-        # The mask 0 means all compasses. The other zeros: no retry, no automatic saving, no delay, no reboot.
+        # The mask 0 means all compasses. The other zeros mean no retry, no automatic saving, no delay and no reboot.
         await run.start(0, 0, 0, 0, 0, command=MavCmd.DO_START_MAG_CAL)
         session = run.session
         for message_type in (MagCalProgress, MagCalReport):
             cleanup.callback(session.connection.bus.attach(message_type, on_message, system_id=session.system_id))
             cleanup.callback(session.rates.request(message_type, REPORT_HZ, is_optional=True))
-        yield run.new_step(0.0, "turn the vehicle slowly in all directions, about each of its axes")
+        instruction = "turn the vehicle slowly in all directions, about each of its axes"
+        yield run.new_step(0.0, instruction)
         while not is_complete():
             await run.wait(was_reported)
             has_changed = False
             progress = min(percents.values(), default=0) / 100
-            yield run.new_step(progress, "turn the vehicle slowly in all directions, about each of its axes")
+            yield run.new_step(progress, instruction)
     failures = [
         f"compass {report.compass_id} {_status_name(report.cal_status)} (fitness {report.fitness:.1f} mgauss)"
         for report in reports.values()
@@ -262,7 +263,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 raise run.failure("the calibration failed; keep the vehicle still in each pose")
             if request in POSES:
                 pose = POSES[AccelcalVehiclePos(request)]
-                remaining = tuple(POSES.values())[request - 1 :]  # ArduPilot requests the poses 1 to 6 in this order.
+                remaining = tuple(POSES.values())[request - 1 :]  # POSES has the order of ArduPilot's requests.
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
                 yield run.new_step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)

@@ -60,7 +60,7 @@ class CalibrationRun:
         self._runs = runs  # all runs of this vehicle that may be in progress
         self.new_step: partial[CalibrationStep] = partial(CalibrationStep, sensor)
         self._cancel_command: tuple[float, ...] | None = None  # MAV_CMD and its parameters
-        self._cannot_cancel_reason = ""  # tells the user why the calibration cannot be cancelled; empty if it can
+        self._cannot_cancel_reason = ""  # why the calibration cannot be cancelled, for the user; empty if it can be
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
         # The arbiter keeps the order to cancel, and its command, until this stack is closed.

@@ -160,8 +160,8 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
     """Convert to roll, pitch and yaw in degrees. For a camera that points straight up or down, roll is 0."""
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
-    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Rounding may exceed 1, for which asin() would fail.
-    if abs(sine) > MAX_PITCH_SINE:  # gimbal lock: the whole turn about the common axis counts as yaw
+    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Rounding may exceed 1, which asin() refuses.
+    if abs(sine) > MAX_PITCH_SINE:  # In gimbal lock, the whole turn counts as yaw.
         roll = 0.0
         yaw = -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:

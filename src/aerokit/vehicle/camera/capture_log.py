@@ -52,7 +52,7 @@ class _Entry:
     def __init__(self, message: Message, capture: Capture) -> None:
         self.kind = type(message)
         self.capture = capture
-        # Time stamps in microseconds: UTC, and since boot. A time stamp that the message does not have is 0.
+        # `utc_us` and `boot_us` are time stamps in microseconds. A time stamp that the message does not have is 0.
         if isinstance(message, m.CameraImageCaptured):
             self.utc_us = message.time_utc
             self.boot_us = message.time_boot_ms * 1000
@@ -97,8 +97,8 @@ class CaptureLog:
         self._highest: _Entry | None = None  # the entry with the highest plausible index
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
         self._failed: _Entry | None = None  # the last failed picture
-        # Number of pictures, from CAMERA_CAPTURE_STATUS and from indices, and the camera's time when it reported the
-        # number. `_is_count_used` is False until the camera has reported a number above 0.
+        # Number of pictures according to CAMERA_CAPTURE_STATUS and to indices, and the time since boot at which the
+        # camera reported it. `_is_count_used` is False until the camera has reported a number above 0.
         self._count = 0
         self._count_boot_ms = 0
         self._is_count_used = False
@@ -125,7 +125,7 @@ class CaptureLog:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None  # PX4's trigger cannot send a capture again.
-        self._requested.add(index)  # The answer has a low index, which must not count as a reset of the camera.
+        self._requested.add(index)  # The answer may have a low index, which must not count as a reset.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index):
@@ -282,7 +282,7 @@ class CaptureLog:
         self._publish(message, entry.capture, is_new=True)
 
     def _store(self, entry: _Entry) -> None:
-        # Remove the index first: the dictionary then has the newest entry last, so that the oldest can be dropped.
+        # Remove an older entry first, so that the dictionary has the newest entry last and the oldest can be dropped.
         self._by_index.pop(entry.capture.index, None)
         self._by_index[entry.capture.index] = entry
         if len(self._by_index) > MAX_CAPTURES:

@@ -387,7 +387,8 @@ class StorageMixin(CameraMixin):
         await self._link.identify()
         # The reset also changes the mode, so it ends the retries of an earlier order to change the mode.
         with self._link.new_order("mode") as order:
-            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, 1, self._link.device_id, order=order)  # 1: reset
+            reset = 1  # param1
+            await self._link.command(MavCmd.RESET_CAMERA_SETTINGS, reset, self._link.device_id, order=order)
         await self._link.request(m.CameraSettings, timeout=MODE_REQUEST_TIMEOUT_S)
 
     def _on_settings(self, message: m.CameraSettings) -> None:

@@ -58,7 +58,7 @@ class CameraLink(CameraOrders):
         self._on_bound = on_bound
         # True if another object publishes the events of this camera.
         self.is_muted = False
-        # Both are None until a camera is found.
+        # The component and the number of the camera are None until a camera is found.
         self._component: Component | None = None
         self.number = None
         self._listeners: list[tuple[type[Message], Callable[[Any], object]]] = []
@@ -72,7 +72,7 @@ class CameraLink(CameraOrders):
         self._is_bound = anyio.Event()
         # Time of the camera's last HEARTBEAT.
         self._heartbeat_at = -math.inf
-        # True after a silence of the camera until it has identified itself again. Another camera may use its id now.
+        # True after a silence until the camera has identified itself again, because another camera may use its id now.
         self._was_silent = False
         self._session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")
@@ -160,8 +160,8 @@ class CameraLink(CameraOrders):
         return not self.information.is_known or self._was_silent
 
     async def _find_first_camera(self) -> None:
-        # A camera with its own component id takes precedence over one that is attached to the autopilot, and gets time
-        # to send a heartbeat.
+        # A camera with its own component id takes precedence over one that is attached to the autopilot. Wait for its
+        # first heartbeat.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_bound.wait()
@@ -252,8 +252,8 @@ class CameraLink(CameraOrders):
 
     def _is_from_this_camera(self, message: Any) -> bool:
         """Return True if a message of the component is about this camera. An autopilot may have several cameras."""
-        # Each message type has only one or two of these fields, and a firmware may leave them at 0. If all are 0, the
-        # message is from the first camera.
+        # Each message type has only one or two of the fields below, and a firmware may leave them at 0. If all are 0,
+        # the message is from the first camera.
         if not self.is_autopilot_attached:
             return True
         number_from_1 = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)

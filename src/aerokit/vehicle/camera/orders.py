@@ -255,7 +255,7 @@ class _PolledCell:
         # Set by the camera's answer to the last request; see UNSUPPORTED and MAYBE_UNSUPPORTED.
         self.is_refused = False
         self.is_doubtful = False
-        cell._feed_from(self)  # From now on, the state value calls `pending` and `watchers_changed`.
+        cell._feed_from(self)  # From now on, the state value uses this object as its `Feed`.
 
     @property
     def pending(self) -> bool:

@@ -26,8 +26,8 @@ TRIGGER, TRIGGER_INTERVAL = MavCmd.DO_TRIGGER_CONTROL, MavCmd.DO_SET_CAM_TRIGG_I
 UNCHANGED = -1  # leaves the shutter time, or the sequence number of the trigger, as it is
 # Seconds without a capture after which the status of a series is requested, and seconds to wait for the status.
 CHECK_INTERVAL_S, STATUS_TIMEOUT_S = 1.0, 2.0
-# Number of status requests before an order: the first number for a camera that has answered such a request before, the
-# second for all others.
+# Maximum number of status requests before an order. FIRST_STATUS_ATTEMPTS is for a camera that has not sent its status
+# yet.
 STATUS_ATTEMPTS, FIRST_STATUS_ATTEMPTS = 8, 3
 # A series has failed if this many successive status checks have shown no new capture.
 MAX_SILENT_CHECKS = 6
@@ -134,8 +134,8 @@ class Shutter:
         """
         if not is_repeated:
             pictures = 0 if before is None else before.image_count
-            # The number must also be above the number of pictures, because an earlier program may have used the numbers
-            # up to there.
+            # An earlier program may have ordered the existing pictures with sequence numbers up to the image count, so
+            # the new sequence number must be above it.
             self._sequence_number = max(pictures + 1, self._sequence_number + 1)
         try:
             if self.link.is_trigger:
@@ -157,7 +157,7 @@ class Shutter:
 
     async def _send_digicam_control(self) -> None:
         """Send the older command, for PX4's trigger and for cameras without MAV_CMD_IMAGE_START_CAPTURE."""
-        unchanged, take_photo = (0, 0, 0, 0), 1  # param1 to param4: session, zoom and focus; param5: the shutter
+        unchanged, take_photo = (0, 0, 0, 0), 1  # session, zoom and focus in param1 to param4, the shutter in param5
         await self.link.command(MavCmd.DO_DIGICAM_CONTROL, *unchanged, take_photo, 0, 0, attempts=1)
 
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
@@ -206,8 +206,8 @@ class PhotoInterval:
 
     def __init__(self, shutter: Shutter, seconds: float, count: int) -> None:
         self._shutter = shutter
-        self._seconds = seconds
-        self._count = count
+        self._seconds = seconds  # interval between two pictures
+        self._count = count  # number of ordered pictures; 0 for a series without an end
         self._link = shutter.link
         self._log = shutter.log
         self._new_captures = CaptureQueue(self._log.cell)
@@ -228,7 +228,7 @@ class PhotoInterval:
         # Received captures that were not delivered yet: the successful ones by index, and the failed ones.
         self._waiting: dict[int, Capture] = {}
         self._failed: list[Capture] = []
-        # Numbers of captures that the iterator has returned, and that could not be received.
+        # How many captures the iterator has returned, and how many could not be received.
         self._delivered = 0
         self._missed = 0
         self._operation: ActiveOperation | None = None
@@ -268,7 +268,7 @@ class PhotoInterval:
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Stop the series, unless the camera has ended it by itself after the requested number of pictures."""
         self._new_captures.__exit__()
-        # PX4's trigger does not know the requested number.
+        # PX4's trigger does not know the requested number, so it never ends the series by itself.
         has_ended = 0 < self._count <= self._delivered and not self._link.is_trigger
         if self._operation is not None and has_ended:
             self._operation.discard()
@@ -302,7 +302,7 @@ class PhotoInterval:
             if self._waiting and self._next_index is not None:
                 await self._fetch_missing()
                 continue
-            patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # longer than the interval
+            patience_s = max(2.0 * self._seconds, CHECK_INTERVAL_S) + CHECK_INTERVAL_S  # A picture may be late.
             has_arrived = await self._new_captures.wait(patience_s)
             if has_arrived:
                 silent_checks = 0

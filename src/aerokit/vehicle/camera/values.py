@@ -181,7 +181,7 @@ class ThermalRange(Snapshot):
     min_at: tuple[float, float] | None
 
 
-# A position closer to 0, 0 than this means that the vehicle did not know its position.
+# If a position is closer than this to 0°N 0°E in both coordinates, the vehicle did not know its position.
 MIN_COORDINATE_DEG = 0.01
 
 # Values of CAMERA_CAPTURE_STATUS.image_status while a picture is being taken, and while a series runs.

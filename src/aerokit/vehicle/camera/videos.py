@@ -229,7 +229,7 @@ class VideoMixin(CameraMixin):
             await self._link.command(*command, order=order)
 
     def _on_stream(self, message: m.VideoStreamInformation) -> None:
-        if message.stream_id or message.uri:  # ArduPilot also sends an empty message.
+        if message.stream_id or message.uri:  # ArduPilot also sends an empty message without a stream.
             stream = stream_of(message)
             self._streams[stream.number] = stream
             self._publish_streams(message)

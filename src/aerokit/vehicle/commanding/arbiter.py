@@ -77,7 +77,7 @@ class CommandArbiter:
         # The newest order about each topic, even if it was withdrawn or has ended.
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()
-        # The modes that the program ordered last: the time of the order, and the number of the mode.
+        # Time of the order and number of the mode, for the modes that the program ordered last.
         self._ordered_modes: deque[tuple[float, int]] = deque(maxlen=16)
         self._steering_callbacks: list[Callable[[], None]] = []
         telemetry.mode.observe(self._on_mode, every_arrival=True)
@@ -136,7 +136,7 @@ class CommandArbiter:
         self._register(order, (*subjects, STEERING, ACTION))
         self._ordered_since_disarmed.update(subjects)
         self.newest = order
-        self._orders = [order]  # The order has ended all other actions, which need no more reports of the vehicle.
+        self._orders = [order]  # The order has ended all other actions, so they need no more reports of the vehicle.
         return order
 
     def raw_order(self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
@@ -161,8 +161,7 @@ class CommandArbiter:
         for order in (*self._orders, *self._posted):
             order.on_reboot()
         self._ordered_since_disarmed.clear()
-        # No order was given after this time (infinity), so `current` ignores all orders from before the reboot until
-        # the vehicle arms again.
+        # Infinity makes `current` ignore all orders from before the reboot until the vehicle arms again.
         self._armed_by_program = None
         self._armed_at = math.inf
 
@@ -268,7 +267,7 @@ class CommandArbiter:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm if a newer command does so; ``armed`` is None for any other command."""
+        """End earlier orders to arm or disarm if a newer command does either; ``armed`` is None if it does neither."""
         if armed is None:
             return
         self.arming_orders += 1

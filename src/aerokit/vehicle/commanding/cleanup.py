@@ -103,7 +103,7 @@ MAX_HOLD_ATTEMPTS = 3
 # many times.
 HOLD_ACK_TIMEOUT_S, MAX_HOLD_RESENDS = 0.5, 10
 
-# NaN means the present position: the vehicle brakes, and does not fly back to a point that it has passed.
+# NaN means the present position, so the vehicle brakes and does not fly back to a point that it has passed.
 STOP_HERE = (MavCmd.DO_REPOSITION, -1, MavDoRepositionFlags.CHANGE_MODE, 0, *(math.nan,) * 4)
 
 

@@ -41,8 +41,8 @@ __all__ = ["Guided", "SetpointStream"]
 
 SetpointT = TypeVar("SetpointT")
 
-# Some autopilots restart their path at each position set-point, so they get each set-point rarely: at first this many
-# times at the stream's rate, because one may be lost, and then at this interval.
+# Some autopilots restart their path at each position set-point. A new set-point is sent this many times at the stream's
+# rate, because one may be lost, and then only at this interval in seconds.
 INITIAL_REPEATS, REPEAT_INTERVAL_S = 3, 5.0
 
 # Set-points that the autopilot executes with its own limits of acceleration. With these, a sudden stop is an impact.
@@ -225,8 +225,8 @@ class SetpointStream(SteeringStream[SetpointT]):
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
-        # For autopilots that restart their path: how often a new set-point is still sent at the stream's rate, and when
-        # it was sent last.
+        # How often the set-point is still sent at the stream's rate, and when it was last sent. Both matter only for
+        # autopilots that restart their path.
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)

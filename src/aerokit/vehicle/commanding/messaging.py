@@ -120,7 +120,7 @@ class _StreamMonitor:
     """Tracks whether streamed messages arrive, and sets ``must_request`` when the vehicle may have lost the request."""
 
     def __init__(self, session: VehicleSession, cleanup: ExitStack) -> None:
-        # Both are reset by each request.
+        # Each request resets the two attributes.
         self.has_received = False
         self.must_request = asyncio.Event()
         self._system_id = session.system_id

@@ -187,7 +187,7 @@ class Order:
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
-        # Sets of modes, by their numbers in HEARTBEAT.custom_mode. The class describes the kinds of modes.
+        # Sets of modes, by their numbers in HEARTBEAT.custom_mode. The docstring of the class describes the kinds.
         self._own_modes = {mode.custom_mode for mode in modes}
         self._expected_modes = set(expected)
         self._modes_before = set() if mode_before is None else {mode_before.custom_mode} - self._expected_modes
@@ -328,7 +328,7 @@ class SentCommand:
         self._armed_now = armed_now
         self.arms = armed
         """True if the command arms the vehicle, False if it disarms it, None if it does neither."""
-        # True once a newer command of the program disarms what this one arms, or the reverse.
+        # True once this command arms and a newer command of the program disarms, or the reverse.
         self._is_overruled = False
         self._is_done = is_done
         self._slept_s = slept_s
@@ -344,7 +344,7 @@ class SentCommand:
         """Reason why the command is not sent again, as a clause for error texts; empty while it may be sent again."""
         if self.is_confirmed:
             return "its effect was reported"
-        if self._slept_s() > 0:  # Hours may have passed since the transmission.
+        if self._slept_s() > 0:  # Hours may have passed since the last transmission.
             return "the computer slept"
         return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
 

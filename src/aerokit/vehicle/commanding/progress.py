@@ -235,7 +235,7 @@ class VehiclePosition:
 
     def __init__(self, session: VehicleSession) -> None:
         self._telemetry, self._autopilot = session.telemetry, session.autopilot
-        # Radius that the vehicle was ordered to circle with; 0 if there is none.
+        # Radius of the circle that the vehicle was ordered to fly; 0 if it was not ordered to circle.
         self._circle_m = 0.0
         session.telemetry.mode.observe(lambda *_: self.record_circle(0.0))
 

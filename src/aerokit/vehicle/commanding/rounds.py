@@ -139,7 +139,7 @@ class RoundFlight:
             refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
             refusal = next(refusals, "")
             if refusal:
-                self._circle_problem = refusal  # so that `fly_by_command` orders the vehicle to hold
+                self._circle_problem = refusal  # `fly_by_command` then orders the vehicle to hold.
             if reason := mode_failure() or refusal:
                 return reason
             if session.connection.now() <= started + CIRCLE_REPORT_S:  # PX4 may still report the previous circle.
@@ -261,7 +261,7 @@ class RoundFlight:
                     raise OperationTimeout(
                         f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
                     )
-                await self._supply(stream, flight.advance(0.0))  # the set-point at the end, once more
+                await self._supply(stream, flight.advance(0.0))  # Send the set-point at the end once more.
 
     async def _supply(self, stream: SetpointStream[TrajectorySetpoint], setpoint: TrajectorySetpoint) -> None:
         stream.set(setpoint)

@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 __all__ = ["StickInput", "StickStream"]
 
-# Value of an axis without a position: ArduPilot releases the channel of this axis (GCS_Common.cpp, manual_override).
+# Value of an axis without a position. ArduPilot releases the channel of the axis (GCS_Common.cpp, manual_override).
 NO_VALUE = 0x7FFF
-# Values of RC_CHANNELS_OVERRIDE: release a channel (1 to 8), release a channel (9 to 18), leave it unchanged.
+# Values of RC_CHANNELS_OVERRIDE that release channels 1 to 8, release channels 9 to 18, or leave a channel unchanged.
 RELEASED, RELEASED_UPPER, UNCHANGED = 0, 0xFFFE, 0xFFFF
 # Channels that MANUAL_CONTROL overrides on ArduSub, from 1 (joystick.cpp).
 SUB_CHANNELS = 11
 MAX_BUTTONS = 0xFFFF
 
-# Values of PX4's COM_RC_IN_MODE that ignore MAVLink (ManualControlSelector.cpp).
+# Values of COM_RC_IN_MODE with which PX4 ignores stick positions sent by MAVLink (ManualControlSelector.cpp).
 RC_ONLY, DISABLED = 0, 4
-# Bit of ArduPilot's RC_OPTIONS: ignore overrides (RC_Channels.h).
+# Bit of RC_OPTIONS with which ArduPilot ignores overrides (RC_Channels.h).
 IGNORE_OVERRIDES = 1 << 1
 
 
@@ -133,7 +133,7 @@ class StickStream(SteeringStream[StickInput]):
             return
         values = await known_values(self._probe, "MAV_GCS_SYSID", "SYSID_MYGCS", "RC_OVERRIDE_TIME", "RC_OPTIONS")
         own_id = self._session.connection.source_system
-        # Older versions of ArduPilot call MAV_GCS_SYSID SYSID_MYGCS.
+        # Older versions of ArduPilot have SYSID_MYGCS instead of MAV_GCS_SYSID.
         ground_station = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS", own_id))
         if ground_station != own_id:
             raise OperationRejected(

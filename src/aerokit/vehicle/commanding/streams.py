@@ -90,7 +90,7 @@ class ValueStream(Generic[ValueT]):
         self._has_raised_stop = False
         self._was_entered = False
         self._is_changing_mode = False
-        self._began_sending_at = math.inf
+        self._began_sending_at = math.inf  # infinite before anything is sent
 
     @property
     def is_running(self) -> bool:

@@ -326,7 +326,7 @@ class TravelActions(VehicleBase):
         home = self.telemetry.home
         with self._arbiter.auxiliary_order() as order:
             if place is None:
-                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1: the present position
+                await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1 means the present position.
             else:
                 # The command takes altitudes above mean sea level only.
                 amsl_place = point_at(place).replace(altitude_relative_m=None)

@@ -120,7 +120,7 @@ class Component(ReadOnly):
     ) -> None:
         self._session = session
         self._sender = sender
-        # Returns the component with an id, of the same vehicle.
+        # Returns the component of this vehicle that has a given id.
         self._component_of = component_of
         self._make_files = files
         self._make_parameters = parameters
@@ -377,7 +377,7 @@ class Components:
     ) -> None:
         self._context = context
         self._session = context.session
-        # Return the autopilot's objects, which the vehicle creates on first use.
+        # These functions return the autopilot's objects, which the vehicle creates on first use.
         self._files = files
         self._parameters = parameters
         self._by_id: dict[int, Component] = {}

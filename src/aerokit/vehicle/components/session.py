@@ -108,7 +108,7 @@ BLOCK_SIZE = 1 << 16
 # Maximum seconds for the download of a whole file from the web.
 WEB_TIMEOUT_S = 60.0
 
-# `socket.SHUT_RDWR` has this value on all platforms. Only `transport` may import `socket`.
+# The value of `socket.SHUT_RDWR` on all platforms. It is repeated here, because only `transport` may import `socket`.
 SHUT_RDWR = 2
 
 

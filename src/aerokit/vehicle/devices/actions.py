@@ -159,7 +159,7 @@ class DeviceActions(VehicleBase):
             CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot make this part fail. If an
                 acknowledgement was lost, the part may have failed.
         """
-        # `checks_arguments` has refused every other intent.
+        # The decorator `checks_arguments` has refused every other intent.
         await INJECT_FAILURE.send(self._context, UNITS[unit], FailureType[kind.upper()], instance)
 
 

@@ -286,7 +286,7 @@ class Actuators(ReadOnly):
             CommandTimeout: there was no acknowledgement.
             OperationTimeout: no status text reported the release.
         """
-        # `checks_arguments` has refused every other intent.
+        # The decorator `checks_arguments` has refused every other intent.
         await PARACHUTE.send_until_text(
             self._context,
             ParachuteAction.RELEASE,

@@ -53,7 +53,8 @@ class Gripper(ReadOnly):
         """Send the command, and wait until the autopilot reports the end of the movement."""
         context, topic = self._context, ("gripper", self._number)
         order = SimpleOrder(f"gripper {action.name.lower()}", MavCmd.DO_GRIPPER, (NUMBER, action))
-        if not context.session.autopilot.reports_gripper_by_text:  # The acknowledgement reports the end.
+        if not context.session.autopilot.reports_gripper_by_text:
+            # The acknowledgement reports the end of the movement.
             await order.send(context, self._number, topic=topic)
             return
 

@@ -26,7 +26,7 @@ UNKNOWN_VECTOR: Vector = (NAN, NAN, NAN)
 POSITION_DIAGONAL, ORIENTATION_DIAGONAL, TRIANGLE_SIZE = (0, 6, 11), (15, 18, 20), 21
 MAX_SECTORS, UNKNOWN_DISTANCE, UNKNOWN_OBSTACLE_ID = 72, 0xFFFF, 0xFFFF
 MAX_CENTIMETRES = 0xFFFE
-# GPS time began on 1980-01-06 and is 18 leap seconds ahead of UTC since 2017.
+# GPS time began on 1980-01-06 and has been 18 leap seconds ahead of UTC since 2017.
 GPS_EPOCH_S, LEAP_SECONDS, SECONDS_PER_WEEK = 315_964_800, 18, 604_800
 GPS_NUMBERS = ("hdop", "vdop", "horizontal_accuracy_m", "vertical_accuracy_m", "speed_accuracy_m_s", "yaw_deg")
 # Maps each direction to its MAV_SENSOR_ORIENTATION.

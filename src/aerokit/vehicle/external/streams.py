@@ -28,7 +28,8 @@ __all__ = ["EstimatorUse", "MeasurementStream", "MeasurementT"]
 MeasurementT = TypeVar("MeasurementT")
 EstimatorUse: TypeAlias = Literal["used", "not used", "unknown"]
 
-# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS: the estimator does not know the position, and assumes a constant one.
+# Flag of EKF_STATUS_REPORT and ESTIMATOR_STATUS that is set while the estimator does not know the position, and assumes
+# a constant one.
 CONSTANT_POSITION = 1 << 7
 # A report of the estimator that is older than this many seconds does not show its present state.
 ESTIMATOR_MAX_AGE_S = 2.5
@@ -114,7 +115,7 @@ class MeasurementStream(Generic[MeasurementT]):
         self._waiting: tuple[tuple[Message, ...], float] | None = None
         # Calls `_flush` at the end of the period, if a measurement waits.
         self._timer: asyncio.TimerHandle | None = None
-        # End of the present period: the next measurement is sent then at the earliest.
+        # End of the present period. The next measurement is sent at this time at the earliest.
         self._next_at = -math.inf
         self._is_open = False
         self._was_entered = False

@@ -144,7 +144,7 @@ class Files:
                     entry = _parse_entry(text)
                     if entry is not None:
                         entries[entry.name] = entry
-                # A reply is empty if the next name is too long for a message. This entry is skipped.
+                # A reply is empty if the name of the next entry is too long for a message. That entry is skipped.
                 offset += max(len(listed), 1)
                 replies_without_new_entry += 1
                 if len(entries) > count_before:

@@ -46,7 +46,7 @@ class UlogAssembler:
         self._has_header = False
         # False after a gap, until the beginning of a ULog message is received.
         self._is_aligned = False
-        # Data from the beginning of a ULog message on that is not complete yet.
+        # The received part of a ULog message that is not complete yet.
         self._buffer = bytearray()
         # Time of the last message that was used, to compute the duration of a gap.
         self._received_at = 0.0
@@ -54,7 +54,7 @@ class UlogAssembler:
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
         """Add a message of the stream; return the next data of the file, up to the last complete ULog message."""
         gap = 0 if self._next_sequence is None else (message.sequence - self._next_sequence) % SEQUENCE_RANGE
-        if gap >= SEQUENCE_RANGE // 2:  # PX4 repeats an earlier message, whose acknowledgement was lost.
+        if gap >= SEQUENCE_RANGE // 2:  # PX4 repeats a message if our acknowledgement was lost.
             return b""
         data = bytes(message.data[: message.length])
         prefix = b""  # the header of the file, or a ULog message that marks a gap
@@ -149,8 +149,8 @@ class LogStream(ReadOnly):
         is_stopped = False
         try:
             if error is None:
-                # `_close` ends the acknowledgements, so STOP is sent before. PX4 answers STOP only after its last log
-                # message was acknowledged (logger.cpp).
+                # PX4 answers STOP only after its last log message was acknowledged (logger.cpp), so send STOP before
+                # `_close` ends the acknowledgements.
                 await STOP.send(self._context)
                 is_stopped = True
         finally:

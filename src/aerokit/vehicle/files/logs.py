@@ -160,8 +160,8 @@ class Logs:
             growth.log_growth()
             return
         part = PartFile(to, _part_suffix(entry))
-        # The time of the log is part of the file name's suffix. If the time is unknown, the part file may be of another
-        # flight, so it must not be continued.
+        # The time of the log is part of the file name's suffix. If the time is unknown, the part file may belong to
+        # another flight, so it must not be continued.
         has_time = entry.time_utc is not None
         start = part.size if resume and has_time and part.size <= entry.size else 0
         with part.writing(start) as disk:
@@ -238,7 +238,7 @@ class Logs:
     ) -> tuple[str | None, LogEntry]:
         """Return the path of a log for MAVFTP, and the entry of the log.
 
-        If the path is None, download the log by LOG_* messages. The entry is then up to date, as they require.
+        If the path is None, download the log by LOG_* messages. The entry, which they require, is then up to date.
         """
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
@@ -300,7 +300,7 @@ class Logs:
                 logs = await request_list(idle_timeout_s, only_id, max_unanswered=MAX_UNANSWERED_REQUESTS)
             except FileTimeout:
                 logs = await listed_logs(self._files, autopilot.log_directories, idle_timeout_s)
-                max_unanswered = None  # If `logs` is None, the vehicle has logs and must answer.
+                max_unanswered = None  # If `logs` is None, there are logs but no list file, so PX4 must answer.
         if logs is None:
             logs = await request_list(idle_timeout_s, only_id, max_unanswered=max_unanswered)
         return tuple(_entry_of(log) for log in logs if log.size)

@@ -167,13 +167,13 @@ class GimbalControl:
         self._is_primary = is_primary
         # The gimbal, once the manager has confirmed our control.
         self._device: GimbalDevice | None = None
-        self._control_request = ControlRequest(0, 0, is_primary=is_primary)  # replaced on entry
-        # The error that describes the loss of control; None while it was not lost.
+        self._control_request = ControlRequest(0, 0, is_primary=is_primary)  # `__aenter__` replaces it.
+        # The error that describes the loss of control; None until control is lost.
         self._taken: GimbalTaken | None = None
         self._was_loss_raised = False
         self._was_entered = False
         self._is_ended = False
-        # Ends the waits of `until_lost`: set when control is lost, and when the block or the connection ends.
+        # Set when control is lost, or when the block or the connection ends. `until_lost` waits for it.
         self._lost = asyncio.Event()
         self._detach_callbacks: list[Callable[[], None]] = []
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
 
-# MAVLink has component ids for seven gimbals; the limit protects against corrupt ids.
+# MAVLink has component ids for six gimbals. The limit protects against corrupt ids.
 MAX_GIMBALS = 32
 GIMBAL_COMPONENT_IDS = frozenset((154, *range(171, 176)))
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)

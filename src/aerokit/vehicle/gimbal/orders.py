@@ -29,10 +29,10 @@ NAN = math.nan
 PITCHYAW, CONFIGURE = MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.DO_GIMBAL_MANAGER_CONFIGURE
 MOUNT = MavCmd.DO_MOUNT_CONTROL
 
-# Roll and pitch relative to the horizon, yaw relative to the nose of the vehicle.
+# With these flags, roll and pitch are relative to the horizon, and yaw is relative to the vehicle's nose.
 LEVEL = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
 
-# Roll and pitch relative to the horizon, yaw relative to north.
+# With these flags, roll and pitch are relative to the horizon, and yaw is relative to north.
 LOCKED = LEVEL | GimbalManagerFlags.YAW_LOCK
 
 # Ids with a special meaning in MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE.

@@ -369,7 +369,7 @@ class PointingMixin(GimbalMixin):
             await wait_until_reached(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
-        """Raise InvalidArgument for an angle beyond the gimbal's limits. ``yaw`` is from the nose; None: from north."""
+        """Raise InvalidArgument for an angle beyond the limits. ``yaw`` is from the nose; None accepts any yaw."""
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
             return  # The program has not requested the limits by `information()`.

@@ -62,10 +62,10 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         _check_rates(*first_rates)
         self._orders = orders
         self._flags = int(LOCKED if is_from_north else LEVEL)
-        # Time at which the manager accepted the first rates. Its silence counts from then on.
+        # Time at which the manager accepted the first rates. The manager's silence is counted from then on.
         self._began_at = -math.inf
         self._order: Order | None = None
-        # The error that describes the loss of control; None while it was not lost.
+        # The error that describes the loss of control; None until control is lost.
         self._taken: AerokitError | None = None
         # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another gimbal.
         self._in_use = ExitStack()
@@ -119,7 +119,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if reason:
             self._stop(reason, hold=False)
         if self._stop_error is None:
-            zero = self._zero_rates_command()  # for this gimbal; after `_end`, another gimbal may be the first one
+            # Create the command before `_end`, after which another gimbal may be the first one.
+            zero = self._zero_rates_command()
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")
             if error is None:
@@ -130,7 +131,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             raise self._stop_error
 
     def _send(self) -> None:
-        self._session.connection.send(self._encode_rates(self._value))  # Encoded again: the manager may have changed.
+        self._session.connection.send(self._encode_rates(self._value))  # The message depends on the present manager.
 
     def _encode_rates(self, rates: tuple[float, float]) -> Message:
         """Return the message for these rates (pitch, yaw) that the manager supports."""

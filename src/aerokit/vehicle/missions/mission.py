@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# The last items of missions that end with a landing, and what the mode is for in which the vehicle may then land.
+# Maps each last item with which a mission ends by landing to the purpose of the mode in which the vehicle may land.
 LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: "return",
     MavCmd.NAV_LAND: "land",
@@ -75,7 +75,7 @@ class MissionEndDetector:
         self._is_last_item_landing = last_command in LANDING_PURPOSES
         self._ends_in_air = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
-        # Modes in which the vehicle may land: the mode of the last item if it is a landing or return, otherwise all.
+        # Modes in which the vehicle may land. If the last item is a landing or a return, only its mode counts.
         self._landing_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for command, purpose in LANDING_PURPOSES.items()
@@ -120,7 +120,7 @@ class MissionEndDetector:
     def _has_stayed_complete(self) -> bool:
         """Return True if the mission has been complete for ``END_GRACE_S``.
 
-        PX4 reports completion when a return or a landing begins. HEARTBEAT may report the mode of it a little later.
+        PX4 reports completion when a return or a landing begins. HEARTBEAT may report the new mode a little later.
         """
         now = self._session.connection.now()
         if self._completed_at is None:
@@ -385,7 +385,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._tracker.on_transfer_count(count)
 
     def _check_item(self, item: int) -> None:
-        """Raise InvalidArgument unless the mission has this item. If their number is unknown, accept all."""
+        """Raise InvalidArgument unless the mission has this item. If the number of items is unknown, accept any."""
         count = self._tracker.count.latest
         last = MAX_ITEM if count is None else count - 1
         if count == 0:
@@ -451,8 +451,8 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             with vehicle_context.arbiter.changing_mode():
                 await vehicle_context.sender.send_long(order, MavCmd.MISSION_START, modes=(mode,))
-                # No refusals are watched here. Only PX4 refuses a command that it has accepted before, and PX4 does not
-                # get MISSION_START.
+                # No refusals are watched here, because only PX4 refuses a command after it has accepted it, and PX4
+                # does not get MISSION_START.
                 await vehicle_context.sender.await_mode(
                     mode, order, refusals=[], timeout=timeout, reported_since=order.given_at
                 )

@@ -166,8 +166,9 @@ class PlanChannel:
             message = f"{error}{self._describe_items_on_vehicle(exchange, refused_item=error.item)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
+            # Change only the text, so that the error keeps its attribute `missing`.
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
-            raise  # This error also has `missing`, so only its text was changed.
+            raise
         finally:
             if not exchange.done and connection.is_open:
                 for cancellation in exchange.cancellation():

@@ -153,7 +153,7 @@ def warn_of_rename(renamed: Renamed) -> None:
     """Issue the warning, attributed to the line of the program that called aerokit."""
     from aerokit.parameters.renames import ParameterRenamedWarning
 
-    # Frame 1 is the caller of this function, and so is `stacklevel` 2.
+    # Frame 1 and `stacklevel` 2 both stand for the caller of this function.
     frame, stack_level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("aerokit."):
         frame = frame.f_back

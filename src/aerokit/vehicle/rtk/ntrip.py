@@ -174,7 +174,7 @@ class NtripClient:
         self._send = send
         self._caster = caster
         self._timeout = timeout
-        # None until the caster's source table was read.
+        # None if the caster's source table decides and was not read yet.
         self._sends_position = send_position
         self._name = f"NTRIP {caster!r}"
         # Ends the background task; `_ended` is set when the task has ended.
@@ -183,8 +183,8 @@ class NtripClient:
         self._was_entered = False
         # The open connection to the caster; None while there is none.
         self._writer: asyncio.StreamWriter | None = None
-        self._problem = ""
-        self._oversized = 0
+        self._problem = ""  # the last problem, as a text for the user
+        self._oversized = 0  # number of messages that are too long to be sent
         self._reconnects = 0
 
     @property

@@ -57,7 +57,7 @@ def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
     for piece in pieces:
         connection.send(piece)
     sent.sequence += 1
-    # Remove the message first: the dictionary then has the newest message last, so that the oldest can be dropped.
+    # Remove an equal message first, so that the dictionary has the newest message last and the oldest can be dropped.
     sent.recent.pop(message, None)
     sent.recent[message] = (now, {id(sender)})
     if len(sent.recent) > MAX_RECENT:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 UNSUPPORTED_RESULTS = (MavResult.UNSUPPORTED, MavResult.COMMAND_LONG_ONLY, MavResult.COMMAND_UNSUPPORTED_MAV_FRAME)
 """Results of a command that the firmware does not support: not at all, or not in this message or frame."""
-# A command is repeated after this many measured round trips at the earliest: before that, its ack may still arrive.
+# A command is repeated after this many measured round trips at the earliest, because its ack may arrive until then.
 MIN_ROUND_TRIPS = 2
 MAX_ATTEMPT_TIMEOUT_S = 5.0
 PENDING_ACK_TIMEOUT_S = 2.0
@@ -60,7 +60,7 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # Acks of earlier commands that may still arrive: one entry for each ack, the time at which it was recorded.
+        # Acks of earlier commands that may still arrive, as the times at which they were recorded.
         self._pending_acks: dict[_Key, list[float]] = {}
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}
@@ -258,7 +258,7 @@ class CommandSender:
     def _expect_acks(self, key: _Key, count: int, earlier_acks: Sequence[float] = ()) -> None:
         """Record acks that may still arrive, so that the next command with this key ignores them.
 
-        These are ``earlier_acks``, which were recorded before, and ``count`` acks that are recorded now.
+        The acks are ``earlier_acks``, which have been recorded before, and ``count`` new ones.
         """
         new_acks = [self._connection.now()] * count
         if earlier_acks or new_acks:

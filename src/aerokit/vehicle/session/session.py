@@ -177,7 +177,8 @@ class VehicleSession:
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
         """Process the first heartbeat, request streams and constants, and start the background tasks."""
         self.telemetry.receive(heartbeat)
-        # A message with a default rate may be missing. A message that the program has named is reported if it is.
+        # A message with a default rate may be missing. If a message that the program has named is missing, it is
+        # reported.
         are_default = rates is None
         requested_rates = self.telemetry.default_rates if rates is None else rates
         for message_type, hz in requested_rates.items():

@@ -63,7 +63,7 @@ def _message(session: VehicleSession, signing: Signing | None) -> SetupSigning:
     if signing is None:
         return SetupSigning(session.system_id, session.component_id, NO_KEY, initial_timestamp=0)
     # The vehicle counts its time stamps from this `timestamp` on. The time stamp is a second ahead of our clock, so
-    # that the vehicle's next frames are later than those already received: frames that are not later are refused as
-    # replayed.
+    # that the vehicle's next frames are later than those already received. Frames that are not later would be
+    # refused as replayed.
     timestamp = signing.timestamp_now(session.connection.unix_time()) + TIMESTAMP_TICKS_PER_S
     return SetupSigning(session.system_id, session.component_id, signing.key.secret, timestamp)

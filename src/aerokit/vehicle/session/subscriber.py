@@ -114,7 +114,7 @@ class ComponentSubscriber:
         if rate_hz is not None:
             release_previous = self._rate_releases.pop(message_type, None)
             self._rate_releases[message_type] = self._rates.request(message_type, rate_hz)
-            # The new request comes first: a message without any request returns to the autopilot's own rate.
+            # Request the new rate first, because a message without any request returns to the autopilot's own rate.
             if release_previous is not None:
                 release_previous()
         return cell

@@ -77,13 +77,13 @@ class VehicleWatch:
         self._has_ended = False
         self.reboots: int = 0
         """Number of reboots detected."""
-        # For each clock of the vehicle: its last reported time in milliseconds, and when the report was processed.
+        # Maps each clock of the vehicle to its last reported time in milliseconds, and when the report was processed.
         self._last_times: dict[str, tuple[int, float]] = {}
         # The first ``time_boot_ms`` after a boot, and when its message was processed.
         self._first_time: tuple[int, float] | None = None
         # By this clock, the connection recognises a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
-        # For each clock: a decreased time and when it was processed. Later messages may confirm that it shows a reboot.
+        # Maps each clock to a decreased time and when it was processed. Later messages may confirm a reboot.
         self._decreased_times: dict[str, tuple[int, float]] = {}
         self._expects_reboot = False
         # Our time when the last answer to a TIMESYNC request was processed, and the vehicle's time in it (ms).
@@ -176,7 +176,7 @@ class VehicleWatch:
         if frame is None or frame.component_id != self._component_id:
             return
         now = self._connection.now()
-        silent_for_s = self.silent_for_s  # It restarts at 0 with the next line.
+        silent_for_s = self.silent_for_s  # Read it before the next line resets it to 0.
         self._heartbeat_read_at = now
         self.last_heartbeat_at = frame.received_at
         self._state_tracker.record_activity(now)
@@ -225,7 +225,7 @@ class VehicleWatch:
         """Return True if the vehicle has counted on from the decreased time for ``REBOOT_CONFIRM_S`` seconds."""
         now = self._connection.now()
         decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
-        if milliseconds < decreased_ms:  # The time has decreased further: the confirmation starts again.
+        if milliseconds < decreased_ms:  # The time has decreased further, so the confirmation starts again.
             self._decreased_times[clock] = (milliseconds, now)
             return False
         return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
@@ -272,7 +272,7 @@ class LinkWatch:
         self._system_id = system_id
         self._component_id = component_id
         self._on_report = on_report
-        # Called with each answer: our time of the request, and the vehicle's time in milliseconds.
+        # Called for each answer with our time of the request and the vehicle's time in milliseconds.
         self._on_answer = on_answer
         self._round_trip_s: float | None = None
         # Times of the unanswered TIMESYNC requests in nanoseconds, which identify their answers.

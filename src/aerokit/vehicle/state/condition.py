@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
-# An earlier time, which is before September 2001, shows that the vehicle's clock is not set.
+# A time before this one (September 2001) shows that the vehicle's clock is not set.
 EARLIEST_UNIX_S = 1_000_000_000
 # Flags of EKF_STATUS_REPORT and ESTIMATOR_STATUS, which have the same values.
 ATTITUDE, HORIZONTAL_VELOCITY, RELATIVE_POSITION, ABSOLUTE_POSITION, ALTITUDE = 1, 2, 8, 16, 32

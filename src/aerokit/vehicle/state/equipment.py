@@ -56,8 +56,8 @@ LOOKING_DOWN = 25
 # The fix types from a 3D fix to PPP, the best one (GPS_FIX_TYPE).
 GPS_FIX_TYPE_3D, GPS_FIX_TYPE_PPP = 3, 8
 
-# Largest cell voltage in BATTERY_STATUS, in mV. The total of a pack above 65.5 V is reported as several "cells", whose
-# sum is the total: all of them except the last have this value.
+# Largest cell voltage in BATTERY_STATUS, in mV. The total voltage of a pack above 65.5 V is split into several "cells",
+# of which all except the last have this value.
 FULL_CELL = 0xFFFE
 
 # DISTANCE_SENSOR.signal_quality is 1 if the reading is invalid, and 0 if the quality is unknown.

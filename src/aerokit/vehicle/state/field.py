@@ -160,7 +160,7 @@ def divided(value: int, divisor: int, *, unknown: int) -> float | None:
 
 
 # Even if the program reads no value, a frame is decoded at this interval. An undecoded frame is replaced by the next
-# one, which may lack some of its values: without a fix, for example, the position is missing.
+# one, which may lack some of its values. Without a fix, for example, the position is missing.
 MAX_DECODE_DELAY_S = 5.0
 
 # Number of bytes before the payload in ``Frame.body``.
@@ -214,7 +214,7 @@ class StreamedMessage:
             return
         if self._is_watched or frame.received_at >= self._decode_from:
             self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
-            # The lock keeps a thread that reads from decoding the frame: only the loop's thread may call observers.
+            # Only the loop's thread may call observers, so the lock keeps other threads from decoding the frame.
             with self._lock:
                 if self.pending:
                     self.catch_up()  # Frames that arrived earlier must be applied first.

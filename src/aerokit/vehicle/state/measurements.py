@@ -18,7 +18,7 @@ __all__ = ["ActuatorControls", "AirPressure", "Aircraft", "Altitude", "Imu", "Od
 
 # Conversion factors: thousandths of g to m/s², milligauss to microtesla, hectopascal to pascal, radians to degrees.
 MG_M_S2, MGAUSS_UT, HPA_PA, RAD_DEG = 9.80665e-3, 0.1, 100.0, math.degrees(1)
-# An ALTITUDE.altitude_terrain below this, and a sensor temperature of exactly 0, mean that the value is unknown.
+# ALTITUDE.altitude_terrain is unknown if it is below NO_TERRAIN_M. A temperature of exactly 0 means "unknown".
 NO_TERRAIN_M, UNKNOWN_TEMPERATURE = -1000.0, 0
 MAX_AIRCRAFT = 64
 

@@ -70,7 +70,7 @@ class Telemetry(States):
             name: StateCell(name, clock, field.waits_for(self.autopilot), stamp=self._time_of_arrival)
             for name, field in STATES.items()
         }
-        # Messages are decoded on arrival, and frames when one of their values is read; see `handles` and `streams`.
+        # `_handlers` get decoded messages. `_streams` keep frames, and decode them when a value is read.
         handlers = {name: self._handler(name) for name in (*SOURCES, "AvailableModes")}
         self._handlers = {MESSAGE_IDS[name]: self._receiver(name, handler) for name, handler in handlers.items()}
         self._streams = {MESSAGE_IDS[name]: self._streamed_message(name, handlers[name]) for name in LAZY}
@@ -195,7 +195,7 @@ class Telemetry(States):
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
         """Process a message. Its values get the time at which its frame arrived, which may be long before this call."""
-        # Calls may be nested: a handler may read a cell, and the cell then decodes another message.
+        # Calls may be nested, because a handler may read a cell, which then decodes another message.
         outer_arrived_at = self._arrived_at
         self._arrived_at = None if frame is None else frame.received_at
         try:
@@ -230,6 +230,7 @@ class Telemetry(States):
         """Return the function that updates one cell from one type of message.
 
         A decoder returns None if the message does not have the value. The cell then keeps its previous value.
+        A fallback message updates the cell only if no better message has reported the value recently.
         """
         decode, context = message_source.decode, self._context
         assert decode is not None
