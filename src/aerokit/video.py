@@ -113,7 +113,7 @@ class VideoStream:
         """Address of the stream."""
         self.missed: int = 0
         """Number of frames dropped because the reader was slow."""
-        self._vehicle = vehicle  # source of each frame's position and attitude; None: frames have neither
+        self._vehicle = vehicle  # source of each frame's position and attitude; None if frames have neither
         self._now = asyncio.get_running_loop().time
         self._latest: VideoFrame | None = None  # the frame to read next; None after it was read
         self._is_open = False

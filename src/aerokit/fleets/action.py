@@ -171,7 +171,7 @@ class FleetAction:
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if member.name in self._stopped:  # by the policy, before this task began
+            if member.name in self._stopped:  # The policy stopped the member before this task began.
                 return
             wait_s = delay_s
             while wait_s > START_TOLERANCE_S:
@@ -218,7 +218,7 @@ class FleetAction:
         is_policy_applied = self._policy_trigger is not None or self._is_applying_policy
         if self._is_safe or is_policy_applied or self._context.is_closed:
             return
-        # _apply_policy() refreshes the other members, which may call _record_failure() for them, too.
+        # `_apply_policy` refreshes the other members. This may call `_record_failure` again, for another member.
         self._is_applying_policy = True
         try:
             self._apply_policy(member, error)

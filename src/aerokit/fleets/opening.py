@@ -177,7 +177,7 @@ def _requested_ids(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None, networks: list[str]
 ) -> dict[str, list[int] | None]:
     """Return the requested system ids of each network; None for a network: all that are found."""
-    ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - of a wider type
+    ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - `fromkeys` has a narrower type
     if isinstance(system_ids, Mapping):
         for name, network_ids in system_ids.items():
             if str(name) not in ids:

@@ -45,7 +45,7 @@ import anyio
 
 T = TypeVar("T")
 
-# The selector is polled at least once in this many steps: iterations of the loop or runs of an event source.
+# The selector is polled at least once in this many steps. A step is an iteration of the loop or of an event source.
 _POLL_EVERY = 64
 # With more timers than this, cancelled timers are discarded if they are more than half of the timers.
 _MANY_TIMERS = 100
@@ -162,8 +162,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 if due < earliest_due:
                     earliest_due = due
                     earliest_handle = handle
-            # If a timer is due earlier or at the same instant, stop here: the iteration that runs the timer also runs
-            # the event sources of its instant.
+            # Stop if a timer is due earlier or at the same instant. The iteration that runs the timer also runs the
+            # event sources of its instant.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)

@@ -45,7 +45,7 @@ class Interruption:
             with self._lock:  # `_send_signal` must not send after this block has ended.
                 self._is_allowed = False
             if signal.getsignal(signal.SIGINT) == self._on_signal:
-                # If a signal is pending, signal.signal() first runs the present handler.
+                # signal.signal() first runs `_on_signal` for a pending signal, so the previous handler never gets it.
                 signal.signal(signal.SIGINT, self._previous_handler)
 
     @contextlib.contextmanager

@@ -90,7 +90,7 @@ class RecordedParameters(ParameterProtocolServer):
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
         name = request.param_id
         if name not in self.names:
-            self._refuse(request, index=-1, channel=channel)  # -1: the request has no index
+            self._refuse(request, index=-1, channel=channel)  # -1 because the request has no index
             return
         # If the recording has no successful write of the parameter, the vehicle keeps and answers the present value.
         if name in self._vehicle.recording.settable:
@@ -114,7 +114,7 @@ class RecordedMissions(MissionServer):
         self.requests_int: bool = vehicle.recording.uses_int
         self._received: list[AnyItem] = []  # items of the upload in progress
         self._written: dict[int, tuple[AnyItem, ...]] = {}  # uploaded plans by MAV_MISSION_TYPE
-        # How many recorded results were already sent, by operation and MAV_MISSION_TYPE.
+        # Number of recorded results that were already sent, by operation and MAV_MISSION_TYPE.
         self._result_counts: dict[tuple[str, int], int] = {}
         self.listen()
 

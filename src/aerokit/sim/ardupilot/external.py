@@ -77,7 +77,7 @@ class ArduPilotExternal:
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
             return
         self.latest[type(target)] = target
-        # The offset of the target is relative to the vehicle, and turned with its heading.
+        # The offset of the target is relative to the nose, so it is rotated by the heading.
         north, east, _down = rotated((target.x, target.y, target.z), motion.yaw)
         self._target = (motion.north + north, motion.east + east)
         self._target_at = self._vehicle.now

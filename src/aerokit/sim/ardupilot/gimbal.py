@@ -74,7 +74,7 @@ class ArduPilotGimbal:
         self.is_yaw_locked: bool = False  # True if the pilot's stick controls yaw relative to north.
         self.in_control: tuple[int, int] = (0, 0)  # System id and component id that control the gimbal.
         self._target = MountTarget()
-        self._region: Ned | None = None  # region of interest; None: there is none
+        self._region: Ned | None = None  # region of interest; None if there is none
         self._followed_id = 0  # system id of the followed vehicle
         self._followed_place: Ned | None = None  # None until its position is received
         vehicle.observe(GlobalPositionInt, self._on_global_position)

@@ -225,7 +225,7 @@ class FenceList(ItemList):
     def __init__(self, capacity: int = _STORAGE_BYTES // _BYTES_PER_POINT) -> None:
         super().__init__(capacity)
         self._stored: list[MissionItem] = []
-        # Items of a running upload, None for those that are missing; None without an upload.
+        # Items of the running upload, with None for each missing item. None if no upload is running.
         self._uploaded: list[MissionItem | None] | None = None
 
     @property

@@ -127,8 +127,8 @@ class ArduPilotMissionServer(MissionServer):
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
-        # During an upload, only two messages are not denied here: the base class decides on MISSION_COUNT, and requests
-        # for single items are served.
+        # During an upload, the vehicle serves MISSION_REQUEST and denies all other messages, even MISSION_REQUEST_INT.
+        # The base class decides on MISSION_COUNT.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return Result.DENIED
         return None if kind in self._lists else Result.UNSUPPORTED

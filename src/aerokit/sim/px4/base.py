@@ -285,8 +285,8 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
-        # If the vehicle is already in the requested mode, the request restarts a mission, and in other modes it holds
-        # the current position.
+        # A request for the present mode restarts the mission in MISSION. In all other modes, the vehicle then stays at
+        # its present position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:

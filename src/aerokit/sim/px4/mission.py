@@ -144,7 +144,7 @@ class Px4Mission:
         self._phase = ""  # Phase of the current item: "climb", "go" or "land".
         self._arrived_at = math.nan  # time of arrival at the current item; NaN before
         self._jumps: dict[int, int] = {}  # Number of jumps that each DO_JUMP has done, by its index.
-        self._state = int(MissionState.NO_MISSION)  # MissionState
+        self._state = int(MissionState.NO_MISSION)  # a MISSION_STATE
         self._repeats_left = 0  # how often MISSION_ITEM_REACHED is still repeated
         self._is_report_scheduled = False  # True while a repetition is due
 
@@ -294,7 +294,7 @@ class Px4Mission:
             return
         target = self._place(item)
         north, east, down = target
-        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None: look ahead.
+        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None to look ahead
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(down if item.command in _TAKE_OFFS else None)
         elif item.command in _LANDINGS:
