@@ -96,7 +96,8 @@ class FleetAction:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
-        self._outcomes: dict[str, Any] = {}  # by member name: the returned value, or the error
+        # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
+        self._outcomes: dict[str, Any] = {}
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -104,7 +105,7 @@ class FleetAction:
         # System id and name of the failed member for which the policy was applied; None if it was not applied.
         self._policy_trigger: tuple[int, str] | None = None
         self._policy_order_errors: dict[str, str] = {}
-        self._pending_policy_orders = 0
+        self._pending_policy_orders = 0  # number of policy orders that have not ended
         self._last_start_at = -math.inf  # when the last member started
         self._is_applying_policy = False
         self._finished = asyncio.Event()

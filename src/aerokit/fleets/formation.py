@@ -236,7 +236,7 @@ class Following:
                 while not self._stop_if_leader_lost():
                     stream.set(self._setpoint(member))
                     await anyio.sleep(self._period_s)
-                await asyncio.Event().wait()  # waits to be cancelled, which makes the vehicle hold
+                await asyncio.Event().wait()  # Wait for the cancellation, which makes the vehicle hold.
         finally:
             # Check in the next iteration of the loop, when the action has recorded this follower's failure. The end of
             # the action would be too late, because the action also waits for the policy's orders, such as landing.

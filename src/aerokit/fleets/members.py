@@ -54,7 +54,7 @@ class Member:
         """The member's state in the fleet."""
         self.reason: str = ""
         """The reason for this state; empty in the state ACTIVE."""
-        self._lost_at = 0.0
+        self._lost_at = 0.0  # when the member was lost
         # The vehicle's newest order and its mode at the time of `reclaim`. The member does not count as taken over
         # until one of them changes.
         self._control_when_reclaimed: tuple[object, object] | None = None
@@ -95,7 +95,7 @@ class Member:
             bus.attach_event(VehicleSilent, self._on_silent),
             bus.attach_event(VehicleRecovered, self._on_recovered),
             vehicle.mode.observe(self._refresh_soon),
-            # Observes every HEARTBEAT, because its MAV_STATE may change while mode and arming stay the same.
+            # Observe every HEARTBEAT, because its MAV_STATE may change while mode and arming stay the same.
             vehicle.armed.observe(self._refresh_soon, every_arrival=True),
             vehicle.connection.on_end(self._on_connection_end),
         ]

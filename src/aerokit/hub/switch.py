@@ -127,10 +127,10 @@ class Switch:
             port.counters.dropped["read_only"] += len(frames)
             return
         late = framer.late
-        is_checked = port.gateway is not None
-        if guard is not None and not is_checked:
-            is_checked = guard.is_shared or _HEARTBEAT_ID in map(_message_id, frames)
-        if is_checked:
+        must_check = port.gateway is not None
+        if guard is not None and not must_check:
+            must_check = guard.is_shared or _HEARTBEAT_ID in map(_message_id, frames)
+        if must_check:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
             if port.gateway is not None or len(frames) != received_count:

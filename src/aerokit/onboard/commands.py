@@ -196,6 +196,7 @@ class ComponentCommands:
         task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
+        # The event loop calls `cancel` after this method has returned. The variables below are then set.
         def cancel() -> None:
             """Cancel the handler because its sender or the end of the component requires it."""
             nonlocal is_cancelled

@@ -51,7 +51,7 @@ class ComponentHost:
         self._encoder = None if has_ids_of_connection else FrameEncoder(system_id, component_id)
         self._started_at = connection.now()
         self._detachments: list[Detach] = []
-        self._text_id = 0
+        self._text_id = 0  # id of the last status text that was sent in chunks
         self._is_closed = False
 
     @property

@@ -59,9 +59,9 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
         self._small_names: list[str] = []  # names of the parameters that are not strings, which PARAM_VALUE can carry
-        self._stored: dict[str, Any] = _read_stored(path)
-        self._is_dirty = False
-        self._save_task: asyncio.Task[None] | None = None
+        self._stored: dict[str, Any] = _read_stored(path)  # values that were in the file at the start
+        self._is_dirty = False  # True if the file does not contain the last change
+        self._save_task: asyncio.Task[None] | None = None  # None while the file is not being written
         self._param_server = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
         self._param_ext_server: TypedExtendedServer | None = None
         self._has_camera_settings = False

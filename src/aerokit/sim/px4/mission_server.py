@@ -312,7 +312,8 @@ class Px4MissionServer(MissionServer):
         link = self._link(upload.channel)
         item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
-        item_in_e7 = item  # a MISSION_ITEM has degrees instead of degrees times 1e7
+        item_in_e7 = item
+        # A MISSION_ITEM has latitude and longitude in degrees instead of degrees times 1e7.
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
         stored_item = as_stored(item_in_e7, link.mission_type, is_int=is_int)
