@@ -26,9 +26,9 @@ class Interruption:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._is_allowed = False
-        self._is_sent = False
-        self._is_delivered = False
+        self._is_allowed = False  # True within the block of `allowed`
+        self._is_sent = False  # True once a signal was sent to the main thread
+        self._is_delivered = False  # True once KeyboardInterrupt was raised
         self._previous_handler: Any = signal.default_int_handler
 
     @contextlib.contextmanager

@@ -46,8 +46,8 @@ class RecordedParameters(ParameterProtocolServer):
     def __init__(self, vehicle: RecordedVehicle) -> None:
         super().__init__(vehicle, self, list_rate_hz=_LIST_RATE_HZ)
         self._vehicle = vehicle
-        self._written: dict[str, float] = {}
-        self._recorded: dict[str, list[tuple[float, m.ParamValue]]] = {}
+        self._written: dict[str, float] = {}  # values that clients have set
+        self._recorded: dict[str, list[tuple[float, m.ParamValue]]] = {}  # recorded values with their times, by name
         for time, value in vehicle.recording.parameters:
             self._recorded.setdefault(value.param_id, []).append((time, value))
         values = [value for _, value in vehicle.recording.parameters]
@@ -241,7 +241,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        self._answered_counts: dict[int, int] = {}
+        self._answered_counts: dict[int, int] = {}  # number of answers sent, by `id` of the first candidate
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""
         self.missions: RecordedMissions = RecordedMissions(self)
