@@ -91,7 +91,7 @@ class Formation(Snapshot):
         offsets: dict[str, Offset] = {}
         for index, name in enumerate(names):
             row = index // 2 + 1  # the leader is row 0
-            side = 1 if index % 2 else -1  # 1: right, -1: left
+            side = 1 if index % 2 else -1  # 1 is right, -1 is left
             offsets[name] = Offset(-spacing_m * row, spacing_m * row * side)
         return cls(offsets, frame)
 

@@ -31,8 +31,8 @@ class ArduPilotExternal:
     def reset(self) -> None:
         """Forget all measurements, because of a reboot."""
         self.latest: dict[type[Message], Message] = {}
-        self._navigation_at = self._target_at = -math.inf
-        self._target: tuple[float, float] = (0.0, 0.0)
+        self._navigation_at = self._target_at = -math.inf  # times of the last measurements
+        self._target: tuple[float, float] = (0.0, 0.0)  # (north, east) of the landing target
         # Wind speed in m/s, and the direction in degrees from which the wind comes.
         self.wind: tuple[float, float] | None = None
 

@@ -254,7 +254,7 @@ class ArduPilotGimbal:
             time_boot_ms=self._vehicle.time_boot_ms,
             flags=_device_flags(self),
             q=quaternion_from_euler(roll, pitch, yaw),
-            angular_velocity_x=math.nan,  # NaN: unknown
+            angular_velocity_x=math.nan,  # NaN means unknown.
             angular_velocity_y=math.nan,
             angular_velocity_z=math.nan,
             failure_flags=0,

@@ -148,9 +148,9 @@ class Px4Vehicle(Px4Host):
         self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
         """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL. The motion of the vehicle does not change."""
-        self._touchdown_at = math.nan
-        self._landed_at = math.nan
-        self._has_flown = False
+        self._touchdown_at = math.nan  # NaN while the vehicle does not touch the ground
+        self._landed_at = math.nan  # when the landing was detected; NaN before
+        self._has_flown = False  # True after a take-off, until the vehicle is armed again
         self.flight: Px4Flight = self._make_flight()
         self.mission: Px4Mission = self._make_mission()
         self.failsafes: Px4Failsafes = Px4Failsafes(self)
