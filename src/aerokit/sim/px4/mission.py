@@ -33,7 +33,7 @@ _MAX_FIRST_DISTANCE_M = 10_000.0
 
 
 def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about why a mission cannot be flown, or None. The glide slope of a landing is not checked."""
+    """Return the text with which PX4 rejects a mission; None if it is accepted. Glide slopes are not checked."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
@@ -52,7 +52,7 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about a missing take-off or landing, or None.
+    """Return PX4's text about a missing take-off or landing; None if nothing is missing.
 
     MIS_TKO_LAND_REQ is 0 to require nothing, 1 a take-off, 2 (the default of planes) a landing, 3 both, 4 both or none.
     """
@@ -81,7 +81,7 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about a wrong order of DO_LAND_START, landing and return, or None."""
+    """Return PX4's text about a wrong sequence of DO_LAND_START, landing and return; None if it is right."""
     # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):

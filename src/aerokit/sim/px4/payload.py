@@ -107,7 +107,7 @@ class Px4Gimbal:
         return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Turn to angles (NaN: stay), then turn on at rates. The flag RETRACT is accepted, but has no effect."""
+        """Turn to angles (NaN keeps the present ones), and then at rates. The flag RETRACT has no effect."""
         if flags & Flags.RETRACT:
             return
         current = self.angles()
