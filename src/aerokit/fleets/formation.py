@@ -115,7 +115,7 @@ class Formation(Snapshot):
         return min(distances, default=math.inf)
 
     def _check(self) -> None:
-        # The class is frozen. Copy the offsets, because the caller may change its own dictionary later.
+        # The class is frozen. Copy the offsets, so that the caller can change its own dictionary later.
         object.__setattr__(self, "offsets", dict(self.offsets))
         if self.frame not in ("north", "heading"):
             raise InvalidArgument(f"frame = {self.frame!r} is not allowed: it must be 'north' or 'heading'")

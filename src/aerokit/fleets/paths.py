@@ -87,7 +87,7 @@ class Path(Snapshot):
         return list(pairwise(points))
 
     def _check(self) -> None:
-        # The class is frozen. Copy the points, because the caller may change its own list later.
+        # The class is frozen. Copy the points, so that the caller can change its own list later.
         object.__setattr__(self, "points", tuple(self.points))
         if not self.points:
             raise InvalidArgument(f"points: the path of {self.name} has no points")

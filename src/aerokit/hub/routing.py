@@ -360,7 +360,8 @@ class Router(Generic[PortT]):
             if self._targets.is_order(message_id):  # An autopilot that is received at two ports gets an order once.
                 numbers = {number: None for number in numbers if not self._is_redundant(number)}
         numbers.pop(node.number, None)
-        if message_id in _RADIOS:  # An autopilot would adapt its message rates to the radio of another vehicle.
+        # Any autopilot would adapt its message rates to this radio, even if the radio is not its own.
+        if message_id in _RADIOS:
             numbers = {number: None for number in numbers if not self._has_autopilot(number)}
         outs, rate_limited = [], []
         for number in numbers:

@@ -189,8 +189,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             raise InvalidArgument(
                 f"{name} = {checked:g} is not allowed: it must be {', '.join(map(str, metadata.values))}"
             )
-        # Do not let `problem` check what is checked above (`values`) or allowed to this program (changing read-only
-        # parameters).
+        # Leave out two checks of `problem`. The allowed values were checked above, and this program may change
+        # read-only parameters.
         problem = metadata.replace(read_only=False, values={}).problem(checked)
         if problem is not None:
             raise InvalidArgument(problem)

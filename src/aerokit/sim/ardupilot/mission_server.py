@@ -127,7 +127,7 @@ class ArduPilotMissionServer(MissionServer):
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
-        # During an upload, the vehicle serves MISSION_REQUEST and denies all other messages, even MISSION_REQUEST_INT.
+        # During an upload, all messages are denied except two. MISSION_REQUEST is served, unlike MISSION_REQUEST_INT.
         # The base class decides on MISSION_COUNT.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return Result.DENIED

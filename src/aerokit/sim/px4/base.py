@@ -285,7 +285,7 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
-        # A request for the present mode restarts the mission in MISSION. In all other modes, the vehicle then stays at
+        # A request for the present mode restarts the mission if this mode is MISSION. Otherwise, the vehicle stays at
         # its present position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
