@@ -8,5 +8,5 @@ from aerokit.mavlink import enums
 if TYPE_CHECKING:
     from aerokit.mavlink.enums import *  # noqa: F403
 else:
-    # This module is an alias: a star import would load all enums instead of only those in use.
+    # Make this module an alias. A star import would load all enums, not only those in use.
     sys.modules[__name__] = enums

@@ -8,5 +8,5 @@ from aerokit.mavlink import messages
 if TYPE_CHECKING:
     from aerokit.mavlink.messages import *  # noqa: F403
 else:
-    # This module is an alias: a star import would load all messages instead of only those in use.
+    # Make this module an alias. A star import would load all messages, not only those in use.
     sys.modules[__name__] = messages

@@ -113,7 +113,7 @@ class VideoStream:
         """Address of the stream."""
         self.missed: int = 0
         """Number of frames dropped because the reader was slow."""
-        self._vehicle = vehicle  # source of each frame's position and attitude; None: frames have neither
+        self._vehicle = vehicle  # source of each frame's position and attitude; None if frames have neither
         self._now = asyncio.get_running_loop().time
         self._latest: VideoFrame | None = None  # the frame to read next; None after it was read
         self._is_open = False
@@ -211,7 +211,10 @@ class _Reader(threading.Thread):
             self._call_on_loop(self.ended.set)
 
     def _read(self) -> None:
-        """Pass frames to the event loop until the stream ends or stop() is called. LinkOpenError, or LinkLost later."""
+        """Pass frames to the event loop until the stream ends or stop() is called.
+
+        Raises LinkOpenError if the stream cannot be opened, and LinkLost if it is interrupted later.
+        """
         errors = (self._av.error.FFmpegError, OSError, ValueError, IndexError)
         try:
             container = self._av.open(self._uri, options=self._options, timeout=self._timeouts_s)

@@ -96,7 +96,8 @@ class FleetAction:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
-        self._outcomes: dict[str, Any] = {}  # by member name: the returned value, or the error
+        # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
+        self._outcomes: dict[str, Any] = {}
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -104,7 +105,7 @@ class FleetAction:
         # System id and name of the failed member for which the policy was applied; None if it was not applied.
         self._policy_trigger: tuple[int, str] | None = None
         self._policy_order_errors: dict[str, str] = {}
-        self._pending_policy_orders = 0
+        self._pending_policy_orders = 0  # number of policy orders that have not ended
         self._last_start_at = -math.inf  # when the last member started
         self._is_applying_policy = False
         self._finished = asyncio.Event()
@@ -171,7 +172,7 @@ class FleetAction:
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if member.name in self._stopped:  # by the policy, before this task began
+            if member.name in self._stopped:  # The policy stopped the member before this task began.
                 return
             wait_s = delay_s
             while wait_s > START_TOLERANCE_S:
@@ -218,7 +219,7 @@ class FleetAction:
         is_policy_applied = self._policy_trigger is not None or self._is_applying_policy
         if self._is_safe or is_policy_applied or self._context.is_closed:
             return
-        # _apply_policy() refreshes the other members, which may call _record_failure() for them, too.
+        # `_apply_policy` refreshes the other members. This may call `_record_failure` again, for another member.
         self._is_applying_policy = True
         try:
             self._apply_policy(member, error)

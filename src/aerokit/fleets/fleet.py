@@ -122,7 +122,7 @@ class Fleet(Selection):
         messages = rtcm_messages(rtcm)
         count = 0
         for connection in dict.fromkeys(self._context.networks.values()):
-            # A link on which another sender has just sent the same message does not get it again.
+            # `send_rtcm` leaves out a message that another sender has just sent on the same link.
             count = max(count, sum(send_rtcm(connection, message, self) for message in messages))
         return count
 
@@ -208,7 +208,7 @@ class Fleet(Selection):
         def publish(network: str, event: Event) -> None:
             is_about_link = event.system_id == 0
             name = network if is_about_link else member_names.get((network, event.system_id))
-            if name is not None:  # an event of a vehicle on this network that is not a member has no name
+            if name is not None:  # A vehicle that is not a member has no name, and its events are not passed on.
                 sink(MemberEvent(event.at, event.system_id, name, event))
 
         return [

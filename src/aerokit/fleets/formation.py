@@ -91,7 +91,7 @@ class Formation(Snapshot):
         offsets: dict[str, Offset] = {}
         for index, name in enumerate(names):
             row = index // 2 + 1  # the leader is row 0
-            side = 1 if index % 2 else -1  # 1: right, -1: left
+            side = 1 if index % 2 else -1  # 1 is right, -1 is left
             offsets[name] = Offset(-spacing_m * row, spacing_m * row * side)
         return cls(offsets, frame)
 
@@ -115,7 +115,8 @@ class Formation(Snapshot):
         return min(distances, default=math.inf)
 
     def _check(self) -> None:
-        object.__setattr__(self, "offsets", dict(self.offsets))  # a copy; this object is immutable otherwise
+        # The class is frozen. Copy the offsets, so that the caller can change its own dictionary later.
+        object.__setattr__(self, "offsets", dict(self.offsets))
         if self.frame not in ("north", "heading"):
             raise InvalidArgument(f"frame = {self.frame!r} is not allowed: it must be 'north' or 'heading'")
         for name, offset in self.offsets.items():
@@ -235,11 +236,10 @@ class Following:
                 while not self._stop_if_leader_lost():
                     stream.set(self._setpoint(member))
                     await anyio.sleep(self._period_s)
-                await asyncio.Event().wait()  # waits to be cancelled, which makes the vehicle hold
+                await asyncio.Event().wait()  # Wait for the cancellation, which makes the vehicle hold.
         finally:
-            # The call waits until the action has recorded this follower's failure. At the end of the action, the call
-            # would be too late, because the action also waits for the policy's orders, such as landing the other
-            # members.
+            # Check in the next iteration of the loop, when the action has recorded this follower's failure. The end of
+            # the action would be too late, because the action also waits for the policy's orders, such as landing.
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:

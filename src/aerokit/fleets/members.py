@@ -54,9 +54,9 @@ class Member:
         """The member's state in the fleet."""
         self.reason: str = ""
         """The reason for this state; empty in the state ACTIVE."""
-        self._lost_at = 0.0
-        # The vehicle's newest order and its mode at the time of `reclaim`. The member does not count as taken over as
-        # long as both are the same.
+        self._lost_at = 0.0  # when the member was lost
+        # The vehicle's newest order and its mode at the time of `reclaim`. The member does not count as taken over
+        # until one of them changes.
         self._control_when_reclaimed: tuple[object, object] | None = None
         # MAV_STATE at the time of `reclaim`. If it was a failsafe, this failsafe does not count as a takeover.
         self._ignored_failsafe: int | None = None
@@ -95,7 +95,7 @@ class Member:
             bus.attach_event(VehicleSilent, self._on_silent),
             bus.attach_event(VehicleRecovered, self._on_recovered),
             vehicle.mode.observe(self._refresh_soon),
-            # Observes every HEARTBEAT, because its MAV_STATE may change while mode and arming stay the same.
+            # Observe every HEARTBEAT, because its MAV_STATE may change while mode and arming stay the same.
             vehicle.armed.observe(self._refresh_soon, every_arrival=True),
             vehicle.connection.on_end(self._on_connection_end),
         ]
@@ -117,7 +117,7 @@ class Member:
             self._set_lost(f"its link is closed, {self.vehicle.describe_link()}")
         if self.is_available and (reason := self._takeover_reason()):
             self._set_taken_over(reason)
-            self._on_unavailable(self)  # `_set_lost` calls it itself.
+            self._on_unavailable(self)  # `_set_lost` above calls `_on_unavailable` itself.
 
     def record_failure(self, action: str, error: Exception) -> None:
         """Set the state to FAILED, unless the member is lost or taken over, and publish :class:`MemberFailed`."""

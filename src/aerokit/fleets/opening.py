@@ -176,8 +176,8 @@ def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[s
 def _requested_ids(
     system_ids: Iterable[int] | Mapping[str, Iterable[int]] | None, networks: list[str]
 ) -> dict[str, list[int] | None]:
-    """Return the requested system ids of each network; None for a network: all that are found."""
-    ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - of a wider type
+    """Return the requested system ids of each network. None instead of a list means all that are found."""
+    ids: dict[str, list[int] | None] = {name: None for name in networks}  # noqa: C420 - `fromkeys` has a narrower type
     if isinstance(system_ids, Mapping):
         for name, network_ids in system_ids.items():
             if str(name) not in ids:
@@ -235,7 +235,7 @@ async def find_systems(
 
     Args:
         networks: connections by name.
-        requested: system ids by network; None for a network: all that are found.
+        requested: system ids by network; None instead of a list means all that are found.
         count: total number of vehicles to wait for, including ``passed_count``; None: at least one on each network.
         passed_count: number of vehicles that the program passed to ``fleet()``.
         timeout: seconds to wait.
@@ -324,8 +324,8 @@ class MemberConnections:
         self._tasks = BackgroundTasks(self._on_error)
         self._connected: dict[int, tuple[str, Vehicle]] = {}  # by index in the list of systems
         self._error: Exception | None = None
-        self._changed = asyncio.Event()
-        self._close = asyncio.Event()
+        self._changed = asyncio.Event()  # set after each connection and each error
+        self._close = asyncio.Event()  # set at the end of the fleet's block
         self._has_block_failed = False
         self._running_task_count = 0
         self._all_closed = asyncio.Event()

@@ -87,7 +87,8 @@ class Path(Snapshot):
         return list(pairwise(points))
 
     def _check(self) -> None:
-        object.__setattr__(self, "points", tuple(self.points))  # a copy; this object is immutable otherwise
+        # The class is frozen. Copy the points, so that the caller can change its own list later.
+        object.__setattr__(self, "points", tuple(self.points))
         if not self.points:
             raise InvalidArgument(f"points: the path of {self.name} has no points")
         for point, next_point in pairwise(self.points):

@@ -161,7 +161,8 @@ class Show(Snapshot):
         write_atomically(path, self.to_json() if str(path).lower().endswith(".json") else self.to_csv())
 
     def _check(self) -> None:
-        object.__setattr__(self, "tracks", dict(self.tracks))  # a copy; this object is immutable otherwise
+        # The class is frozen. Copy the tracks, so that the caller can change its own dictionary later.
+        object.__setattr__(self, "tracks", dict(self.tracks))
         if not self.tracks:
             raise InvalidArgument("a show needs at least one track")
         for name, track in self.tracks.items():

@@ -133,7 +133,6 @@ class Attachment:
         Datagrams that a peer sends in one burst are joined and processed together. A datagram that does not begin with
         a frame is processed alone, because only data that consists of whole frames is forwarded as it is.
         """
-        # Hot path.
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:
                 self._burst.append(data)

@@ -155,8 +155,9 @@ def kind_of(name: str, *, has_target: bool) -> MessageKind:
     return MessageKind.TRANSFER
 
 
-# Maps the payload offsets of the target's system id and component id (None: no such field) to message ids. The offsets
-# are not computed from the message definitions, because importing these would block the loop for a third of a second.
+# Maps the payload offsets of the target's system id and component id (None if there is no such field) to message ids.
+# The table is not computed from the message classes, because importing them would block the loop for a third of a
+# second.
 STANDARD_OFFSETS: dict[tuple[int, int | None], tuple[int, ...]] = {
     (0, None): (5,),
     (0, 1): (21, 43, 45, 47, 121, 122, 123, 156, 161, 176, 183, 186, 216, 218, 258, 321, 323, 12900, 12903, 12905,

@@ -31,8 +31,8 @@ class QueuedFrame(NamedTuple):
     raw: bytes
     kind: MessageKind
     message_id: int
-    target: tuple[int, int]
-    waiting_since: float
+    target: tuple[int, int]  # system id and component id
+    waiting_since: float  # loop time
 
 
 class FrameQueue:

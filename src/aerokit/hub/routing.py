@@ -173,9 +173,9 @@ class Router(Generic[PortT]):
     def route_all(
         self, node: RouterPort[PortT], frames: list[Frame], now: float, late: list[Frame]
     ) -> list[ForwardingPlan[PortT]]:
-        """Return the plans for frames received together at ``node``. ``late``: frames with a number out of order."""
-        # Hot path for new frames of known streams. :meth:`route` processes all other frames: frames that are out of
-        # order or may return in a loop, and frames after the tables of recent frames have expired or are full.
+        """Return the plans for frames received together at ``node``. Frames in ``late`` have a number out of order."""
+        # This is the hot path for new frames of known streams. `route` processes frames that are out of order or may
+        # return in a loop, and all frames while the tables of recent frames are full or have expired.
         recent, streams, number = self._recent, node.streams, node.number
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]
@@ -187,8 +187,8 @@ class Router(Generic[PortT]):
             if plan is not None:
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
-                # An earlier frame with this identity that arrived at the same port (item 0 of its record) is another
-                # frame, whose number and checksum are equal by chance.
+                # If an earlier frame with this identity arrived at the same port (item 0 of its record), this frame is
+                # no copy: its number and checksum are equal by chance.
                 if is_new or (newer.get(identity) or older[identity])[0] == number:
                     newer[identity] = record
                     plan.sender.received_at = now
@@ -209,7 +209,7 @@ class Router(Generic[PortT]):
         sender = self._senders.get(source)
         if sender is None:
             if message_id not in self._offsets and self._targets.is_unknown(message_id):
-                return self._unknown  # Its checksum could not be checked, so the frame may be noise.
+                return self._unknown  # The checksum of an unknown message cannot be checked, so the frame may be noise.
             sender = self._add_sender(source, node, now)
         number, recent = node.number, self._recent
         if now >= recent.ends_at or len(recent.newer) >= MAX_RECENT_FRAMES:
@@ -360,7 +360,8 @@ class Router(Generic[PortT]):
             if self._targets.is_order(message_id):  # An autopilot that is received at two ports gets an order once.
                 numbers = {number: None for number in numbers if not self._is_redundant(number)}
         numbers.pop(node.number, None)
-        if message_id in _RADIOS:  # An autopilot would adapt its message rates to a radio that is not its own.
+        # Any autopilot would adapt its message rates to this radio, even if the radio is not its own.
+        if message_id in _RADIOS:
             numbers = {number: None for number in numbers if not self._has_autopilot(number)}
         outs, rate_limited = [], []
         for number in numbers:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.framer import Framer
 
-# Full links are polled at this interval. It is doubled after each poll in which no link accepted data.
+# Full links are polled. The interval doubles, up to the maximum, after each poll in which no link accepted data.
 MIN_POLL_INTERVAL_S = 0.01
 MAX_POLL_INTERVAL_S = 0.08
 
@@ -127,10 +127,10 @@ class Switch:
             port.counters.dropped["read_only"] += len(frames)
             return
         late = framer.late
-        is_checked = port.gateway is not None
-        if guard is not None and not is_checked:
-            is_checked = guard.is_shared or _HEARTBEAT_ID in map(_message_id, frames)
-        if is_checked:
+        must_check = port.gateway is not None
+        if guard is not None and not must_check:
+            must_check = guard.is_shared or _HEARTBEAT_ID in map(_message_id, frames)
+        if must_check:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
             if port.gateway is not None or len(frames) != received_count:
@@ -160,7 +160,7 @@ class Switch:
             if port.batch:
                 try:
                     port.flush(unix_time)
-                except Exception as error:  # E.g. the time stamps of a key are exhausted. Other ports must continue.
+                except Exception as error:  # For example, a key has no time stamps left. Other ports must continue.
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:

@@ -264,6 +264,7 @@ class CameraAdapter(CameraDevice):
         return image.file_url
 
     def storage(self, number: int) -> list[m.StorageInformation]:
+        """Build STORAGE_INFORMATION for a storage id. The list is empty if the camera has no such memory."""
         storage = self._camera.storage()
         if storage is None or number not in (0, 1):  # 0 requests all media.
             return []

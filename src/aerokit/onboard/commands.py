@@ -59,7 +59,7 @@ class CommandRequest:
     def params(self) -> tuple[float, ...]:
         """Parameters 1 to 7; positions are in degrees for COMMAND_LONG and COMMAND_INT."""
         *params, x, y, z = self._command.params
-        # COMMAND_INT has latitude and longitude in 1e-7 degrees, but other values in the frames excluded here.
+        # In COMMAND_INT, x and y are latitude and longitude in 1e-7 degrees, except in these two frames.
         if self._command.frame is not None and self._command.frame not in (MavFrame.MISSION, MavFrame.LOCAL_NED):
             x, y = x / 1e7, y / 1e7
         return (*params, x, y, z)
@@ -196,6 +196,7 @@ class ComponentCommands:
         task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
+        # The event loop calls `cancel` after this method has returned. The variables below are then set.
         def cancel() -> None:
             """Cancel the handler because its sender or the end of the component requires it."""
             nonlocal is_cancelled

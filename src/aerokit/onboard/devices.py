@@ -106,6 +106,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
+        """Call the driver's method for the action, with the parameters that the action needs."""
         method = _WINCH_METHODS.get(action, "")
         if not method or not overrides(winch, WinchDriver, method):
             raise NotSupported(f"this winch does not support action {action}")
@@ -157,6 +158,7 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
     """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:
+        """Ask the program, and convert its answer or its error to the result of the command."""
         sender_system, _ = request.sender
         try:
             # PX4 sends 0 instead of its system id (ArmAuthorization.cpp).

@@ -30,11 +30,12 @@ class EventSender:
 
     def __init__(self, host: ComponentHost) -> None:
         self._host = host
-        self._sequence = -1
+        self._sequence = -1  # number of the last event; -1 before the first event
         self._sent: deque[m.Event] = deque(maxlen=MAX_STORED_EVENTS)
         host.on(m.RequestEvent, self._on_request)
 
     def send(self, event_id: int, arguments: bytes, severity: int) -> None:
+        """Send an event to all programs. The first event starts the announcements of sequence numbers."""
         if not 0 <= event_id <= 0xFFFFFFFF:
             raise InvalidArgument(f"event_id = {event_id} is not allowed: it must be 0 to 4294967295")
         if len(arguments) > MAX_ARGUMENT_BYTES:

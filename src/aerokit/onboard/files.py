@@ -138,7 +138,7 @@ class DirectoryFiles:
             except (OSError, FileFault):
                 if path not in self._memory:  # A directory in memory need not exist on the disk.
                     raise
-        if self._root is None or path in self._memory:  # Without a directory, `entries` raises for an unknown path.
+        if self._root is None or path in self._memory:  # If only memory is served, this raises for an unknown path.
             sizes.update(self._memory.entries(path))
         return sorted(sizes.items())
 

@@ -116,7 +116,7 @@ class GimbalAdapter(GimbalMount):
             self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
         self._gimbal, self._host = gimbal, host
         self._is_yaw_locked = False
-        self._followed_system_id = 0  # the gimbal points at this system; 0: none
+        self._followed_system_id = 0  # system at which the gimbal points; 0 if there is none
 
     @property
     def host(self) -> ServerHost:

@@ -51,7 +51,7 @@ class ComponentHost:
         self._encoder = None if has_ids_of_connection else FrameEncoder(system_id, component_id)
         self._started_at = connection.now()
         self._detachments: list[Detach] = []
-        self._text_id = 0
+        self._text_id = 0  # id of the last status text that was sent in chunks
         self._is_closed = False
 
     @property
@@ -86,7 +86,7 @@ class ComponentHost:
         target_component = getattr(message, "target_component", 0)
         if target_system not in (0, self.system_id) or target_component not in (0, self.component_id):
             return False
-        # A command to all components is ignored if this component does not know it: another component may execute it.
+        # An unknown command to all components is ignored without an answer, because another component may execute it.
         is_command_to_all = target_component == 0 and message.ID in _COMMAND_MESSAGE_IDS
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 

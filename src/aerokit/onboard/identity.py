@@ -78,6 +78,7 @@ class IdentityMessages:
         }
 
     def _version(self) -> m.AutopilotVersion:
+        """Build AUTOPILOT_VERSION."""
         identity = self._identity
         return m.AutopilotVersion(
             capabilities=self.capabilities,
@@ -94,6 +95,7 @@ class IdentityMessages:
         )
 
     def _basic(self) -> m.ComponentInformationBasic:
+        """Build COMPONENT_INFORMATION_BASIC."""
         identity = self._identity
         return m.ComponentInformationBasic(
             time_boot_ms=self._host.time_boot_ms,

@@ -59,9 +59,9 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
         self._small_names: list[str] = []  # names of the parameters that are not strings, which PARAM_VALUE can carry
-        self._stored: dict[str, Any] = _read_stored(path)
-        self._is_dirty = False
-        self._save_task: asyncio.Task[None] | None = None
+        self._stored: dict[str, Any] = _read_stored(path)  # values that were in the file at the start
+        self._is_dirty = False  # True if the file does not contain the last change
+        self._save_task: asyncio.Task[None] | None = None  # None while the file is not being written
         self._param_server = TypedParameterServer(host, _Store(self), bytewise=bytewise, list_rate_hz=LIST_RATE_HZ)
         self._param_ext_server: TypedExtendedServer | None = None
         self._has_camera_settings = False
@@ -189,8 +189,8 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             raise InvalidArgument(
                 f"{name} = {checked:g} is not allowed: it must be {', '.join(map(str, metadata.values))}"
             )
-        # The allowed values are checked above, and this program may change read-only parameters, so `problem` checks
-        # neither.
+        # Leave out two checks of `problem`. The allowed values were checked above, and this program may change
+        # read-only parameters.
         problem = metadata.replace(read_only=False, values={}).problem(checked)
         if problem is not None:
             raise InvalidArgument(problem)

@@ -51,6 +51,7 @@ class ComponentServices:
         is_failing = False
 
         def build(_: object) -> Iterable[Message]:
+            """Return the message of the program's function. Nothing is returned if the function fails."""
             nonlocal is_failing
             try:
                 message = function()

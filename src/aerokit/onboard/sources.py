@@ -64,7 +64,7 @@ class ComponentSources:
             )
         if not 0 < increment_deg <= 360:
             raise InvalidArgument(f"increment_deg = {increment_deg} is not allowed: it must be above 0 and at most 360")
-        nothing_in_range = round(max_m * 100) + 1  # defined by OBSTACLE_DISTANCE
+        nothing_in_range = round(max_m * 100) + 1  # In OBSTACLE_DISTANCE, max_distance + 1 means no obstacle.
         values = [_centimetres(distance, nothing_in_range) for distance in distances_m]
         values += [_NOT_MEASURED] * (MAX_DISTANCES - len(values))
         self._send(

@@ -111,7 +111,7 @@ class ReceivedCorrections:
         self._vehicle = vehicle
         self.messages: list[bytes] = []
         self._received_at = -math.inf  # time of the last assembled message
-        self._sequence = -1  # of the message that is being assembled
+        self._sequence = -1  # sequence id of the message that is being assembled; -1 before the first message
         self._fragments: dict[int, bytes] = {}  # by fragment id
         vehicle.on(GpsRtcmData, lambda message, _: self._on_fragment(message))
 
@@ -237,8 +237,8 @@ class SimulatedAutopilot(SimulatedVehicle):
 
 
 _RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
-# The lines between two of these points, from full to empty. Each is given by percent and volts at its lower end, and by
-# its slope in volts per percent.
+# The lines between neighbouring points, from full to empty. Each tuple has the percent and the volts at the lower end,
+# and the slope in volts per percent.
 _RESTING_CELL_SLOPES = tuple(
     (low, volts, (high_volts - volts) / (high - low))
     for (low, volts), (high, high_volts) in pairwise(_RESTING_CELL_VOLTS)

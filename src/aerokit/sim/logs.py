@@ -73,7 +73,8 @@ class LogServer:
         self._vehicle = vehicle
         self._erase_files = erase_files
         self._append_to_file = append_to_file
-        self._outgoing: deque[Callable[[], Message]] = deque()  # builds each message of the present transfer
+        # Functions that build the messages of the present transfer.
+        self._outgoing: deque[Callable[[], Message]] = deque()
         self._channel: Channel | None = None  # where the present transfer is sent
         self._transfer_number = 0  # Number of the present transfer. An earlier transfer sends nothing more.
         # Content of the log that was requested last, and its index; -1 if there is none.

@@ -190,7 +190,7 @@ class Motion:
         self._target_is_acceleration = False
         # The target roll and pitch, which replace the horizontal components of `_target`; None without such a target.
         self._target_lean: tuple[float, float] | None = None
-        self._wanted_yaw: float | None = None  # None: turn with `_wanted_yaw_rate`
+        self._wanted_yaw: float | None = None  # None while the vehicle turns with `_wanted_yaw_rate`
         self._wanted_yaw_rate = 0.0
 
     @property

@@ -121,8 +121,8 @@ class ArduPilotParameterServer(ParameterServer):
         else:
             value = self.clamped(name, request.param_value)
             self._parameters[name] = rounded(value, self._parameters.type(name))
-            # With `errors`, the released firmware is simulated, which also confirms the value on the sender's port,
-            # before the broadcast.
+            # The released firmware, which `errors` selects, confirms the value on the sender's port before the
+            # broadcast.
             if self.errors:
                 self.send(name, UNKNOWN_INDEX, channel)
             self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))

@@ -63,7 +63,7 @@ class SimParameters:
         self._rows: dict[str, SimParameter | str] = {row.name: row for row in rows}
         # Maps the name of a parameter to the name of the parameter that enables it.
         self._switches = {row.name: row.switch for row in self._all_rows() if row.switch is not None}
-        self._names: tuple[str, ...] | None = None  # None: computed at the next access
+        self._names: tuple[str, ...] | None = None  # None if they must be computed at the next access
         self._indices: dict[str, int] = {}
 
     @classmethod
@@ -313,7 +313,7 @@ class _Writer(UploadedFile):
 
     def _read_rows(self, content: bytes, count: int) -> None:
         """Apply the values in an uploaded file. Unknown names are skipped."""
-        # An entry omits the beginning of its name that the previous name has, too, so `read_entry` needs that name.
+        # An entry omits the first letters that its name shares with the previous name. `read_entry` adds them again.
         position, previous_name = HEADER.size, b""
         for _ in range(count):
             entry = read_entry(content, position, previous_name) if position < len(content) else None

@@ -66,6 +66,7 @@ class SimulatorServer:
             )
         self._speedup = speedup
         self._dues = [0.0] * len(self.vehicles)  # simulated time of each vehicle's next event
+        # Index of each vehicle in `vehicles` and `_dues`, by `id`.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
         self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0

@@ -144,8 +144,8 @@ class SimulatedVehicle:
         messages = channel.messages(data, now, peer)
         if not messages:
             return
-        # In steady flight, the running tick may be long. It ends before the messages change the targets, and the next
-        # tick is short.
+        # In steady flight, one tick may stand for many. Complete the tick now, before the messages change the targets,
+        # and let the next tick be short.
         self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):

@@ -45,7 +45,8 @@ import anyio
 
 T = TypeVar("T")
 
-# The selector is polled at least once in this many steps: iterations of the loop or runs of an event source.
+# The selector is polled at least once in this many steps. A step is one iteration of the loop or one run of an event
+# source.
 _POLL_EVERY = 64
 # With more timers than this, cancelled timers are discarded if they are more than half of the timers.
 _MANY_TIMERS = 100
@@ -66,10 +67,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def __init__(self, *, deadlock_timeout_s: float = DEADLOCK_TIMEOUT_S) -> None:
         self._now = 0.0
-        self._executor_calls = 0
-        self._iterations = 0
+        self._executor_calls = 0  # number of calls that executor threads are running
+        self._iterations = 0  # number of steps since the last poll, see `_POLL_EVERY`
         self._deadlock_timeout_s = deadlock_timeout_s
-        self._sources: list[tuple[Callable[[], float], asyncio.Handle]] = []
+        self._sources: list[tuple[Callable[[], float], asyncio.Handle]] = []  # `next_due` and `run` of each source
         super().__init__(_JumpingSelector(self))
         selector: selectors.BaseSelector = self._selector  # type: ignore[attr-defined]
         self._registered: Mapping[Any, Any] = selector.get_map()
@@ -162,8 +163,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
                 if due < earliest_due:
                     earliest_due = due
                     earliest_handle = handle
-            # If a timer is due earlier or at the same instant, stop here: the iteration that runs the timer also runs
-            # the event sources of its instant.
+            # Stop if a timer is due earlier or at the same instant. The iteration that runs the timer also runs the
+            # event sources of its instant.
             if earliest_due + self._clock_resolution >= self._next_timer():
                 break
             self._now = max(self._now, earliest_due)

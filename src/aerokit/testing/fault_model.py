@@ -93,11 +93,11 @@ class FaultyPath:
         self.duplicated = 0
         self.reordered = 0
         self.corrupted = 0
-        self._chance = random.Random(repr(seed)).random
-        self._bits = random.Random(repr((seed, "bits")))
+        self._chance = random.Random(repr(seed)).random  # decides which frames have a fault
+        self._bits = random.Random(repr((seed, "bits")))  # selects the bits to flip
         self._air = Air() if air is None else air
-        self._started_at: float | None = None
-        self._latest_due = -math.inf
+        self._started_at: float | None = None  # None until the clock of the outages starts
+        self._latest_due = -math.inf  # arrival of the last frame that was not reordered
 
     def start(self, now: float) -> None:
         """Start the clock of the outages at ``now``. Without this call, the clock starts at the first frame."""

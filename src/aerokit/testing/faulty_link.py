@@ -157,13 +157,13 @@ class FaultyLink(Link):
         """The outgoing direction, with counters. Its ``model`` may be replaced at any time."""
         self.incoming: FaultyPath = FaultyPath(incoming or model, (seed, "incoming"), air)
         """The incoming direction, with counters. Its ``model`` may be replaced at any time."""
-        self._incoming_path: _IncomingPath | None = None
-        self._in_flight: _DeliveryQueue | None = None
+        self._incoming_path: _IncomingPath | None = None  # None until the link is opened
+        self._in_flight: _DeliveryQueue | None = None  # outgoing frames in transit; None until the link is opened
         self._is_closed = False
-        self._stalled_queue: StalledQueue | None = None  # None before the first call of `stall`.
-        self._stalled_at: float | None = None
+        self._stalled_queue: StalledQueue | None = None  # None before the first call of `stall`
+        self._stalled_at: float | None = None  # start of the present stall; None if there is none
         self._expired_writes = 0
-        self._drained = asyncio.Event()
+        self._drained = asyncio.Event()  # not set while a closed link still delivers frames
         self._drained.set()
 
     @property
@@ -220,7 +220,7 @@ class FaultyLink(Link):
         self.incoming.start(loop.time())
         try:
             await self.link.open(self._incoming_path)
-        except BaseException:  # Also after a cancellation, the link can be opened again.
+        except BaseException:  # The link can be opened again, even after a cancellation.
             self._incoming_path.close()
             self._in_flight.clear()
             self._incoming_path = None
@@ -369,12 +369,12 @@ class _DeliveryQueue:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
-        self.latest_due = loop.time()  # when the last callback is due; the present if there is none
-        # A heap of due time, number in order of insertion, and callback.
+        self.latest_due = loop.time()  # the latest due time of all actions so far
+        # Heap of (due time, number, action). The numbers keep the order of actions that are due at the same time.
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
-        self._count = 0
+        self._count = 0  # number of actions queued so far
         self._timer: asyncio.TimerHandle | None = None
-        # The due time of `_timer`. It is stored, because TimerHandle.when() of uvloop fails after this time.
+        # The due time of `_timer` is stored, because TimerHandle.when() of uvloop fails after that time.
         self._timer_at = 0.0
 
     @property
@@ -387,7 +387,7 @@ class _DeliveryQueue:
             action()
             return
         self.latest_due = max(self.latest_due, due)
-        self._count += 1  # Actions with the same due time run in the order in which they were queued.
+        self._count += 1
         heappush(self._waiting, (due, self._count, action))
         self._schedule()
 
@@ -408,6 +408,7 @@ class _DeliveryQueue:
         self._timer_at = due
 
     def _run(self) -> None:
+        """Run the actions that are due, and set the timer for the others."""
         self._timer = None
         first_due, _, _ = self._waiting[0]
         now = max(self.loop.time(), first_due)  # A timer may fire slightly early.

@@ -108,8 +108,8 @@ class SimulatedFleet(Sequence[Flight]):
         self._latency_s = latency_s
         self.recording: FlightRecording | None = FlightRecording() if record else None
         """Recording of the link; None without ``record=True``."""
-        self._server: SimulatorServer | None = None
-        self._link: Link | None = None
+        self._server: SimulatorServer | None = None  # None while the fleet is not open
+        self._link: Link | None = None  # None while the fleet is not open
         self._was_opened = False
         self._flights = [Flight(self, number) for number in range(len(kinds))]
 

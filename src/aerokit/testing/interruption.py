@@ -26,9 +26,9 @@ class Interruption:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._is_allowed = False
-        self._is_sent = False
-        self._is_delivered = False
+        self._is_allowed = False  # True within the block of `allowed`
+        self._is_sent = False  # True once a signal was sent to the main thread
+        self._is_delivered = False  # True once KeyboardInterrupt was raised
         self._previous_handler: Any = signal.default_int_handler
 
     @contextlib.contextmanager
@@ -45,7 +45,7 @@ class Interruption:
             with self._lock:  # `_send_signal` must not send after this block has ended.
                 self._is_allowed = False
             if signal.getsignal(signal.SIGINT) == self._on_signal:
-                # If a signal is pending, signal.signal() first runs the present handler.
+                # signal.signal() first runs `_on_signal` for a pending signal, so the previous handler never gets it.
                 signal.signal(signal.SIGINT, self._previous_handler)
 
     @contextlib.contextmanager

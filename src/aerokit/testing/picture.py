@@ -188,6 +188,7 @@ class _Axes:
         return self.left + from_left, self.top + self.height - from_bottom
 
     def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
+        """Return grid lines at round values of both axes, with the values as labels."""
         shapes: list[_Shape] = []
         bottom = self.top + self.height
         right = self.left + self.width
@@ -271,7 +272,7 @@ class _Labels:
     """Labels with mode names at the points where modes start. Labels that would overlap are left out."""
 
     def __init__(self) -> None:
-        self._places: list[tuple[float, float]] = []
+        self._places: list[tuple[float, float]] = []  # places of the labels so far
 
     def modes(
         self, track: Drawable, places: Sequence[tuple[float, float]], colour: str, *, above: float = 8

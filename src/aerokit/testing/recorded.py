@@ -46,8 +46,8 @@ class RecordedParameters(ParameterProtocolServer):
     def __init__(self, vehicle: RecordedVehicle) -> None:
         super().__init__(vehicle, self, list_rate_hz=_LIST_RATE_HZ)
         self._vehicle = vehicle
-        self._written: dict[str, float] = {}
-        self._recorded: dict[str, list[tuple[float, m.ParamValue]]] = {}
+        self._written: dict[str, float] = {}  # values that clients have set
+        self._recorded: dict[str, list[tuple[float, m.ParamValue]]] = {}  # recorded values with their times, by name
         for time, value in vehicle.recording.parameters:
             self._recorded.setdefault(value.param_id, []).append((time, value))
         values = [value for _, value in vehicle.recording.parameters]
@@ -90,7 +90,7 @@ class RecordedParameters(ParameterProtocolServer):
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
         name = request.param_id
         if name not in self.names:
-            self._refuse(request, index=-1, channel=channel)  # -1: the request has no index
+            self._refuse(request, index=-1, channel=channel)  # -1 because the request has no index
             return
         # If the recording has no successful write of the parameter, the vehicle keeps and answers the present value.
         if name in self._vehicle.recording.settable:
@@ -114,7 +114,7 @@ class RecordedMissions(MissionServer):
         self.requests_int: bool = vehicle.recording.uses_int
         self._received: list[AnyItem] = []  # items of the upload in progress
         self._written: dict[int, tuple[AnyItem, ...]] = {}  # uploaded plans by MAV_MISSION_TYPE
-        # How many recorded results were already sent, by operation and MAV_MISSION_TYPE.
+        # Number of recorded results that were already sent, by operation and MAV_MISSION_TYPE.
         self._result_counts: dict[tuple[str, int], int] = {}
         self.listen()
 
@@ -241,7 +241,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        self._answered_counts: dict[int, int] = {}
+        self._answered_counts: dict[int, int] = {}  # number of answers sent, by `id` of the first candidate
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""
         self.missions: RecordedMissions = RecordedMissions(self)

@@ -42,7 +42,7 @@ class RecordedAnswer:
 
     params: tuple[float, ...]
     """Params 1 to 4 of the command; empty if the command itself was not recorded."""
-    requested_at: float
+    requested_at: float  # time of the command
     acks: list[tuple[float, m.CommandAck]] = field(default_factory=list)
     """The acknowledgements, each with its time in seconds after the command."""
 
@@ -87,14 +87,15 @@ class RecordedFlight:
         self.uses_int: bool = True
         """True if the vehicle requests items by MISSION_REQUEST_INT, False by MISSION_REQUEST."""
         self.duration_s: float = 0.0
-        self._unconfirmed_sets: dict[str, float] = {}
+        self._unconfirmed_sets: dict[str, float] = {}  # values of PARAM_SET that are not confirmed yet, by name
         # Transfers in progress by MAV_MISSION_TYPE. An upload has its items by index, a download its count and items.
         self._uploads: dict[int, dict[int, m.MissionItemInt | m.MissionItem]] = {}
         self._downloads: dict[int, tuple[int, dict[int, m.MissionItemInt | m.MissionItem]]] = {}
-        self._clearing: set[int] = set()
+        self._clearing: set[int] = set()  # types of which MISSION_CLEAR_ALL is not answered yet
         self._read(frames)
 
     def _read(self, frames: list[tuple[float, Frame]]) -> None:
+        """Divide the frames into requests of clients, answers of the vehicle, and messages without a request."""
         now = 0.0  # seconds since the vehicle's first message, without long gaps
         previous_unix_s = None
         for unix_s, frame in frames:

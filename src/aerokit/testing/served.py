@@ -50,7 +50,7 @@ class ServedFlight:
         self._server = server
         self._scheduler = scheduler
         self._interruption = interruption
-        self._is_raised = False
+        self._is_raised = False  # True once `_raise_failure` has raised the exception of the vehicle
         scheduler.refresh_with(lambda: portal.call(self._refresh))
 
     @contextmanager

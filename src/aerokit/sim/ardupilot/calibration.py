@@ -31,8 +31,8 @@ class AccelerometerCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.is_held_wrong = False  # If True, the calibration fails after the second position.
-        self._run_number = 0  # number of this calibration; timers of earlier ones do nothing
-        self._requested: int | None = None  # position or result that is sent repeatedly; None: nothing is sent
+        self._run_number = 0  # number of this calibration; timers of earlier calibrations do nothing
+        self._requested: int | None = None  # position or result that is sent repeatedly; None if nothing is sent
 
     @property
     def is_waiting(self) -> bool:
@@ -60,7 +60,7 @@ class AccelerometerCalibration:
         """Continue after a position was measured: request the next one, or end the calibration."""
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
-        has_earlier_position = position != AccelcalVehiclePos.LEVEL  # The vehicle is level first.
+        has_earlier_position = position != AccelcalVehiclePos.LEVEL  # LEVEL is the first position.
         if self.is_held_wrong and has_earlier_position:
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
@@ -102,8 +102,8 @@ class CompassCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turns_s: float = 30.0
-        self._compass_mask = 0  # bit for each compass that is calibrated; 0: none
-        self._started_at = math.inf  # infinite: not started
+        self._compass_mask = 0  # bit for each compass that is calibrated; 0 if none is
+        self._started_at = math.inf  # infinite before the start
         self._saves_at_once = False  # True if the result needs no DO_ACCEPT_MAG_CAL
         self._progress_compass = 0  # compass of the last progress message
         self._reported_compass = 0  # compass of the last result message

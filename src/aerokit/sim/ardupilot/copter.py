@@ -44,7 +44,7 @@ class MotorTest:
     def __init__(self, copter: SimulatedCopter) -> None:
         self._copter = copter
         self.is_running: bool = False
-        self._test_number = 0  # number of this test; the timer of an earlier one does nothing
+        self._test_number = 0  # number of this test; the timer of an earlier test does nothing
 
     def command(self, command: ReceivedCommand) -> int:
         """Start a test, or replace the running test. A status text reports the end of the test."""
@@ -223,7 +223,7 @@ class SimulatedCopter(CopterHost):
             return _BASE | _GUIDED
         flags = _BASE
         mode_name = self.mode.name
-        # GUIDED_ENABLED is set in modes that use a position, in RTL only while armed.
+        # GUIDED_ENABLED is set in modes that use a position, but in RTL only while armed.
         if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
             flags |= _GUIDED
         if self.is_armed:

@@ -65,7 +65,7 @@ class _CircleLeg:
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
         north, east = motion.north - self._centre_north, motion.east - self._centre_east
         self._angle = math.atan2(east, north)  # bearing of the point to follow, seen from the centre
-        self._turned_rad = 0.0  # angle flown so far, in both directions positive
+        self._turned_rad = 0.0  # angle flown so far; positive in both directions
         self._reported_turns = -1  # Not even turn 0 is reported yet.
         self._approach: _FlyLeg | None = None  # None once the copter is on the circle
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
@@ -156,8 +156,9 @@ class _DescendLeg:
 
 _ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
 _HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
-_CHECKED_COMMANDS = 3  # An upload that changes one of this many next commands restarts the current command.
-# If one of these commands follows a waypoint, the copter does not stop there, unless the waypoint has a delay.
+# An upload restarts the current command if it changes one of this many commands, beginning with the current one.
+_CHECKED_COMMANDS = 3
+# The copter passes a waypoint without a stop if one of these commands follows and the waypoint has no delay.
 _PASSED_BEFORE = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
 )
@@ -183,13 +184,13 @@ class CopterAuto(MissionMode):
         super().__init__(copter)
         self.climb: float = 0.0  # Maximum climb rate in m/s.
         self.descent: float = 0.0  # Maximum sink rate in m/s.
-        self._leg: _Leg | None = None  # None: hold the position.
-        self._last_reached = 0  # index of the command to report in MISSION_ITEM_REACHED; 0: none
+        self._leg: _Leg | None = None  # None while the copter holds its position.
+        self._last_reached = 0  # index of the command to report in MISSION_ITEM_REACHED; 0 if there is none
         self._reached_at: float | None = None  # None until the copter reaches the waypoint.
         self._condition_started_at = 0.0
         self._delay_until = 0.0
         self._list_version = -1  # version of the command list from which `_upcoming` was read
-        # The current and the next navigation commands, to notice an upload that changes them.
+        # The current and the next navigation commands. They are compared to notice an upload that changes them.
         self._upcoming: tuple[MissionCommand, ...] = ()
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             **dict.fromkeys(_TAKE_OFFS, self._take_off),
@@ -430,7 +431,7 @@ class CopterAuto(MissionMode):
         leg.enter(force=True)
 
     def _delay(self, item: MissionItem) -> None:
-        seconds = max(0.0, item.param1)  # A negative number, for a time of day, is not simulated.
+        seconds = max(0.0, item.param1)  # A negative number (to wait for a time of day) is not simulated.
         self._delay_until = self.vehicle.now + seconds
         self.vehicle.info(f"Delaying {int(seconds)} sec")
 

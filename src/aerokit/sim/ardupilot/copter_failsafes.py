@@ -22,7 +22,7 @@ class CopterArming(ArduPilotArming[CopterHost]):
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
 
     def ahrs_reasons(self) -> Sequence[str]:
-        return ()  # `position_reasons` includes these checks, because ArduCopter runs them after those of GPS.
+        return ()  # `position_reasons` includes these checks, because ArduCopter runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
         """Return the failures of the checks of GPS and of the estimator, and of the mandatory checks."""

@@ -52,7 +52,7 @@ class CopterGuided(CopterModeBase):
         self.velocity: Ned = _ZERO
         self.acceleration: Ned = _ZERO
         self._attitude = (0.0, 0.0)  # target roll and pitch in radians
-        # Target roll rate and pitch rate in rad/s, which change `_attitude`; None: no rates were commanded.
+        # Target roll rate and pitch rate in rad/s, which change `_attitude`. None if no rates were commanded.
         self._body_rates: tuple[float, float] | None = None
         self._attitude_climb = 0.0  # climb rate in m/s that goes with `_attitude`
         self._updated_at = -math.inf  # time of the last target

@@ -342,8 +342,8 @@ class CopterRtl(CopterModeBase):
         self._place = best_return_place(copter, home, is_allowed=copter.fence.contains)
         north, east, down = self._place
         distance = math.hypot(north - copter.motion.north, east - copter.motion.east)
-        # The copter returns at the return altitude or at the altitude of `_place`, whichever is higher: `min`, because
-        # a smaller down coordinate is higher.
+        # The copter returns at the return altitude or at the altitude of `_place`, whichever is higher. `min` selects
+        # the higher one, because a smaller down coordinate is higher.
         self._return_down = min(down, home_down - self._return_altitude(distance))
         copter.yaw.apply_default(returning=True)
         return True

@@ -106,5 +106,5 @@ class ArduPilotDevices:
         if not self._is_set("WINCH_TYPE"):
             return None
         unknown, unknown_temperature, healthy = float("nan"), 0x7FFF, 1
-        electrical = (unknown, unknown, unknown, unknown_temperature)  # tension, voltage, current
+        electrical = (unknown, unknown, unknown, unknown_temperature)  # tension, voltage, current, temperature
         return m.WinchStatus(self._vehicle.time_boot_us, self.line_m, self.line_rate_m_s, *electrical, healthy)

@@ -31,8 +31,8 @@ class ArduPilotExternal:
     def reset(self) -> None:
         """Forget all measurements, because of a reboot."""
         self.latest: dict[type[Message], Message] = {}
-        self._navigation_at = self._target_at = -math.inf
-        self._target: tuple[float, float] = (0.0, 0.0)
+        self._navigation_at = self._target_at = -math.inf  # times of the last measurements
+        self._target: tuple[float, float] = (0.0, 0.0)  # (north, east) of the landing target
         # Wind speed in m/s, and the direction in degrees from which the wind comes.
         self.wind: tuple[float, float] | None = None
 
@@ -77,7 +77,7 @@ class ArduPilotExternal:
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
             return
         self.latest[type(target)] = target
-        # The offset of the target is relative to the vehicle, and turned with its heading.
+        # The offset of the target is relative to the nose, so it is rotated by the heading.
         north, east, _down = rotated((target.x, target.y, target.z), motion.yaw)
         self._target = (motion.north + north, motion.east + east)
         self._target_at = self._vehicle.now

@@ -146,7 +146,7 @@ class ArduPilotFence(Generic[HostT]):
 
     def __init__(self, vehicle: HostT) -> None:
         self.vehicle = vehicle
-        self.enabled: int = 0  # Enabled kinds of fences (bits of FENCE_TYPE), even if not configured.
+        self.enabled: int = 0  # Enabled kinds of fences (bits of FENCE_TYPE), including kinds that are not configured.
         self.breached: int = 0  # Kinds of fences that are breached at present.
         self.breach_count: int = 0
         self.breach_time_ms: int = 0  # Start of the latest breach, in milliseconds since boot.
@@ -321,7 +321,7 @@ class ArduPilotFence(Generic[HostT]):
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
     def _record_breach(self, kind: int) -> None:
-        """Count a new breach of this kind of fence. FENCE_STATUS reports the first of several."""
+        """Count a new breach of this kind of fence. FENCE_STATUS reports only the first of several breaches."""
         vehicle = self.vehicle
         self.breach_count += 1
         was_any_breached = self.breached != 0

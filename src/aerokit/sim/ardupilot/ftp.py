@@ -206,8 +206,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware changes and sends the same reply for the whole burst (GCS_FTP.cpp). After each block, it
-        # increments the sequence number. After a short block, it also advances the offset for the refusal.
+        # The firmware reuses one reply for the whole burst (GCS_FTP.cpp). After each block, it increments the sequence
+        # number of the reply. After a short block, it also advances the offset, which the refusal then contains.
         next_offset = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
         next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, block_number + 1)

@@ -74,7 +74,7 @@ class ArduPilotGimbal:
         self.is_yaw_locked: bool = False  # True if the pilot's stick controls yaw relative to north.
         self.in_control: tuple[int, int] = (0, 0)  # System id and component id that control the gimbal.
         self._target = MountTarget()
-        self._region: Ned | None = None  # region of interest; None: there is none
+        self._region: Ned | None = None  # region of interest; None if there is none
         self._followed_id = 0  # system id of the followed vehicle
         self._followed_place: Ned | None = None  # None until its position is received
         vehicle.observe(GlobalPositionInt, self._on_global_position)
@@ -254,7 +254,7 @@ class ArduPilotGimbal:
             time_boot_ms=self._vehicle.time_boot_ms,
             flags=_device_flags(self),
             q=quaternion_from_euler(roll, pitch, yaw),
-            angular_velocity_x=math.nan,  # NaN: unknown
+            angular_velocity_x=math.nan,  # NaN means unknown.
             angular_velocity_y=math.nan,
             angular_velocity_z=math.nan,
             failure_flags=0,

@@ -103,7 +103,7 @@ def as_stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
         return result
     if item.command in (0, 1):  # The storage format reserves these command ids (AP_Mission.cpp).
         return MavMissionResult.INVALID
-    # One letter for each stored param; empty for an unsupported command.
+    # The layout has one letter for each stored param. It is empty for an unsupported command.
     layout = STORED_COMMANDS.get(item.command, _UNKNOWN).parameters
     if kind == "plane":
         layout = _PLANE_PARAMETERS.get(item.command, layout)
@@ -183,7 +183,7 @@ def _signed(value: int, bits: int) -> float:
     return float(value - (1 << bits) if value >> bits - 1 else value)
 
 
-# By storage type: functions that return the value that is read after a value was stored.
+# Maps a storage type to the function that converts an uploaded value to the value that a download returns.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     _NOT_STORED: lambda _: 0.0,
     "f": float32,

@@ -225,7 +225,7 @@ class FenceList(ItemList):
     def __init__(self, capacity: int = _STORAGE_BYTES // _BYTES_PER_POINT) -> None:
         super().__init__(capacity)
         self._stored: list[MissionItem] = []
-        # Items of a running upload, None for those that are missing; None without an upload.
+        # Items of the running upload, with None for each missing item. None if no upload is running.
         self._uploaded: list[MissionItem | None] | None = None
 
     @property
@@ -306,15 +306,18 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
 
 def _fence_problem(items: Sequence[MissionItem]) -> str | None:
     """Return the text that the firmware sends about an invalid fence; None if the fence is valid."""
-    # The current polygon: the command of its vertices, its number of vertices, and how many of them are missing.
-    polygon_type, vertices, missing = 0, 0.0, 0
+    polygon_type = 0  # command of the vertices of the current polygon
+    vertices = 0.0  # number of vertices of the current polygon
+    missing = 0  # number of vertices that must still follow
     has_return_point = False
     for item in items:
         if item.command in _POLYGONS:
             if item.param1 < 3:
                 return f"Invalid vertex count ({item.param1:.0f})"
             if missing == 0:
-                polygon_type, vertices, missing = item.command, item.param1, int(item.param1)
+                polygon_type = item.command
+                vertices = item.param1
+                missing = int(item.param1)
             elif item.command != polygon_type:
                 return f"Received incorrect vertex type (want={_number(polygon_type)} got={_number(item.command)})"
             elif item.param1 != vertices:

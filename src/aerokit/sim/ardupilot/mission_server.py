@@ -127,8 +127,8 @@ class ArduPilotMissionServer(MissionServer):
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
-        # During an upload, only two messages are not denied here: the base class decides on MISSION_COUNT, and requests
-        # for single items are served.
+        # During an upload, all messages are denied except two. MISSION_REQUEST is served, unlike MISSION_REQUEST_INT.
+        # The base class decides on MISSION_COUNT.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return Result.DENIED
         return None if kind in self._lists else Result.UNSUPPORTED
@@ -149,8 +149,8 @@ class ArduPilotMissionServer(MissionServer):
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         """Return the message that answers a request: MISSION_ITEM_INT or MISSION_ITEM."""
         client, kind = sender_of(request), request.mission_type
-        # Reproduces a bug of the firmware, which compares the command of the item (instead of its index) with the index
-        # of the current item.
+        # This reproduces a bug of the firmware, which compares the command of the item, instead of its index, with the
+        # index of the current item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
         if isinstance(request, m.MissionRequestInt):
             return item_message_int(item, request.seq, client, kind, current=current)

@@ -272,7 +272,7 @@ class SmartPath:
 
     def __init__(self, vehicle: ArduPilotHost, *, only_armed: bool) -> None:
         self._vehicle = vehicle
-        self._only_armed = only_armed  # True: record only while the vehicle is armed
+        self._only_armed = only_armed  # True if the path is recorded only while the vehicle is armed
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
         self._good_at = -math.inf  # time of the last good position

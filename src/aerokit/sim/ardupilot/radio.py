@@ -41,7 +41,7 @@ class ArduPilotRadio:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self._sticks: list[int] = list(_AT_REST)
-        # Maps a channel index to the pulse width (0: released), and to the time at which it was received.
+        # Maps a channel index to the pulse width (0 if released) and the time at which it was received.
         self._overrides: dict[int, tuple[int, float]] = {}
 
     def __len__(self) -> int:

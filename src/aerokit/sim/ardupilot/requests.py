@@ -194,7 +194,7 @@ class ArduPilotMessageRequests:
             interval = group_interval
             if message_id == m.TerrainRequest.ID and rate > 0:
                 interval = max(interval, _MIN_TERRAIN_REQUEST_INTERVAL_S)
-            # A NAMED_VALUE_FLOAT has one of the values. Each value is sent at the rate of the group.
+            # Each NAMED_VALUE_FLOAT has only one of `DISPLAY_VALUES`. Every value is sent at the rate of the group.
             elif message_id == m.NamedValueFloat.ID:
                 interval /= len(DISPLAY_VALUES)
             self._stream(message_id, interval, channel, first)

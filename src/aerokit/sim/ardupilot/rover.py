@@ -28,7 +28,7 @@ class RoverArming(ArduPilotArming[RoverHost]):
     """ArduRover's arming checks. Only modes that use a position require it, unless ARMING_NEED_LOC is set."""
 
     def ahrs_reasons(self) -> Sequence[str]:
-        return ()  # `position_reasons` includes these checks, because ArduRover runs them after those of GPS.
+        return ()  # `position_reasons` includes these checks, because ArduRover runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
         """Return the failures of the checks of GPS, then of the estimator and its position."""

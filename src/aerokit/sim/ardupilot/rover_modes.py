@@ -185,9 +185,9 @@ class RoverGuided(_Mode):
     def __init__(self, rover: RoverHost) -> None:
         super().__init__(rover)
         self.speed: float = 0.0
-        self._place: Ned | None = None  # place to drive to; None: follow `_target`
+        self._place: Ned | None = None  # place to drive to; None while the rover follows `_target`
         self._has_arrived = False
-        self._target: GuidedTarget | None = None  # None: stop
+        self._target: GuidedTarget | None = None  # None if the rover must stop
         self._target_at = 0.0
 
     @property

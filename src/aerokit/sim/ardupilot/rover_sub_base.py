@@ -193,7 +193,7 @@ class RoverSubAuto(MissionMode):
 
     def __init__(self, vehicle: RoverSubVehicle) -> None:
         super().__init__(vehicle)
-        self._place: Ned | None = None  # place of the current command; None: stay
+        self._place: Ned | None = None  # place of the current command; None if the vehicle stays
         self._stops = True  # True if the vehicle stops at `_place`
         self._reached_at: float | None = None  # time of arrival at `_place`; None before
         self._wait_until = 0.0  # end of a delay command

@@ -118,7 +118,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         """Detect the loss of the pilot's input and apply FS_PILOT_INPUT: 1 warns, 2 disarms."""
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
         silence = sub.now - self.radio_received_at
-        is_silent = silence >= sub.parameters["FS_PILOT_TIMEOUT"]  # false for a pilot that was never received (NaN)
+        is_silent = silence >= sub.parameters["FS_PILOT_TIMEOUT"]  # `silence` is NaN before the first input.
         if not enabled or not is_silent:
             self.is_pilot_lost = False
             return

@@ -154,10 +154,10 @@ class SubGuided(_Mode):
     def __init__(self, sub: SubHost) -> None:
         super().__init__(sub)
         self.speed: float = 0.0
-        self._place: Ned | None = None  # place to move to; None: follow `_target`
-        self._target: GuidedTarget | None = None  # None: stop
+        self._place: Ned | None = None  # place to move to; None while the vehicle follows `_target`
+        self._target: GuidedTarget | None = None  # None if the vehicle must stop
         self._target_at = 0.0
-        self._heading: float | None = None  # heading to hold, in radians; None: follow `_target`
+        self._heading: float | None = None  # heading to hold, in radians; None to follow `_target`
 
     @property
     def destination(self) -> Ned | None:

@@ -75,7 +75,7 @@ _SENSORS: dict[Kind, _Sensors] = {
     "sub": _Sensors(_BODY | _LASER, always=_RATE | _ATTITUDE | _YAW),
 }
 
-# For each kind of vehicle: bits of SYS_STATUS for kinds of control, and the modes in which these are off.
+# For each kind of vehicle, pairs of control bits of SYS_STATUS and the modes in which these bits are off.
 _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
     "copter": (
         (_HEIGHT | _PLACE, (CopterMode.STABILIZE, CopterMode.ACRO)),

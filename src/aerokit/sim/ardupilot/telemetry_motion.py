@@ -187,7 +187,7 @@ def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
     """Build GPS_RAW_INT."""
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
-        return _gps_without_fix(GpsFixType.NO_GPS, dilution=65535, satellites=0)  # 65535: unknown
+        return _gps_without_fix(GpsFixType.NO_GPS, dilution=65535, satellites=0)  # 65535 means unknown.
     if nav.fix_type < GpsFixType.TYPE_3D_FIX:
         return _gps_without_fix(GpsFixType.NO_FIX, dilution=9999, satellites=3)
     place = nav.frame.to_global(*motion.place)
@@ -351,7 +351,7 @@ MOTION_BUILDERS: dict[int, Callable[[ArduPilotVehicle], Message | None]] = {
     m.RawImu.ID: lambda v: m.RawImu(v.time_boot_us, *_imu(v), id=0, temperature=3500),
     m.ScaledImu.ID: lambda v: m.ScaledImu(v.time_boot_ms, *_imu(v), temperature=3500),
     m.ScaledImu2.ID: lambda v: m.ScaledImu2(v.time_boot_ms, *_imu(v), temperature=3500),
-    # The third compass has no accelerometers and gyroscopes, whose six values are 0.
+    # The third compass has no accelerometers and no gyroscopes, so their six values are 0.
     m.ScaledImu3.ID: lambda v: m.ScaledImu3(v.time_boot_ms, 0, 0, 0, 0, 0, 0, *_magnetic_field(v)),
     m.HighresImu.ID: _highres_imu,
     m.ScaledPressure.ID: lambda v: m.ScaledPressure(

@@ -49,8 +49,8 @@ class Px4Calibration:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self.side_s: float = math.inf
-        self._sensor = ""  # sensor that is being calibrated; "": none
-        self._run_number = 0  # number of this calibration; timers of earlier ones do nothing
+        self._sensor = ""  # sensor that is being calibrated; empty if none is
+        self._run_number = 0  # number of this calibration; timers of earlier calibrations do nothing
 
     @property
     def is_running(self) -> bool:

@@ -148,9 +148,9 @@ class Px4Vehicle(Px4Host):
         self.mode_after_landing: Px4Mode = modes.HOLD
         self.vtol_state: int = 0
         """MAV_VTOL_STATE to report. Assign a value to simulate a VTOL. The motion of the vehicle does not change."""
-        self._touchdown_at = math.nan
-        self._landed_at = math.nan
-        self._has_flown = False
+        self._touchdown_at = math.nan  # NaN while the vehicle does not touch the ground
+        self._landed_at = math.nan  # when the landing was detected; NaN before
+        self._has_flown = False  # True after a take-off, until the vehicle is armed again
         self.flight: Px4Flight = self._make_flight()
         self.mission: Px4Mission = self._make_mission()
         self.failsafes: Px4Failsafes = Px4Failsafes(self)
@@ -285,8 +285,8 @@ class Px4Vehicle(Px4Host):
         self.is_in_failsafe = False
         self.intended_mode = mode
         self.failsafes.override()
-        # If the vehicle is already in the requested mode, the request restarts a mission, and in other modes it holds
-        # the current position.
+        # A request for the present mode restarts the mission if this mode is MISSION. Otherwise, the vehicle stays at
+        # its present position.
         if mode == self.mode == modes.MISSION:
             self.mission.enter()
         elif mode == self.mode:

@@ -51,7 +51,7 @@ _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
     """Return the handlers of the commands that have no object of their own."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
-    handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None: send no acknowledgement.
+    handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None sends no acknowledgement.
     handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
     handlers[Cmd.CONTROL_HIGH_LATENCY] = lambda _: _refuse_high_latency(px4)
     handlers[Cmd.INJECT_FAILURE] = lambda command: _inject_failure(px4, command)

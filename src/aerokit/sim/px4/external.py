@@ -31,8 +31,8 @@ class Px4External:
         """Number of answers to the vehicle's TIMESYNC requests."""
         self.origin: GlobalPoint | None = None
         """Origin set by SET_GPS_GLOBAL_ORIGIN."""
-        self._vision_at = self._target_at = -math.inf
-        self._target: tuple[float, float] = (0.0, 0.0)
+        self._vision_at = self._target_at = -math.inf  # times of the last measurements
+        self._target: tuple[float, float] = (0.0, 0.0)  # (north, east) of the landing target
         self.wind: tuple[float, float] | None = None
         """Wind of EXTERNAL_WIND_ESTIMATE: the speed in m/s, and the direction in degrees from which it comes."""
         px4.on(m.Odometry, self._on_vision)

@@ -230,7 +230,7 @@ class Px4Failsafes:
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
-        is_known_at_arming = state <= self._battery_at_arming  # The pilot armed in this state, so it only warns.
+        is_known_at_arming = state <= self._battery_at_arming  # The pilot armed in this state, so only warn.
         has_action = action in (_BATTERY_LAND, _BATTERY_RETURN)
         if state == MavBatteryChargeState.LOW or is_known_at_arming or not has_action:
             return Action.WARN

@@ -106,7 +106,7 @@ class Px4Flight:
         self._vehicle = vehicle
         self.target: Ned = (0.0, 0.0, 0.0)  # Point of the local frame to which HOLD, TAKEOFF and RTL fly.
         self.destination: Ned = (0.0, 0.0, 0.0)  # Landing point of RTL, which is home or a rally point.
-        self.heading: float | None = None
+        self.heading: float | None = None  # Heading in radians; None if the nose points in the direction of flight.
         self.speed_m_s: float = 0.0
         self.radius_m: float = 0.0  # Radius of the circle that a plane flies.
         self.lifts_off: bool = False  # True if the mode wants to leave the ground.

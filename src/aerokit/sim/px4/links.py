@@ -23,7 +23,7 @@ from aerokit.sim.px4.host import Px4Host
 
 _INITIAL_SEQUENCE = 65526
 _INFO_LEVELS = 102
-# Numbers of the reasons in the events.
+# Numbers that PX4's events use for the reasons of arming and disarming.
 _OTHER_REASON = 0
 _ARMED_BY = {"external command": 4, "mission start": 5}
 _DISARMED_BY = {"external command": 4, "landing": 6, "auto preflight disarming": 7}

@@ -33,7 +33,7 @@ _MAX_FIRST_DISTANCE_M = 10_000.0
 
 
 def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about why a mission cannot be flown, or None. The glide slope of a landing is not checked."""
+    """Return the text with which PX4 rejects a mission; None if it is accepted. Glide slopes are not checked."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
@@ -52,7 +52,7 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
 
 
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about a missing take-off or landing, or None.
+    """Return PX4's text about a missing take-off or landing; None if nothing is missing.
 
     MIS_TKO_LAND_REQ is 0 to require nothing, 1 a take-off, 2 (the default of planes) a landing, 3 both, 4 both or none.
     """
@@ -81,7 +81,7 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about a wrong order of DO_LAND_START, landing and return, or None."""
+    """Return PX4's text about a wrong sequence of DO_LAND_START, landing and return; None if it is right."""
     # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):
@@ -144,7 +144,7 @@ class Px4Mission:
         self._phase = ""  # Phase of the current item: "climb", "go" or "land".
         self._arrived_at = math.nan  # time of arrival at the current item; NaN before
         self._jumps: dict[int, int] = {}  # Number of jumps that each DO_JUMP has done, by its index.
-        self._state = int(MissionState.NO_MISSION)  # MissionState
+        self._state = int(MissionState.NO_MISSION)  # a MISSION_STATE
         self._repeats_left = 0  # how often MISSION_ITEM_REACHED is still repeated
         self._is_report_scheduled = False  # True while a repetition is due
 
@@ -294,7 +294,7 @@ class Px4Mission:
             return
         target = self._place(item)
         north, east, down = target
-        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None: look ahead.
+        px4.flight.heading = math.radians(item.param4) if self._has_heading(item) else None  # None to look ahead
         if px4.is_landed or item.command in _TAKE_OFFS:  # On the ground, every item begins with a climb.
             self._climb(down if item.command in _TAKE_OFFS else None)
         elif item.command in _LANDINGS:

@@ -146,7 +146,7 @@ def _heading(degrees: float) -> float:
     return float32(radians * _DEGREES_PER_RADIAN)
 
 
-# By storage type: functions that return the value that is read after a value was stored.
+# Maps a storage type to the function that converts an uploaded value to the value that a download returns.
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,

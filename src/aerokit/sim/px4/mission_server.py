@@ -46,7 +46,7 @@ class _Link(ListUpload):
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0  # checksum of the items received so far
-    current: int = -1  # index of the item that the client marked as current; -1: none
+    current: int = -1  # index of the item that the client marked as current; -1 if there is none
 
     @property
     def is_retried(self) -> bool:
@@ -312,7 +312,8 @@ class Px4MissionServer(MissionServer):
         link = self._link(upload.channel)
         item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
-        item_in_e7 = item  # has its latitude and longitude in degrees times 1e7, also if received in MISSION_ITEM
+        item_in_e7 = item
+        # A MISSION_ITEM has latitude and longitude in degrees instead of degrees times 1e7.
         if not is_int and item.frame != MavFrame.MISSION:
             item_in_e7 = item.replace(x=_e7(item.x), y=_e7(item.y))
         stored_item = as_stored(item_in_e7, link.mission_type, is_int=is_int)

@@ -51,7 +51,7 @@ class Px4Offboard:
         self._attitude: tuple[float, float, float] | None = None
         self._body_rates: tuple[float, float, float] | None = None
         self._flown_at = 0.0  # time of the last call of `fly`
-        self._thrust = 0.0  # 0 to 1, with `_attitude`
+        self._thrust = 0.0  # thrust that belongs to `_attitude`, from 0 to 1
         vehicle.on(SetPositionTargetLocalNed, self._on_local)
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
@@ -165,8 +165,8 @@ class Px4Offboard:
     def fly(self) -> None:
         """Follow the latest set-point for one tick."""
         motion = self._vehicle.motion
-        # `fly` is called only in OFFBOARD. If the last call was before another mode, the elapsed time is limited to
-        # MAX_TICK_S.
+        # `fly` is called only in OFFBOARD. Without the limit, the first call after another mode would count the whole
+        # time in that mode.
         elapsed = min(MAX_TICK_S, self._vehicle.now - self._flown_at)
         self._flown_at = self._vehicle.now
         if self._attitude is not None:

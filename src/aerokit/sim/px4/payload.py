@@ -53,7 +53,7 @@ class Px4Gimbal:
         self._target = self._rates = _NEUTRAL
         self._target_at = 0.0
         self._flags = 0  # GIMBAL_MANAGER_FLAGS
-        self._place: tuple[int, int, float] | None = None  # region of interest; None: follow the set-point
+        self._place: tuple[int, int, float] | None = None  # region of interest; None to follow the set-point
         self._was_returning = False  # True if the vehicle was returning at the last check
         self.is_fitted: bool = False  # True if MNT_MODE_IN enabled the gimbal at power-on.
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
@@ -107,7 +107,7 @@ class Px4Gimbal:
         return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Turn to angles (NaN: stay), then turn on at rates. The flag RETRACT is accepted, but has no effect."""
+        """Turn to angles (NaN keeps the present ones), and then at rates. The flag RETRACT has no effect."""
         if flags & Flags.RETRACT:
             return
         current = self.angles()
@@ -258,7 +258,7 @@ class Px4CameraTrigger:
         self.sends_image_captured = True  # False simulates a PX4 without the geotag module.
         self._is_enabled = False
         self._is_paused = False
-        self._series_number = 0  # number of this series; timers of earlier ones do nothing
+        self._series_number = 0  # number of this series; timers of earlier series do nothing
         self._last_at = -math.inf  # time of the last image
 
     @property

@@ -77,7 +77,7 @@ class _Writer(FileHandle):
         self._written = 0  # number of bytes received so far
         self._announced: tuple[int, int] | None = None  # Number of entries and file size; None before the header.
         self._count = 0  # number of entries that were applied
-        self._previous_name = b""  # name in the last entry, with which the next one may share its beginning
+        self._previous_name = b""  # name in the last entry; the next name may begin with the same letters
         self._is_rejected = False  # True once the upload has failed
 
     def read(self, offset: int, size: int) -> bytes:

@@ -135,7 +135,7 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
 def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
     """Build BATTERY_STATUS."""
     battery = px4.battery
-    voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)  # 0xFFFF: there is no such cell.
+    voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)  # 0xFFFF means that there is no such cell.
     return m.BatteryStatus(
         id=0,
         battery_function=MavBatteryFunction.ALL,
