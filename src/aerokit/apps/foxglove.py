@@ -116,7 +116,7 @@ async def foxglove_bridge(
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
-    """Return the messages of the connection's dialect whose names match a pattern, each once."""
+    """Return the messages of the connection's dialect whose names match a pattern, without duplicates."""
     by_id: dict[int, type[Message]] = {}
     for pattern in patterns:
         matching = [message for message in connection.bus.dialect if fnmatchcase(message.NAME, pattern.upper())]

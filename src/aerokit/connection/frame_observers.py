@@ -51,7 +51,7 @@ class Recording:
         self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
         self._writer: TlogWriter | None = None  # None before the first received frame and after the end
         self._file: BinaryIO | None = None  # the file, if it was created here
-        # Sent frames that wait until a frame is received and the existing file is renamed. None: no frame must wait.
+        # Sent frames that wait until a frame is received and the existing file is renamed. None if no frame must wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.

@@ -155,7 +155,7 @@ class Display:
         del record["result"]
         shown_pose, shown_instruction = self._shown
         self._shown = step.pose, step.instruction
-        text = None  # unless the pose changes, the step only reports progress
+        text = None  # if neither pose nor instruction has changed, the step only reports progress
         if step.pose is not shown_pose:
             text = "\n".join(lines_of(step))
         elif step.instruction != shown_instruction:

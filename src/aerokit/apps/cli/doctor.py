@@ -43,7 +43,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 """Maps extras to their modules. A test compares them with pyproject.toml."""
 
-# Network ports: number, usual purpose, and True for UDP (False: TCP).
+# Each network port has a number, a usual purpose, and True for UDP or False for TCP.
 _COMMON_PORTS = (
     (14550, "the port of ground stations such as QGroundControl and MAVProxy", True),
     (14540, "PX4's simulator sends to it", True),

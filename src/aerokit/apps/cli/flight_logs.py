@@ -109,7 +109,7 @@ async def _report(options: argparse.Namespace) -> int:
 
     target = options.output or options.log.with_suffix(".html")
     for log in logs:
-        check_log_name(log)  # before the target is checked, because its default is derived from this name
+        check_log_name(log)  # before the target, whose default is derived from the log's name
     check_not_existing(target, options)
     with progress_bar(options.log.name, "B") as on_progress:
         report = write_report(

@@ -149,7 +149,7 @@ class PlanFlight(SupervisedFlight):
             self._report.prints_status = True
 
     async def _print_progress(self) -> None:
-        """Print each new mission item. Explain a change of the mode, after which the flight does not end at once."""
+        """Print each new mission item. If the mode changes, explain why the flight does not end at once."""
         with (
             self._vehicle.subscribe(events.MissionCurrentChanged, events.ModeChanged, capacity=100) as changes,
             suppress(AerokitError),

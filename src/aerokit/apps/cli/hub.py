@@ -112,7 +112,7 @@ async def _hub(options: argparse.Namespace) -> int:
                         await stop.wait()
                     if not stop.is_set():
                         _emit_statistics(options, hub)
-            _emit_statistics(options, hub)  # of the whole time
+            _emit_statistics(options, hub)  # totals since the start
     # Without --seconds, Ctrl-C is the normal end of the command.
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
 

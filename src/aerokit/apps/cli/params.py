@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
-# How long to read the names of the vehicle's parameters, if only a suggestion needs them.
+# How long to read the names of the vehicle's parameters when only a suggestion needs them.
 _NAMES_TIMEOUT_S = 10.0
 # If the given name begins with a known name of at least this length, the known name is suggested.
 _MIN_BEGINNING = 5
@@ -169,7 +169,7 @@ async def _set(options: argparse.Namespace) -> int:
     values = dict(options.values)
     metadata = load_metadata_option(options)
     if not options.force:
-        check_allowed(metadata, values)  # with a file of metadata, already before connecting
+        check_allowed(metadata, values)  # if --metadata is given, values are checked before connecting
     async with connected(options, changes=True) as vehicle:
         if metadata is None:
             metadata = await metadata_for_check(vehicle, from_file=None, options=options)

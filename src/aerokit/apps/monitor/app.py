@@ -41,7 +41,7 @@ REFRESH_INTERVAL_S = 0.5
 WIDE_SIZE = 120, 30
 """Minimum columns and rows of a terminal in which less important values are displayed, too."""
 TALL_ROWS = 48
-"""Minimum rows of a wide terminal in which the state has more lines, for all reasons that prevent a flight."""
+"""Minimum rows of a wide terminal in which the state lists all reasons that prevent a flight."""
 ANSI_THEMES = ("ansi-dark", "textual-ansi", "textual-dark")
 """Names of the theme that uses the terminal's colours. The name depends on the version of Textual."""
 TRACK_STYLES = ("green", "magenta", "red", "blue", "cyan", "yellow")
@@ -370,7 +370,7 @@ class Monitor(App[None]):
         texts = {name: _rate_text(hz) for name, hz in self._model.rates(vehicle.system_id) if hz}
         if not texts:
             return Text(UNKNOWN, "dim")
-        # Sorts by the displayed numbers, not by the exact rates, so that equal numbers stay in the order of the names.
+        # Sort by the displayed numbers, not by the exact rates. Names with equal numbers are in alphabetical order.
         names = sorted(texts, key=lambda name: (-float(texts[name]), name))
         lines = "\n".join(f"{texts[name]:>5} {name}" for name in names)
         return Text(lines, no_wrap=True, overflow="ellipsis")

@@ -214,7 +214,7 @@ class ServedVehicles:
             await anyio.sleep(TRACK_INTERVAL_S)
 
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
-        """Return the overview of a vehicle, with what the page shows besides: see docs/serve.md.
+        """Return the overview of a vehicle, and further values that the page shows (docs/serve.md).
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
         wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
@@ -247,7 +247,7 @@ class ServedVehicles:
 
 
 async def _read_return_altitude(vehicle: Vehicle) -> None:
-    with suppress(AerokitError):  # the altitude then stays unknown
+    with suppress(AerokitError):  # after an error, the altitude stays unknown
         await vehicle.return_altitude()
 
 

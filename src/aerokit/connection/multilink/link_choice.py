@@ -17,7 +17,7 @@ PROBED_TIMEOUT_S = 1.0
 # missing.
 UNPROBED_TIMEOUT_S = 2.5
 
-# Consecutive matching clock samples that prove that a second link leads to the same vehicle.
+# This many consecutive matching clock samples prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
 # A vehicle that answers this many TIMESYNC probes after the request for its hardware id, but not the request itself,

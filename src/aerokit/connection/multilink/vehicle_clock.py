@@ -60,7 +60,7 @@ class VehicleClock:
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample is as expected from the last sample and the speed; None if the speed is unknown."""
+        """Return True if a sample is as expected from the last one and the clock's speed; None if that is unknown."""
         speed = self._speed
         if speed is None:
             return None
@@ -74,7 +74,7 @@ class VehicleClock:
         advance_s = vehicle_s - last_vehicle_s
         speed = self._measured_speed
         if speed is None:
-            # The speed of the vehicle's clock is not measured yet. In a simulation, it may be up to MAX_SPEED.
+            # The rate of the vehicle's clock is not measured yet. A simulation may run up to MAX_SPEED times as fast.
             max_advance_s = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
             return -TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
         tolerance_s = self._tolerance_s(at, round_trip_s, speed)
