@@ -159,7 +159,7 @@ class SourceStatistics(SourceFields):
     def _on_repeated(self, sequence: int, now: float) -> int:
         """Process a frame with an old number that was not missing. Return a result of :meth:`out_of_order`.
 
-        A single such frame is a repetition. Several in direct succession show that the sender rebooted.
+        A single old number is a repetition. Several in direct succession show that the sender rebooted.
         """
         follows = sequence == (self._late_sequence + 1) & 0xFF
         is_direct_succession = follows and self._late_count == self.received
@@ -194,7 +194,7 @@ class SourceStatistics(SourceFields):
         """Process a frame that continues the other stream. Return a result of :meth:`out_of_order`.
 
         Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
-        other one does.
+        other stream counts as the sender's.
         """
         count = self.received - self._stream_start
         is_other_longer = self._other_count > count

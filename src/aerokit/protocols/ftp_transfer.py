@@ -234,7 +234,7 @@ class FtpDownload(FtpExchange[int]):
         is_end = reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
-        elif is_end:  # The offset is at or after the end: an ACK without data, EOF, or any error after the known size.
+        elif is_end:  # An ACK without data also means that the offset is not before the end of the file.
             self._end_at(offset)
         else:
             self._fail(self._refused(reply))

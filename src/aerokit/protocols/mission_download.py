@@ -240,7 +240,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # ------------------------------------------------------------------------------------ end
 
     def _end(self) -> None:
-        # PX4 (window 1) accepts no upload for 5 s if the acknowledgement is lost, so it is sent twice.
+        # If PX4 (window 1) misses the acknowledgement, it accepts no upload for 5 s. PX4 therefore gets two of them.
         transmissions = 2 if self._window == 1 else 1
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions
         items = tuple(self._items[seq] for seq in self._indices)

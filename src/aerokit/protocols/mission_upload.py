@@ -253,7 +253,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _restart(self, now: float) -> None:
         """Begin again, because the vehicle's transfer has expired or was cancelled."""
-        if not self._is_accepted:  # An older transfer was cancelled.
+        if not self._is_accepted:  # The vehicle has cancelled an older transfer, not this one.
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
             self._refuse(MavMissionResult.OPERATION_CANCELLED)

@@ -156,7 +156,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # A delayed message may have had the old value, so it is read once more.
+                self._window.request(name)  # Read it once more, because a delayed message may have had the old value.
             else:
                 self._settle(name, reported, now)
                 self._reject_alternatives(name, now)
@@ -264,7 +264,7 @@ class ParameterWrites(ParameterRequests):
             return
         unexpected.add(reported)
         self._window.on_answer(name, now)
-        before = self._before.get(name)  # None: unknown, so the value may be unchanged
+        before = self._before.get(name)  # None if unknown; the reported value may then be the old one
         is_unchanged = before is None or same_value(reported.value, before)
         if is_unchanged and not is_as_requested:
             self._to_set.add(name)  # The value is still the old one, so PARAM_SET is sent again.

@@ -98,7 +98,7 @@ class _Reader:
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight)
-        # Commands that the vehicle itself has sent are not handled, because it sends them to its components. For
+        # Commands that the vehicle itself has sent are ignored, because they are for its own components. For
         # example, PX4 informs its components when it has decided to return.
         commands: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._mode_commands.on_command,
@@ -196,7 +196,7 @@ class _Reader:
         setpoints, destinations = self._flight.position_target, self._destinations
         if setpoints.has("latitude_deg"):
             return
-        has_heights = setpoints.has()  # set-points without latitudes have only heights
+        has_heights = setpoints.has()  # without latitudes, set-points have only heights
         rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints), strict=True))
         columns = (destinations[name] for name in destinations)
         for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
@@ -391,7 +391,7 @@ class _Reader:
 
     def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
         cells_mv = [mv for mv in message.voltages if mv != _U16]
-        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0: the cell does not exist
+        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 if the cell does not exist
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         state = message.charge_state
@@ -423,7 +423,7 @@ class _Reader:
     def _on_servo_output(self, time_s: float, message: m.ServoOutputRaw) -> None:
         if message.port == 0:  # the main outputs
             pulses = (getattr(message, f"servo{number}_raw") for number in range(1, 9))
-            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0: the output is not used
+            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0 if the output is not used
 
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)

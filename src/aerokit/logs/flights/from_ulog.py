@@ -207,7 +207,7 @@ class _Reader:
         fields = ("nav_state", "nav_state_user_intention", "failsafe")
         for time_s, state, intended_state, failsafe in status.rows(*fields):
             name = _NAV_STATES.get(int(state), f"MODE {int(state)}")
-            # The autopilot itself changed the mode if it is not the mode that the pilot or a program requested.
+            # If the mode is not the one that the pilot or a program requested, the autopilot itself has changed it.
             by_autopilot = None if math.isnan(intended_state) else bool(state != intended_state)
             reason = ""
             if failsafe == 1:
@@ -221,7 +221,7 @@ class _Reader:
         if flags is None:
             return
 
-        # Flags on the ground, until one second after arming, are ignored, because many are set there.
+        # Flags are ignored until one second after arming, because many flags are set on the ground.
         def is_armed(time_s: float) -> bool:
             return any(begin + 1 < time_s <= end for begin, end in flight.armed)
 
@@ -267,7 +267,7 @@ class _Reader:
     def _track_of_receiver(self) -> None:
         receiver = self._topic("vehicle_gps_position", "sensor_gps")
         if receiver is not None:
-            has_integers = "lat" in receiver  # old versions: 1e-7 degrees and millimetres
+            has_integers = "lat" in receiver  # old versions of PX4 log 1e-7 degrees and millimetres
             fields = ("lat", "lon", "alt") if has_integers else ("latitude_deg", "longitude_deg", "altitude_msl_m")
             per_degree, per_metre = (1e7, 1e3) if has_integers else (1, 1)
             for time_s, fix_type, latitude, longitude, amsl in receiver.rows("fix_type", *fields):
@@ -327,9 +327,9 @@ class _Reader:
             remaining = battery.array("remaining") * 100
             remaining[remaining < 0] = NAN
             current = battery.array("current_a")
-            current[current < 0] = NAN  # -1: unknown
+            current[current < 0] = NAN  # -1 means unknown
             voltage, used = battery.array("voltage_v"), battery.array("discharged_mah")
-            voltage[voltage <= 0] = NAN  # 0: unknown
+            voltage[voltage <= 0] = NAN  # 0 means unknown
             used[used < 0] = NAN
             _extend(
                 flight.battery(number),
