@@ -215,6 +215,7 @@ class _TopicChannels:
         self._channels.clear()
 
     def _publish_states(self, system_id: int, vehicle: Vehicle) -> None:
+        """Send the states of a vehicle that are newer than the last ones sent, and at intervals its link."""
         for state, cell in vehicle.telemetry.cells.items():
             value, name = cell.latest, topics.vehicle_topic(system_id, state)
             if value is None:

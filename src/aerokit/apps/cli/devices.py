@@ -236,6 +236,7 @@ async def _gimbal(options: argparse.Namespace, *, changes: bool = True) -> Async
 
 
 async def _gimbal_info(options: argparse.Namespace) -> int:
+    """Print the description of the gimbal and, if it arrives soon, the attitude."""
     async with _gimbal(options, changes=False) as gimbal:
         try:
             information = await gimbal.information()

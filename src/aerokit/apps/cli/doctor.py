@@ -167,6 +167,7 @@ async def run_doctor(options: argparse.Namespace) -> int:
 
 
 def _check_computer(report: Callable[[Finding], None]) -> None:
+    """Report findings on the installation, the serial ports and the common network ports."""
     for finding in check_installation():
         report(finding)
     ports = serial_ports()

@@ -60,6 +60,7 @@ class PlanFlight(SupervisedFlight):
         """Text about what was sent to the vehicle before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
+        """Upload the plan, ask for confirmation if needed, arm, and fly the mission to its end."""
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}")
         self._check_vehicle()
@@ -272,6 +273,7 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
 async def _connect_and_fly(
     options: argparse.Namespace, plan: Plan, interrupts: InterruptStack, flights: list[PlanFlight]
 ) -> int:
+    """Connect to the vehicle or simulate one, fly the plan, and print the summary. Return the exit code."""
     async with AsyncExitStack() as stack:
         stack.enter_context(new_recording(options.record))
         link: str | Link = options.connect or default_address()

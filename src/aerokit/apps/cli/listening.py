@@ -113,6 +113,7 @@ async def _wait_for_end(connection: Connection, options: argparse.Namespace) -> 
 
 
 def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], seconds: float) -> None:
+    """Print how many frames of which messages were recorded. The keys of ``counts`` are (system id, message id)."""
     from aerokit.mavlink.dialect import STANDARD
 
     messages: Counter[str] = Counter()

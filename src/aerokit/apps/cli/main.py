@@ -211,6 +211,7 @@ class _TopParser(Parser):
     """The parser of ``aerokit`` itself. Its help lists the commands by task."""
 
     def format_help(self) -> str:
+        """Return the help, in which the commands are grouped as in `GROUPS`."""
         *options, subparsers = self._actions
         assert isinstance(subparsers, argparse._SubParsersAction)
         commands = {action.dest: action for action in subparsers._get_subactions()}

@@ -220,6 +220,7 @@ async def _show(options: argparse.Namespace) -> int:
 
 
 async def _download(options: argparse.Namespace) -> int:
+    """Write the mission to a waypoint file or, with fence and rally points, to a ``.plan`` file."""
     from aerokit.missions import Plan, write_plan_file, write_waypoint_file
 
     check_not_existing(options.file, options)
@@ -248,6 +249,7 @@ async def _upload(options: argparse.Namespace) -> int:
 
 
 async def _check(options: argparse.Namespace) -> int:
+    """Print the items of a plan file, and warnings and notes about them. Nothing is sent."""
     plan = read_plan(options.file)
     has_items = False
     for part in PARTS:

@@ -95,6 +95,7 @@ def connected(options: argparse.Namespace, *, changes: bool = False) -> Abstract
 
 
 async def _list(options: argparse.Namespace) -> int:
+    """Print the parameters whose names match a pattern. A pattern without wildcards matches parts of names."""
     metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
@@ -151,6 +152,7 @@ async def _save(options: argparse.Namespace) -> int:
 
 
 async def _diff(options: argparse.Namespace) -> int:
+    """Print the differences from a file. Return FAILED if there are any."""
     from aerokit.parameters import read_parameter_file
 
     file_values = read_parameter_file(options.file)
@@ -166,6 +168,7 @@ async def _diff(options: argparse.Namespace) -> int:
 
 
 async def _set(options: argparse.Namespace) -> int:
+    """Set parameters, after a check of the values against the metadata, and print the results."""
     values = dict(options.values)
     metadata = load_metadata_option(options)
     if not options.force:
@@ -188,6 +191,7 @@ async def _set(options: argparse.Namespace) -> int:
 
 
 async def _load(options: argparse.Namespace) -> int:
+    """Set the parameters of a file, and print the results that are not "unchanged" (all results with --json)."""
     from aerokit.parameters import read_parameter_file
 
     file_values = read_parameter_file(options.file)

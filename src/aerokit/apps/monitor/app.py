@@ -288,6 +288,7 @@ class Monitor(App[None]):
             add_line(f"{command}: {done}", "bold green")
 
     def _update_list(self, options: OptionList) -> None:
+        """Add new vehicles to the list, select the first one if none is selected, and redraw changed rows."""
         vehicles = self._model.vehicles
         for system_id in vehicles:
             if system_id not in self._listed_ids:

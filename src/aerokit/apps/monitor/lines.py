@@ -85,6 +85,7 @@ class VehicleText:
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
+        """Return the labels and values of the rows that are always shown."""
         vehicle = self._vehicle
         cell = self.cell
         rows = [

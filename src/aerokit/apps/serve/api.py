@@ -181,6 +181,7 @@ def _operation(operation: Operation) -> dict[str, Any]:
 
 
 def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
+    """Yield the OpenAPI parameters of an operation: in the path, in the query and, for orders, in the headers."""
     for name in re.findall(r"{(\w+)}", operation.path):
         schema = {"type": "integer", "minimum": 1, "maximum": 255} if name == "system_id" else {"type": "string"}
         yield {"name": name, "in": "path", "required": True, "schema": schema}

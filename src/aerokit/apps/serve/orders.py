@@ -397,6 +397,7 @@ class OrderRunner:
     async def _run(
         self, vehicle: Vehicle, order_type: OrderType, record: OrderRecord, arguments: dict[str, Any]
     ) -> None:
+        """Run an order, and store and publish its result or error."""
         try:
             record.result = to_jsonable(await order_type.run(vehicle, arguments))
             record.state = "done"

@@ -46,6 +46,7 @@ class StateStream:
         self._anonymous: set[WebSocket] = set()
 
     async def endpoint(self, socket: WebSocket) -> None:
+        """Handle one WebSocket, from its request until its end."""
         try:
             rate_hz = self._admit(socket)
         except HttpProblem as problem:

@@ -135,6 +135,7 @@ class BinReader(_RowReader):
             close_bin(self._reader)
 
     def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
+        """Yield a record for each row, except descriptions of tables. Report the progress to ``on_bytes``."""
         count = 0
         while (message := self._next(reader)) is not None:
             count += 1

@@ -390,6 +390,7 @@ class _Reader:
         )
 
     def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
+        """Add the values of a battery, and evidence of a failsafe if its charge state has become worse."""
         cells_mv = [mv for mv in message.voltages if mv != _U16]
         cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 if the cell does not exist
         if message.id == 0 and cells_mv:

@@ -153,6 +153,7 @@ class _Reader:
         self._began_us = min([int(log.start_timestamp), *first_times])
 
     def read(self) -> None:
+        """Fill the flight with the texts, the parameters and all topics of the log."""
         flight, log = self._flight, self._log
         flight.autopilot = "PX4"
         flight.vehicle = _version(log)
@@ -217,6 +218,7 @@ class _Reader:
             self._flight.add_mode(time_s, name, reason, by_autopilot)
 
     def _failsafe_flags(self) -> None:
+        """Add evidence of failsafes for the flags that were set while the vehicle was armed."""
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
@@ -239,6 +241,7 @@ class _Reader:
                 )
 
     def _movement(self) -> None:
+        """Read home, track, velocity, attitude and airspeed."""
         flight = self._flight
         home = self._topic("home_position")
         if home is not None:
@@ -287,6 +290,7 @@ class _Reader:
         _extend(columns, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
 
     def _targets(self) -> None:
+        """Read the set-points. PX4 logs positions in metres from the local origin."""
         flight = self._flight
         self._angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
         setpoint = self._topic("vehicle_local_position_setpoint")
@@ -322,6 +326,7 @@ class _Reader:
         return origin
 
     def _equipment(self) -> None:
+        """Read batteries, GPS receivers, the estimator, vibration and links."""
         flight = self._flight
         for number, battery in self._topics("battery_status"):
             remaining = battery.array("remaining") * 100
@@ -366,6 +371,7 @@ class _Reader:
         self._links()
 
     def _links(self) -> None:
+        """Read the loss of messages and the values of the telemetry radio."""
         # PX4 may have several links. The data of the link that received the most messages is used.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
