@@ -165,7 +165,7 @@ def keep_existing(path: str | os.PathLike[str]) -> str | None:
     for number in itertools.count(1):
         kept = f"{stem}.{number}{suffix}"
         try:
-            os.close(os.open(kept, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # This claims the name.
+            os.close(os.open(kept, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # Creating the file claims the name.
         except FileExistsError:
             continue
         try:

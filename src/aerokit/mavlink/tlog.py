@@ -76,7 +76,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
                 or data[end : end + 2] > _MAX_TIME_PREFIX
             ):
                 end = _record_end(data, begin, min_time)
-        except IndexError:  # This is the last record, or garbage.
+        except IndexError:  # The data ends here, so this is the last record, or garbage.
             end = _record_end(data, begin, min_time)
         if end is None:
             if len(data) - begin <= 8:

@@ -242,13 +242,13 @@ class ParameterWrites(ParameterRequests):
         """Accept the reported value as the result, or request it again, because it may be old or unintended."""
         name = message.param_id
         if not self._window.attempts(name):
-            return  # This answers another station, because our write of this name was not sent yet.
+            return  # The message answers another station, because our write of the name was not sent yet.
         requested = self._requested[name]
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recent:
-            # This may be the late answer to the earlier write, so the value is read once more.
+            # The message may be the late answer to the earlier write, so the value is read once more.
             self._recent.remove(name)
             unexpected.add(reported)
             self._window.on_answer(name, now)

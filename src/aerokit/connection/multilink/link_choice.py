@@ -231,8 +231,8 @@ class LinkChoice:
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is our time at that moment."""
         candidate = self.candidates[link]
-        # True if the link in use did not answer since the previous answer over this link. This is determined before the
-        # new answer is recorded.
+        # True if the link in use has not answered since the previous answer over this link. Recording the new answer
+        # would change the result, so it follows below.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:

@@ -438,7 +438,7 @@ def _message_id_bytes(kind: type[Message]) -> bytes:
 def _decoded(raw: bytes, unix_s: float) -> Message | None:
     """Decode the frame of a record; None if its checksum is wrong."""
     if raw[0] == MAGIC_V2:
-        # This is faster than `Frame.parse`. A signature after the checksum is ignored.
+        # Setting the attributes is faster than `Frame.parse`. A signature after the checksum is ignored.
         frame = Frame()
         end = 10 + raw[1]  # the end of the payload
         frame.body = raw[1:end]
