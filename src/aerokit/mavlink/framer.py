@@ -147,6 +147,7 @@ class PythonFramer:
                 body = b""
                 end = sequence = key = message_id = checksum = 0
             if not is_valid:
+                # Kept data was examined before, so `_search` continues with the findings in `scan`.
                 next_frame = None
                 if data[begin] in _MAGICS and (begin or scan is _NEW_SCAN):
                     _, _, next_frame = self._examine(data, begin)

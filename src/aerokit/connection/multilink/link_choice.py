@@ -284,10 +284,9 @@ class LinkChoice:
 
     def choose(self, now: float) -> str | None:
         """Select the link to use. Return the reason if it changes, otherwise None."""
-        alive = sorted(
-            (link for link in self.candidates.values() if self.may_be_used(link) and link.is_alive(now)),
-            key=lambda candidate: (candidate.is_costly, candidate.cost_s),
-        )
+        usable = filter(self.may_be_used, self.candidates.values())
+        alive = [candidate for candidate in usable if candidate.is_alive(now)]
+        alive.sort(key=lambda candidate: (candidate.is_costly, candidate.cost_s))
         if not alive:
             return None
         best, used = alive[0], self.used
@@ -296,6 +295,7 @@ class LinkChoice:
         if used not in alive:
             return self._change(best, used.failure(), now)
         is_better = best.is_costly < used.is_costly or best.cost_s < MAX_COST_RATIO * used.cost_s
+        # A better link replaces the link in use only after it has stayed the best for MIN_BETTER_S.
         if best is used or not is_better:
             self._better = None
         elif best is not self._better:

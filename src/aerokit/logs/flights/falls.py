@@ -94,7 +94,7 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
                 yield begin_s, time_s, sink_m_s, True
             begin_s, sink_m_s = time_s, 0.0
         previous_s = time_s
-    is_fast_at_end = last_fast_s == previous_s > begin_s
+    is_fast_at_end = last_fast_s == previous_s and last_fast_s > begin_s
     if is_fast_at_end:
         yield begin_s, last_fast_s, sink_m_s, False
 

@@ -143,6 +143,7 @@ class _Reader:
                     message_id, sender, sequence = raw[5:6] + b"\0\0", raw[3:5], raw[2]
                 if sender == source:
                     new_frames += 1
+                    # To save calls, frames are counted together until a frame is missing or a second ends.
                     if sequence != expected_sequence or unix_s >= next_second:
                         if unix_s - last_frame_at >= MIN_SILENCE_S:
                             link.add_silence(
