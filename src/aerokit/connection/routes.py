@@ -30,7 +30,7 @@ CLAIM_MIN_FRAMES = 3
 class Evidence(NamedTuple):
     """Evidence in a frame of another peer: True if it continues the stream of the owner, None if unknown."""
 
-    expected: int  # the owner's next frame number
+    expected: int  # the owner's next sequence number
     sequence_matches: bool | None
     clock_matches: bool | None
 

@@ -73,7 +73,7 @@ class SourceStatistics(SourceFields):
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_base` is missing
         self._missing_base = sequence  # value of `expected` to which `_missing` refers
         self._late_sequence = -1  # sequence number of the last repeated frame
-        self._late_count = -1  # value of `received` at that frame
+        self._late_count = -1  # value of `received` when that frame arrived
         self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations = 0  # how often the two streams have alternated

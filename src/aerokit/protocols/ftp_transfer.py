@@ -42,7 +42,7 @@ MAX_GAPS = 512
 BURST_BLOCKS = 500
 # After each received block of a burst, the server counts as busy for the time of this many blocks.
 BUSY_BLOCKS = 3
-# Minimum seconds to wait for the first block of a long file, in which even a slow radio carries a few blocks.
+# Minimum seconds to wait for the first block of a long file. In this time, even a slow radio carries a few blocks.
 FIRST_BLOCK_TIMEOUT_S = 0.5
 SHORT_FILE = 20 * DATA_SIZE  # Up to this size in bytes, repeating a burst costs little.
 MAX_REPEATED_BURSTS = 3

@@ -28,7 +28,7 @@ _BAR_WIDTH = 30
 _CANCEL_TIMEOUT_S = 20.0
 
 _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
-# Poses whose pictures show the vehicle from behind. The other pictures show its right side, with the nose to the right.
+# Poses whose pictures show the vehicle from behind. The other pictures show its right side.
 _FROM_BEHIND = (CalibrationPose.LEFT, CalibrationPose.RIGHT)
 PICTURES: dict[CalibrationPose, str] = {
     CalibrationPose.LEVEL: r"""

@@ -283,7 +283,7 @@ class Monitor(App[None]):
         except AerokitError as error:
             add_line(f"{command} failed: {error}", "bold red")
         else:
-            # `hold` returns when the vehicle reports the mode. A vehicle with PX4 may then still be moving.
+            # `hold` returns when the vehicle reports the mode. A PX4 vehicle may still be moving then.
             done = f"in {vehicle.mode_name}, may still be stopping" if method == "hold" else "done"
             add_line(f"{command}: {done}", "bold green")
 

@@ -19,7 +19,7 @@ MAX_REMEMBERED = 4096  # number of remembered frames, enough for 10 s at 400 fra
 # An equal frame over another link is always a duplicate if it arrives within this time after the first.
 COPY_WINDOW_S = 3.0
 
-# A copy over a slow link may arrive up to this time after the first copy. Later than COPY_WINDOW_S, an equal frame can
+# A copy over a slow link may arrive up to this time after the first copy. After COPY_WINDOW_S, an equal frame can
 # only be a duplicate if the first copy was accepted.
 LATE_COPY_WINDOW_S = 10.0
 

@@ -89,7 +89,7 @@ class _Reader:
         self._mode_commands = RecordedModeCommands(flight, self._autopilot)
         self._system_status = 0
         self._has_battery_status = False
-        self._charge_states: dict[int, int] = {}  # by battery
+        self._charge_states: dict[int, int] = {}  # MAV_BATTERY_CHARGE_STATE by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
         self._local_position = (NAN, NAN, NAN)  # metres north, east and down of the estimator's origin
         self._relative_m = NAN
@@ -393,7 +393,7 @@ class _Reader:
     def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
         """Add the values of a battery, and evidence of a failsafe if its charge state has become worse."""
         cells_mv = [mv for mv in message.voltages if mv != _U16]
-        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 if the cell does not exist
+        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 means a missing cell
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         state = message.charge_state
@@ -425,7 +425,7 @@ class _Reader:
     def _on_servo_output(self, time_s: float, message: m.ServoOutputRaw) -> None:
         if message.port == 0:  # the main outputs
             pulses = (getattr(message, f"servo{number}_raw") for number in range(1, 9))
-            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0 if the output is not used
+            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0 means an unused output
 
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
