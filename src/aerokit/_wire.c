@@ -1,15 +1,16 @@
 /* The compiled wire: framing, decoding, encoding, checksums, and records of telemetry logs.
 
-   The Python modules of aerokit.mavlink are the reference: same results, same counters, same errors. What is rare
-   (noise, unknown messages, frames out of order, new senders, invalid values) is left to them, by a call.
+   The Python modules of aerokit.mavlink are the reference: this module has the same results, counters and errors. It
+   calls the Python code for rare cases: noise, unknown messages, frames out of order, new senders and invalid values.
 
-   The input is hostile: every read of it is behind a check of its length. Data is held in immutable bytes, which are
-   owned during every call of Python code. Fields of messages are read and written in the slots of their class: the
-   offsets are found, and verified, once for each class (`slot_of`).
+   The input may be hostile, so its length is checked before every read. The data is kept in immutable bytes objects,
+   and this module owns a reference to them whenever it calls Python code. It reads and writes the fields of messages
+   directly in the slots of their class. The offset of each slot is found once for each class (`slot_of`).
 
-   Only the limited API is used: one binary serves all versions of Python from 3.10. Nothing is static but constants:
-   each interpreter has its own module state. An interpreter with its own GIL refuses the module, because declaring
-   support needs the API of 3.12; free-threaded Python has no limited API. Both use the Python wire. */
+   The module uses only the limited API, so one binary serves all versions of Python from 3.10. Only constants are
+   static, and each interpreter has its own module state. Two kinds of interpreters use the Python code instead: those
+   with their own GIL, because a module can declare support for them only with the API of 3.12, and free-threaded ones,
+   which have no limited API. */
 
 #include <Python.h>
 #include <float.h>
@@ -17,7 +18,7 @@
 #include <string.h>
 #include <structmember.h>
 
-#define VERSION 1 /* as in _internal/wire.py */
+#define VERSION 1 /* must equal _VERSION in _internal/wire.py */
 
 enum { MAGIC_V1 = 0xFE, MAGIC_V2 = 0xFD, SIGNED = 1, SIGNATURE = 13, HEADER = 9, MAX_PAYLOAD = 255, MAX_FRAME = 280 };
 
@@ -25,7 +26,7 @@ enum { FRAME, SOURCE, COUNTERS, CLASSES, FRAMER = CLASSES, TABLE, LAYOUT, TYPES 
 
 typedef struct {
     PyTypeObject *types[TYPES];
-    PyTypeObject *classes[CLASSES]; /* those of Python derived from the first types, or NULL before `register` */
+    PyTypeObject *classes[CLASSES]; /* Python classes derived from the first `types`; NULL before `register` */
     PyObject *zero, *layout_name;
     uint16_t crc[8][256];
 } State;
@@ -69,7 +70,7 @@ static int clear_all(PyObject **objects, int count) {
     return 0;
 }
 
-/* Define garbage collection of a type whose instances own ``count`` objects from ``first`` on, and ``memory``. */
+/* Define garbage collection of a type. Its instances own ``memory`` and ``count`` objects, the first in ``first``. */
 #define OWNER(name, Type, first, count)                                                                                \
     static int name##_traverse(PyObject *self, visitproc visit, void *arg) {                                           \
         Py_VISIT(Py_TYPE(self));                                                                                       \
@@ -92,7 +93,7 @@ static void fill_crc_tables(State *state) {
             crc = crc & 1 ? crc >> 1 ^ 0x8408 : crc >> 1;
         state->crc[0][byte] = (uint16_t)crc;
     }
-    for (int row = 1; row < 8; row++) /* the same byte, followed by ``row`` zeros */
+    for (int row = 1; row < 8; row++) /* entries for a byte that is followed by ``row`` zeros */
         for (int byte = 0; byte < 256; byte++) {
             unsigned crc = state->crc[row - 1][byte];
             state->crc[row][byte] = (uint16_t)(crc >> 8 ^ state->crc[0][crc & 0xFF]);
@@ -111,12 +112,12 @@ static unsigned x25(const State *state, const uint8_t *data, Py_ssize_t size, un
     return crc;
 }
 
-/* The checksum of a frame: without the magic byte, and with CRC_EXTRA. */
+/* Return the checksum of a frame, which covers all bytes after the magic byte, and then CRC_EXTRA. */
 static unsigned x25_of_frame(const State *state, const uint8_t *frame, Py_ssize_t size, uint8_t extra) {
     return x25(state, &extra, 1, x25(state, frame + 1, size - 1, 0xFFFF));
 }
 
-/* x25(data): `aerokit.mavlink.frame.x25`. */
+/* x25(data): implements `aerokit.mavlink.frame.x25`. */
 static PyObject *wire_x25(PyObject *module, PyObject *object) {
     PyObject *data = PyBytes_FromObject(object);
     if (data == NULL)
@@ -150,7 +151,7 @@ static void frame_dealloc(PyObject *self) {
     free_object(self);
 }
 
-/* Create a frame from ``raw``, a whole one of ``size`` bytes. ``whole`` has the same bytes as an object, or is NULL. */
+/* Create a frame from its ``size`` bytes at ``raw``. ``whole`` is a bytes object with the same content, or NULL. */
 static PyObject *make_frame(State *state, const uint8_t *raw, Py_ssize_t size, PyObject *received_at, PyObject *whole) {
     Frame *frame = (Frame *)PyType_GenericAlloc(state->classes[FRAME], 0);
     if (frame == NULL)
@@ -168,7 +169,7 @@ static PyObject *make_frame(State *state, const uint8_t *raw, Py_ssize_t size, P
         memcpy(body, header, HEADER);
         memcpy(body + HEADER, raw + 6, (size_t)length);
     }
-    if (is_v1 || raw[2]) { /* `Frame.raw` cannot reconstruct these */
+    if (is_v1 || raw[2]) { /* `Frame.raw` cannot reconstruct MAVLink 1 frames and signed frames */
         Py_XINCREF(whole);
         frame->raw = whole != NULL ? whole : PyBytes_FromStringAndSize((const char *)raw, size);
         if (frame->raw == NULL)
@@ -206,16 +207,18 @@ static PyMemberDef counter_members[] = {MEMBER("bytes", T_ULONGLONG, Number, num
 /* -------------------------------------------------------------------------- layouts of message classes */
 
 typedef struct {
-    int kind, count;  /* as in struct; "s" for a text, "p" for bytes; elements, 0 if it is not an array */
-    int offset, size; /* in the payload; of an element */
-    Py_ssize_t slot;  /* offset in the message */
+    int kind;        /* "s" for a text, "p" for bytes, otherwise the code in Python's struct */
+    int count;       /* number of elements; 0 if the field is not an array */
+    int offset;      /* position in the payload */
+    int size;        /* size of one element in bytes */
+    Py_ssize_t slot; /* offset of the slot in the message object */
 } Field;
 
 typedef struct {
     PyObject_HEAD
     PyObject *message_class;
     Py_ssize_t frame_slot;
-    Field *memory; /* the fields, in the order of the wire */
+    Field *memory; /* the fields in wire order */
     int field_count, id, crc_extra, length, base_length;
 } Layout;
 
@@ -223,7 +226,8 @@ static PyObject **at_slot(PyObject *object, Py_ssize_t slot) { return (PyObject 
 
 OWNER(layout, Layout, message_class, 1)
 
-/* Find the offset of a slot, by storing an object in it; 0 if it cannot be found, -1 for an error. */
+/* Return the offset of a slot, 0 if it cannot be found, or -1 after an error. A probe object is stored in the slot, and
+   the slot is where exactly one pointer to the probe appears in the message. */
 static Py_ssize_t slot_of(PyObject *message_class, PyObject *name) {
     PyObject *size = PyObject_GetAttrString(message_class, "__basicsize__");
     Py_ssize_t end = size == NULL ? -1 : PyLong_AsSsize_t(size), found = -1;
@@ -246,7 +250,7 @@ static int size_of(int kind) {
     return strchr("bBsp", kind) ? 1 : strchr("hH", kind) ? 2 : strchr("iIf", kind) ? 4 : strchr("qQd", kind) ? 8 : 0;
 }
 
-/* Fill the fields: 1, 0 if the class needs Python, -1 for an error. */
+/* Fill the fields. Return 1, 0 if only Python code can handle the class, or -1 after an error. */
 static int fill_layout(Layout *self, PyObject *rows) {
     int count = (int)PyTuple_Size(rows), at = 0;
     PyObject *name = PyUnicode_FromString("received_frame");
@@ -274,7 +278,8 @@ static int fill_layout(Layout *self, PyObject *rows) {
            self->id <= 0xFFFFFF && self->crc_extra >= 0 && self->crc_extra <= 0xFF;
 }
 
-/* layout(class, id, CRC_EXTRA, length, base length, ((name, kind, count), …)): None if the class needs Python. */
+/* layout(class, id, CRC_EXTRA, length, base length, ((name, kind, count), …)): return the layout of a class, or None if
+   only Python code can handle the class. */
 static PyObject *wire_layout(PyObject *module, PyObject *args) {
     State *state = PyModule_GetState(module);
     PyObject *message_class, *rows;
@@ -296,8 +301,8 @@ static PyObject *wire_layout(PyObject *module, PyObject *args) {
 typedef union { float number; uint32_t bits; } Single;
 typedef union { double number; uint64_t bits; } Double;
 
-/* Return the number at ``at``; NULL without an exception for a signalling NaN, of which versions of Python make
-   different floats. */
+/* Return the number at ``at``. Return NULL without an exception for a signalling NaN, so that Python code decodes it,
+   because the resulting float depends on the version of Python. */
 static PyObject *decode_number(int kind, const uint8_t *at) {
     Single single;
     int is_signalling;
@@ -340,7 +345,8 @@ static PyObject *decode_field(const Field *field, const uint8_t *payload) {
     return items;
 }
 
-/* Decode a `Frame.body` (header of nine bytes, payload). Both arguments must be owned by the caller. */
+/* Decode a `Frame.body`, which has a header of nine bytes before the payload. The caller must own references to
+   ``body`` and ``frame``. */
 static PyObject *decode_body(Layout *self, PyObject *body, PyObject *frame) {
     PyObject *message = NULL, *value;
     if (!PyBytes_CheckExact(body) || self->message_class == NULL)
@@ -348,7 +354,7 @@ static PyObject *decode_body(Layout *self, PyObject *body, PyObject *frame) {
     const uint8_t *payload = (const uint8_t *)PyBytes_AsString(body) + HEADER;
     Py_ssize_t size = PyBytes_Size(body) - HEADER;
     uint8_t restored[MAX_PAYLOAD];
-    if (size < self->length) { /* trailing zeros were truncated */
+    if (size < self->length) { /* the sender truncated trailing zeros */
         memset(restored, 0, (size_t)self->length);
         if (size > 0)
             memcpy(restored, payload, (size_t)size);
@@ -366,12 +372,12 @@ static PyObject *decode_body(Layout *self, PyObject *body, PyObject *frame) {
     return message;
 python:
     Py_XDECREF(message);
-    if (PyErr_Occurred() || self->message_class == NULL) /* NULL while it is being destroyed */
+    if (PyErr_Occurred() || self->message_class == NULL) /* the class is NULL while the layout is being destroyed */
         return PyErr_Occurred() ? NULL : PyErr_NoMemory();
     return PyObject_CallMethod(self->message_class, "decode_body", "OO", body, frame);
 }
 
-/* decode(body, frame): `Message.decode_body` of the class. */
+/* decode(body, frame): implements `Message.decode_body` of the class. */
 static PyObject *layout_decode(PyObject *self, PyObject *const *args, Py_ssize_t count) {
     if (count == 1 || count == 2)
         return decode_body((Layout *)self, args[0], count == 2 ? args[1] : Py_None);
@@ -380,7 +386,7 @@ static PyObject *layout_decode(PyObject *self, PyObject *const *args, Py_ssize_t
 
 /* ------------------------------------------------------------------------------------------- encoding */
 
-/* Encode one number: 1, or 0 if Python has to convert it, or to explain why it is invalid. */
+/* Encode one number. Return 1, or 0 if Python code must convert the value or raise the error for it. */
 static int encode_number(int kind, int size, PyObject *value, uint8_t *at) {
     if (kind == 'f' || kind == 'd') {
         if (!PyFloat_Check(value) && !PyLong_Check(value))
@@ -388,7 +394,7 @@ static int encode_number(int kind, int size, PyObject *value, uint8_t *at) {
         double number = PyFloat_AsDouble(value);
         if (PyErr_Occurred())
             return 0;
-        int is_finite = number - number == 0; /* NaN, and what may be too large, are left to Python */
+        int is_finite = number - number == 0; /* Python code encodes NaN and numbers that may be too large */
         if (kind == 'f' && (number != number || (is_finite && (number > FLT_MAX || number < -FLT_MAX))))
             return 0;
         put_little_endian(at, size, kind == 'f' ? (Single){(float)number}.bits : (Double){number}.bits);
@@ -411,7 +417,7 @@ static int encode_number(int kind, int size, PyObject *value, uint8_t *at) {
     return !limit || (number < limit && number >= (is_signed ? -limit : 0));
 }
 
-/* Encode the value of a field, whose bytes are zero: 1, or 0 if Python has to. */
+/* Encode the value of a field to bytes that are all zero. Return 1, or 0 if Python code must encode the message. */
 static int encode_field(const Field *field, PyObject *value, uint8_t *at) {
     Py_ssize_t size = field->count ? field->count : 1, length = 0;
     const char *text = NULL;
@@ -427,7 +433,7 @@ static int encode_field(const Field *field, PyObject *value, uint8_t *at) {
     }
     if (!field->count)
         return encode_number(field->kind, field->size, value, at);
-    if (!PyTuple_CheckExact(value) || PyTuple_Size(value) > size) /* code of an item could change a list */
+    if (!PyTuple_CheckExact(value) || PyTuple_Size(value) > size) /* converting an item could change a list */
         return 0;
     for (Py_ssize_t i = 0; i < PyTuple_Size(value); i++)
         if (!encode_number(field->kind, field->size, PyTuple_GetItem(value, i), at + i * field->size))
@@ -435,7 +441,8 @@ static int encode_field(const Field *field, PyObject *value, uint8_t *at) {
     return 1;
 }
 
-/* Encode a message into ``frame``, of MAX_FRAME bytes: its size without the signature, or 0 if Python has to. */
+/* Encode a message to ``frame``, which has room for MAX_FRAME bytes. ``head`` has the flags, sequence number, system id
+   and component id. Return the size without the signature, or 0 if Python code must encode the message. */
 static Py_ssize_t encode(State *state, PyObject *message, int version, const uint8_t head[4], uint8_t *frame) {
     Py_ssize_t total = 0;
     Layout *layout = (Layout *)PyObject_GetAttr((PyObject *)Py_TYPE(message), state->layout_name);
@@ -472,8 +479,8 @@ done:
     return total;
 }
 
-/* encode_frame(message, version, flags, sequence, system_id, component_id): a whole frame without its signature, or
-   None if Python has to encode it; errors too are those of Python. */
+/* encode_frame(message, version, flags, sequence, system_id, component_id): return a whole frame without its signature,
+   or None if Python code must encode the message or raise the error. */
 static PyObject *wire_encode_frame(PyObject *module, PyObject *args) {
     uint8_t head[4], frame[MAX_FRAME];
     PyObject *message = NULL;
@@ -492,23 +499,24 @@ static PyObject *wire_encode_frame(PyObject *module, PyObject *args) {
 /* ------------------------------------------------------------------------------------------- dialects */
 
 typedef struct {
-    PyObject *id, *layout; /* in the lists of the table; id is NULL in a free row; layout is NULL until it is needed */
-    uint32_t number;
+    PyObject *id;     /* message id as a Python int; NULL in a free row */
+    PyObject *layout; /* NULL before the first message of this class */
+    uint32_t number;  /* message id */
     int extra, base_length, length;
 } Row;
 
 typedef struct {
     PyObject_HEAD
-    PyObject *owned; /* a list of what rows refer to */
+    PyObject *owned; /* a list of the objects to which the rows refer */
     PyObject *find_layout, *decode_in_python;
-    Row *memory; /* the rows, hashed by message id, at most half full */
+    Row *memory; /* a hash table by message id, at most half full */
     uint32_t mask;
-    State *state; /* of the module, which the type keeps */
+    State *state; /* state of the module, which the type keeps alive */
 } Table;
 
 OWNER(table, Table, owned, 3)
 
-/* Find the row of a message id, or the free one where it would be. */
+/* Return the row of a message id or, if there is none, the free row where it belongs. */
 static Row *row_of(const Table *self, uint32_t number) {
     uint32_t at = number * 2654435761u >> 12 & self->mask;
     while (self->memory[at].id != NULL && self->memory[at].number != number)
@@ -516,7 +524,7 @@ static Row *row_of(const Table *self, uint32_t number) {
     return &self->memory[at];
 }
 
-/* Return NULL for an unknown message, and for a table that is being destroyed. */
+/* Return the row of a message id. Return NULL if the message is unknown, or if the table is being destroyed. */
 static Row *find_row(const Table *self, uint32_t number) {
     Row *row = row_of(self, number);
     return row->id != NULL && self->owned != NULL ? row : NULL;
@@ -527,14 +535,14 @@ static int add_row(Table *self, PyObject *id, PyObject *row) {
     unsigned long number = PyLong_AsUnsignedLong(id);
     if (PyErr_Occurred() || !PyArg_ParseTuple(row, "iii", &new.extra, &new.base_length, &new.length))
         return -1;
-    if (number > 0xFFFFFF) /* no frame has such an id */
+    if (number > 0xFFFFFF) /* message ids have 24 bits, so no frame has this id */
         return 0;
     new.number = (uint32_t)number;
     *row_of(self, new.number) = new;
     return PyList_Append(self->owned, id);
 }
 
-/* table(rows, find_layout, decode_in_python): the messages of a dialect. */
+/* table(rows, find_layout, decode_in_python): return the table of the messages of a dialect. */
 static PyObject *wire_table(PyObject *module, PyObject *args) {
     State *state = PyModule_GetState(module);
     PyObject *rows, *find_layout, *decode_in_python, *id, *row;
@@ -561,11 +569,11 @@ static PyObject *wire_table(PyObject *module, PyObject *args) {
     return PyErr_Occurred() ? NULL : PyErr_NoMemory();
 }
 
-/* decode(frame): `Dialect.decode`. */
+/* decode(frame): implements `Dialect.decode`. */
 static PyObject *table_decode(PyObject *object, PyObject *frame) {
     Table *self = (Table *)object;
     Row *row = Py_TYPE(frame) == self->state->classes[FRAME] ? find_row(self, ((Frame *)frame)->message_id) : NULL;
-    if (row != NULL && row->layout == NULL) { /* the first message of its class */
+    if (row != NULL && row->layout == NULL) { /* this is the first message of its class */
         PyObject *layout = PyObject_CallFunctionObjArgs(self->find_layout, row->id, NULL);
         int result = layout == NULL ? -1 : PyList_Append(self->owned, layout);
         row->layout = result == 0 ? layout : row->layout;
@@ -587,11 +595,11 @@ static PyObject *table_decode(PyObject *object, PyObject *frame) {
 typedef struct {
     PyObject_HEAD
     PyObject *wanted, *statistics, *rest, *sources, *table;
-    PyObject *last_key; /* of the last sender, as a number of Python */
-    void *memory;       /* not used */
-    long last_key_number;
-    int is_out_of_order; /* 1 if a frame of the last call was */
-    int is_simple; /* 1 if ``rest`` is the beginning of a single plausible frame, 0 if `_scan` of Python describes it */
+    PyObject *last_key; /* `last_key_number` as a Python int */
+    void *memory;       /* not used, but required by OWNER */
+    long last_key_number; /* key of the last sender */
+    int is_out_of_order;  /* 1 if a frame of the last call was out of order */
+    int is_simple; /* 1 if ``rest`` is the beginning of one plausible frame, 0 if the attribute `_scan` describes it */
 } Framer;
 
 #define OBJECT(name, member) MEMBER(name, T_OBJECT_EX, Framer, member)
@@ -603,18 +611,19 @@ static PyMemberDef framer_members[] = {
 
 OWNER(framer, Framer, wanted, 6)
 
-/* One call of `receive`. It owns its objects. */
+/* State of one call of `receive`. It owns references to its objects. */
 typedef struct {
     State *state;
     PyObject *framer, *data, *now, *wanted, *sources, *table, *frames;
     const uint8_t *bytes;
     Py_ssize_t size;
-    int is_continued, is_simple; /* the data begins with the rest of an earlier call; as in Framer */
+    int is_continued; /* 1 if the data begins with the rest of an earlier call */
+    int is_simple;    /* value of `Framer.is_simple` when the call began */
 } Run;
 
 enum { GOOD, WAIT, OTHER };
 
-/* Judge the byte at ``begin`` as `PythonFramer._examine` does, with one verdict for all that needs Python. */
+/* Examine the byte at ``begin`` like `PythonFramer._examine`. The verdict is OTHER in all cases for Python code. */
 static int examine(const Run *run, Py_ssize_t begin, Py_ssize_t *end, Row **row) {
     const uint8_t *at = run->bytes + begin;
     Py_ssize_t left = run->size - begin;
@@ -638,7 +647,7 @@ static int examine(const Run *run, Py_ssize_t begin, Py_ssize_t *end, Row **row)
     return crc == u16(at + header + length) ? GOOD : OTHER;
 }
 
-/* Count a frame of a sender. */
+/* Count a frame of the sender with this key. Return 0, or -1 after an error. */
 static int count_frame(Run *run, long key, int sequence) {
     Framer *self = (Framer *)run->framer;
     if (self->last_key == NULL || self->last_key_number != key) {
@@ -669,7 +678,7 @@ static int count_frame(Run *run, long key, int sequence) {
     return done == NULL ? -1 : 0;
 }
 
-/* Count a valid frame, and return it if it is wanted. */
+/* Count a valid frame, and add it to ``frames`` if it is wanted. Return 0, or -1 after an error. */
 static int take_frame(Run *run, Py_ssize_t begin, Py_ssize_t end, const Row *row) {
     const uint8_t *at = run->bytes + begin;
     int is_v1 = at[0] == MAGIC_V1;
@@ -685,7 +694,7 @@ static int take_frame(Run *run, Py_ssize_t begin, Py_ssize_t end, const Row *row
     return result;
 }
 
-/* Find the next frame in Python: 1, 0 if there is none, -1 for an error. */
+/* Let Python code find the next frame. Return 1, 0 if there is no frame, or -1 after an error. */
 static int search(Run *run, Py_ssize_t *begin, Py_ssize_t *end, Row **row) {
     int kept = *begin || !run->is_continued ? 0 : run->is_simple ? 1 : 2;
     PyObject *found = PyObject_CallMethod(run->framer, "_find", "OniOO", run->data, *begin, kept, run->now,
@@ -702,7 +711,7 @@ static int search(Run *run, Py_ssize_t *begin, Py_ssize_t *end, Row **row) {
     return result;
 }
 
-/* Process the data. An unfinished frame at its end is kept. */
+/* Process the data, and keep an incomplete frame at its end. Return 0, or -1 after an error. */
 static int receive(Run *run) {
     Framer *self = (Framer *)run->framer;
     for (Py_ssize_t begin = 0, end = 0; begin < run->size; begin = end) {
@@ -727,7 +736,8 @@ static int receive(Run *run) {
     return 0;
 }
 
-/* Own the objects of a call, and join the data with what was kept. */
+/* Take references to the objects of a call, and put the data kept from earlier calls before the new data. Return 0, or
+   -1 after an error. */
 static int begin_run(Run *run, PyObject *data) {
     Framer *self = (Framer *)run->framer;
     int is_ready = run->state->classes[FRAME] != NULL;
@@ -748,7 +758,7 @@ static int begin_run(Run *run, PyObject *data) {
     if (run->frames == NULL || run->data == NULL)
         return -1;
     ((Number *)self->statistics)->number += (unsigned long long)PyBytes_Size(run->data);
-    if (self->is_out_of_order) { /* the last call was */
+    if (self->is_out_of_order) { /* the last call may have filled `late` and `foreign` */
         PyObject *done = PyObject_CallMethod(run->framer, "_clear_out_of_order", NULL);
         Py_XDECREF(done);
         if (done == NULL)
@@ -772,7 +782,7 @@ static int begin_run(Run *run, PyObject *data) {
     return 0;
 }
 
-/* receive(data, now=0.0): `Framer.receive`. */
+/* receive(data, now=0.0): implements `Framer.receive`. */
 static PyObject *framer_receive(PyObject *self, PyTypeObject *type, PyObject *const *args, Py_ssize_t count,
                                 PyObject *names) {
     Run run = {.framer = self, .state = PyType_GetModuleState(type)};
@@ -796,7 +806,7 @@ static PyObject *framer_receive(PyObject *self, PyTypeObject *type, PyObject *co
 
 /* ------------------------------------------------------------------------------------- telemetry logs */
 
-/* Return the end of a record according to its header, or -1 if there is no valid header, as in tlog.py. */
+/* Return the end of a record according to its header, or -1 if the header is not valid. tlog.py has the same rules. */
 static Py_ssize_t record_end(const uint8_t *data, Py_ssize_t size, Py_ssize_t begin) {
     static const uint8_t last_time[8] = {0x00, 0x0E, 0x93, 0x26, 0xDD, 0x03, 0xC0, 0x00}; /* the year 2100 */
     const uint8_t *at = data + begin + 8;
@@ -807,8 +817,8 @@ static Py_ssize_t record_end(const uint8_t *data, Py_ssize_t size, Py_ssize_t be
     return at[0] == MAGIC_V2 && at[2] <= SIGNED ? begin + 20 + at[1] + (at[2] ? SIGNATURE : 0) : -1;
 }
 
-/* tlog_records(data, begin): ([(time, frame), …], begin of the first one that Python has to judge, because no header of
-   another one follows it). */
+/* tlog_records(data, begin): return ([(time, frame), …], end of these records). The list ends before the first record
+   that is not followed by a valid header, because Python code must check that record. */
 static PyObject *wire_tlog_records(PyObject *module, PyObject *args) {
     PyObject *bytes, *records;
     Py_ssize_t begin, end;
@@ -824,7 +834,8 @@ static PyObject *wire_tlog_records(PyObject *module, PyObject *args) {
         for (int i = 0; i < 8; i++)
             microseconds = microseconds << 8 | data[begin + i];
         PyObject *frame = PyBytes_FromStringAndSize((const char *)data + begin + 8, end - begin - 8);
-        PyObject *record = Py_BuildValue("dN", (double)microseconds / 1e6, frame); /* "#" depends on the headers */
+        /* The format "y#" is not used, because the type of its size depends on the headers of Python. */
+        PyObject *record = Py_BuildValue("dN", (double)microseconds / 1e6, frame);
         if (record == NULL || PyList_Append(records, record) < 0) {
             Py_XDECREF(record);
             Py_DECREF(records);
@@ -865,7 +876,7 @@ static PyType_Slot framer_slots[] = {GC_SLOTS(framer), {Py_tp_members, framer_me
 
 enum { BASE = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, GC = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC };
 
-/* In the order of `State.types`. */
+/* The order is that of `State.types`. */
 static PyType_Spec specs[] = {
     {"aerokit._wire.FrameFields", sizeof(Frame), 0, BASE, frame_slots},
     {"aerokit._wire.SourceFields", sizeof(Number), 0, BASE, source_slots},

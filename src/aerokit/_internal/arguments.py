@@ -33,7 +33,7 @@ ClassT = TypeVar("ClassT")
 Check = Callable[[Any], bool]
 Rule = tuple[Check, str]
 
-# Rules for annotations with these names.
+# Rules by the name of the annotation.
 _SIMPLE: dict[str, Rule] = {
     "float": (lambda value: isinstance(value, Real), "a number"),
     "int": (lambda value: isinstance(value, Integral), "a whole number"),
@@ -47,7 +47,7 @@ _SIMPLE: dict[str, Rule] = {
         lambda value: callable(value) or hasattr(value, "__aiter__"),
         "a function or an asynchronous iterable",
     ),
-    "PeerFilter": (lambda _: True, "addresses and networks"),  # Links check it with a better message.
+    "PeerFilter": (lambda _: True, "addresses and networks"),  # Links refuse a wrong filter themselves.
     "PathLike": (lambda value: isinstance(value, os.PathLike), "a path"),
 }
 
@@ -59,7 +59,7 @@ def _is_above_zero(value: Any) -> bool:
         return False
 
 
-# Rules for parameters that denote a time, with these annotations.
+# Rules for parameters that denote a time, by their annotation.
 _SECONDS: dict[str, Rule] = {
     "float": (_is_above_zero, "a number of seconds above 0"),
     "float | None": (lambda value: value is None or _is_above_zero(value), "a number of seconds above 0, or None"),
@@ -238,7 +238,7 @@ def _class_names(name: str, module_globals: Mapping[str, Any]) -> tuple[str, ...
         return ()
     if isinstance(bound, type):
         return (bound.__name__,)
-    return tuple(bound.__forward_arg__.split(" | "))  # The bound is a text: TypeVar(…, bound="Event | Message").
+    return tuple(bound.__forward_arg__.split(" | "))  # The bound is a string: TypeVar(…, bound="Event | Message").
 
 
 def _is_one_of(choices: tuple[object, ...], value: object) -> bool:

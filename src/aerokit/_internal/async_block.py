@@ -66,7 +66,7 @@ class _Block(AbstractAsyncContextManager[T]):
         raise self._misused("with")
 
     def __exit__(self, *_: object) -> None:
-        """Never called, but needed: Python looks up this method before it calls ``__enter__``."""
+        """Not called. It must exist, because Python looks it up before it calls ``__enter__``."""
 
     def __getattr__(self, name: str) -> None:
         raise AttributeError(

@@ -63,7 +63,7 @@ def decompress(data: bytes, name: str) -> bytes:
     """
     if not data.startswith(_XZ_MAGIC):
         return data
-    import lzma  # Not all builds of Python have it.
+    import lzma  # Some builds of Python do not have lzma.
 
     decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY_LIMIT)
     try:

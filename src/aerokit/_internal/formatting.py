@@ -88,7 +88,7 @@ def short_repr(value: object) -> str:
     """Return at most 100 characters of ``repr(value)``, without passwords in URLs. If repr fails: the type's name."""
     try:
         text = repr(value)
-    except Exception:  # repr fails for an int of 5000 digits, and may fail for a class of the program.
+    except Exception:  # repr fails for an int of 5000 digits, and a __repr__ of the program may fail, too.
         text = f"<{type(value).__name__}>"
     text = _CREDENTIALS.sub(r"//\1:…@", text)
     return text if len(text) <= _MAX_LENGTH else f"{text[: _MAX_LENGTH - 3]}..."

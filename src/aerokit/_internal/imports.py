@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 
-# Packages that only the other project called aerokit has: ``aerokit.aero`` and so on.
+# Packages such as ``aerokit.aero``, which only an unrelated PyPI project called aerokit has.
 _OTHER_PACKAGES = ("aero", "engine", "stability")
 
 # Modules whose names users often look up in the package: aerokit.LinkLost instead of aerokit.errors.LinkLost.
@@ -55,7 +55,7 @@ def lazy_exports(
             raise AttributeError(f"module {package!r} has no attribute {name!r}{_suggestion(package, name)}")
         module = import_module(modules[name])
         value = getattr(module, name, module)
-        setattr(sys.modules[package], name, value)  # Later accesses find the value there and do not call this function.
+        setattr(sys.modules[package], name, value)  # Later accesses find this attribute first.
         return value
 
     def list_names() -> list[str]:

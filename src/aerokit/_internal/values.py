@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from inspect import Signature
 
     from typing_extensions import Self, dataclass_transform
-else:  # typing_extensions takes longer to import than this package
+else:  # Importing typing_extensions takes longer than importing aerokit.
 
     def dataclass_transform(**_: object) -> Any:
         return lambda cls: cls

@@ -116,7 +116,7 @@ async def foxglove_bridge(
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
-    """Return the messages of the connection's dialect whose names match a pattern, each once."""
+    """Return the messages of the connection's dialect whose names match a pattern, without duplicates."""
     by_id: dict[int, type[Message]] = {}
     for pattern in patterns:
         matching = [message for message in connection.bus.dialect if fnmatchcase(message.NAME, pattern.upper())]
@@ -215,6 +215,7 @@ class _TopicChannels:
         self._channels.clear()
 
     def _publish_states(self, system_id: int, vehicle: Vehicle) -> None:
+        """Send the states of a vehicle that are newer than the last ones sent, and at intervals its link."""
         for state, cell in vehicle.telemetry.cells.items():
             value, name = cell.latest, topics.vehicle_topic(system_id, state)
             if value is None:

@@ -62,7 +62,7 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
         changes_mode: True if a mode that does not allow arming is no reason, because `Vehicle.arm` will change it.
     """
     grouped = _grouped(vehicle, reasons)
-    if reasons is not None or changes_mode:  # `why_not_armable` has the mode among its reasons
+    if reasons is not None or changes_mode:  # `reasons` already includes the mode
         return grouped
     against_arming = dict.fromkeys([*_refused_mode(vehicle), *grouped.against_arming])
     return grouped._replace(against_arming=tuple(against_arming))
@@ -211,7 +211,7 @@ class ArmingCheckRequests:
 
 async def run_arming_checks(vehicle: Vehicle) -> None:
     """Ask a vehicle why it cannot arm. Its answers are status texts, which `Vehicle.missing_for_flight` includes."""
-    with contextlib.suppress(AerokitError):  # if the vehicle does not answer, its state shows that
+    with contextlib.suppress(AerokitError):  # the state shows whether the vehicle answers
         await vehicle.why_not_armable()
 
 

@@ -422,7 +422,7 @@ class _Waiter(_Sink[T]):
         self._record(value)
         try:
             is_met = bool(self._predicate(value))
-        except Exception as error:  # It belongs to the caller of `wait_until`.
+        except Exception as error:  # An error of the predicate belongs to the caller of `wait_until`.
             self.fail(error)
             return
         if not is_met:

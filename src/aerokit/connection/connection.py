@@ -124,12 +124,12 @@ class Connection:
         self._observers = self._receiver.observers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = self._receiver.heartbeats
         """Last HEARTBEAT of every (system id, component id) on the link."""
-        self.keeps_peers = True  # The link asks for this; see `aerokit.transport.link.PeerKeeper`.
+        self.keeps_peers = True  # read by the link; see `aerokit.transport.link.PeerKeeper`
         self._background = BackgroundTasks(self.fail)
         self._owns_link = True  # False if the link turns out to belong to another connection
         self._state_watch = LinkStateTracker(self.link_state, self.bus, system_id=0)
         self._end_signal = EndSignal()
-        # None: this program sends no heartbeat.
+        # None if this program sends no heartbeat.
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
 
     def _make_multilink(self, make_routes: Callable[[], Routes]) -> MultiLinkRoutes:
@@ -470,7 +470,7 @@ class Connection:
         """Called when the vehicle side of a zenoh network refused one of our commands."""
         refusal = OrderRefused(self._clock(), system_id=0, message=message, reason=reason, lease_holder=lease_holder)
         self.bus.publish(refusal)
-        for answer in answers:  # Not passed to a framer, which would count these answers as frames of the link.
+        for answer in answers:  # The answers bypass the framers, which would count them as frames of the link.
             self.bus.deliver(Frame.parse(answer, self._clock()))
 
     def link_lost(self, error: LinkLost) -> None:
@@ -536,7 +536,7 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
-        """Write a frame to the peers of its target. ``message`` None: the target is unknown, so all peers get it."""
+        """Write a frame to the peers of its target. If ``message`` is None, the target is unknown: all peers get it."""
         system_id = getattr(message, "target_system", 0) if to is None else to
         for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
             self.link.write(data, peer)

@@ -51,7 +51,7 @@ class Recording:
         self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
         self._writer: TlogWriter | None = None  # None before the first received frame and after the end
         self._file: BinaryIO | None = None  # the file, if it was created here
-        # Sent frames that wait until a frame is received and the existing file is renamed. None: no frame must wait.
+        # Sent frames that wait until a frame is received and the existing file is renamed. None if no frame must wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.
@@ -165,7 +165,7 @@ def keep_existing(path: str | os.PathLike[str]) -> str | None:
     for number in itertools.count(1):
         kept = f"{stem}.{number}{suffix}"
         try:
-            os.close(os.open(kept, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # This claims the name.
+            os.close(os.open(kept, os.O_CREAT | os.O_EXCL | os.O_WRONLY))  # Creating the file claims the name.
         except FileExistsError:
             continue
         try:

@@ -321,7 +321,7 @@ class FrameReceiver:
             self.heartbeats[source] = heartbeat
             if is_new:
                 self._bus.publish(discovery_event(heartbeat, self._clock(), *source))
-            # There are at most MAX_ROUTES routes, so some of these heartbeats have no route any more.
+            # There are at most MAX_ROUTES routes, so some of the stored heartbeats no longer have a route.
             if len(self.heartbeats) > MAX_ROUTES:
                 for expired in [source for source in self.heartbeats if not self._routes.has_route(source)]:
                     del self.heartbeats[expired]

@@ -128,7 +128,7 @@ class HeartbeatWatchdog:
             mavlink_version=3,
         )
         self.activity: ActivityMonitor = ActivityMonitor(clock)
-        self._limit_s = settings.fed_within_s  # None: heartbeats never pause
+        self._limit_s = settings.fed_within_s  # None if heartbeats never pause
         self._clock, self._publish = clock, publish
         self._paused_at: float | None = None  # None while heartbeats are sent
 

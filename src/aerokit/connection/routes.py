@@ -30,7 +30,7 @@ CLAIM_MIN_FRAMES = 3
 class Evidence(NamedTuple):
     """Evidence in a frame of another peer: True if it continues the stream of the owner, None if unknown."""
 
-    expected: int  # the owner's next frame number
+    expected: int  # the owner's next sequence number
     sequence_matches: bool | None
     clock_matches: bool | None
 
@@ -55,7 +55,7 @@ class RouteClaim:
 
     def __init__(self) -> None:
         self._expected: int | None = None  # next sequence number of the owner when the claim was made
-        # True if the peer's sequence numbers and time since boot continue the owner's stream; None: unknown.
+        # True if the peer's sequence numbers and time since boot continue the owner's stream; None if unknown.
         self._sequence_matches: bool | None = None
         self._clock_matches: bool | None = None
         # Number of the peer's frames since the owner's last frame, and the time of the first of them.
@@ -173,7 +173,7 @@ class Routes:
     ) -> None:
         self._link, self._publish, self._attached = link, publish, attached
         self._boot_clocks = {} if boot_clocks is None else boot_clocks
-        self._may_move = may_move  # True: a silent system may move to any host
+        self._may_move = may_move  # True if a silent system may move to any host
         self._routes: dict[ComponentId, _Route] = {}
         self._claims: dict[tuple[ComponentId, Peer], RouteClaim] = {}  # by component and claiming peer
         self._swept_at = 0.0  # time of the last removal of expired routes

@@ -43,7 +43,7 @@ class FieldDefinition:
 
     name: str
     type: str  # without the array brackets
-    array_length: int = 0  # 0: not an array
+    array_length: int = 0  # 0 if the field is not an array
     units: str = ""
     enum: str = ""
     invalid: str = ""  # the value that means "unknown"
@@ -278,7 +278,7 @@ def _parse_message(node: Element, origin: str) -> MessageDefinition:
 
 
 def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinition:
-    """Read one ``<field>`` element of a message. ``extension``: it is below ``<extensions/>``."""
+    """Read one ``<field>`` element of a message. ``extension`` is True below ``<extensions/>``."""
     # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
@@ -403,7 +403,7 @@ def _common_prefix(enum: str, names: list[str]) -> str:
 
 def _member_name(enum: str, prefix: str, name: str) -> str:
     """Return the Python name of an enum entry: its name without the prefix of the entries."""
-    if not name.startswith(prefix):  # Some entries begin with the last words of the enum's name only.
+    if not name.startswith(prefix):  # Some entries begin only with the last words of the enum's name.
         words = enum.split("_")
         shorter_prefixes = ("_".join(words[i:]) + "_" for i in range(1, len(words)))
         prefix = next((shorter for shorter in shorter_prefixes if name.startswith(shorter)), "")

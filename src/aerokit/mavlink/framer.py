@@ -147,6 +147,7 @@ class PythonFramer:
                 body = b""
                 end = sequence = key = message_id = checksum = 0
             if not is_valid:
+                # Kept data was examined before, so `_search` continues with the findings in `scan`.
                 next_frame = None
                 if data[begin] in _MAGICS and (begin or scan is _NEW_SCAN):
                     _, _, next_frame = self._examine(data, begin)
@@ -234,7 +235,7 @@ class PythonFramer:
         end_of_data = (size, _NOISE, size)
         for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):
             if unknown_begin >= 0 and position >= unknown_end:
-                # No valid frame was found inside. The bytes count as an unknown frame if a frame may follow them.
+                # No valid frame was found inside the unknown frame. It counts as a frame if another one may follow it.
                 if unknown_end == size or data[unknown_end] in _MAGICS:
                     self._count_skipped(begin, unknown_begin, bad_crcs)
                     self._skip_unknown(data, unknown_begin, unknown_end)
@@ -257,7 +258,7 @@ class PythonFramer:
             if verdict == _WAIT:
                 keep_from = _earliest(keep_from, unknown_begin, position)
                 examined_to = position + 1
-                break  # What follows probably belongs to this frame, so it is examined later.
+                break  # The following bytes probably belong to this frame, so they are examined later.
             if verdict == _IMPLAUSIBLE and keep_from < 0:
                 keep_from = position
             elif verdict == _UNKNOWN and keep_from < 0 and unknown_begin < 0:
@@ -335,7 +336,7 @@ class PythonFramer:
 
 def _earliest(keep_from: int, unknown_begin: int, position: int) -> int:
     """Return the earliest of three candidates for the beginning of a frame. The first two may be missing (-1)."""
-    if unknown_begin >= 0:  # It is only set while `keep_from` is missing, so it is the earlier of the two.
+    if unknown_begin >= 0:  # `unknown_begin` is set only while `keep_from` is missing, so it is earlier.
         return unknown_begin
     return position if keep_from < 0 else keep_from
 

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 
 from aerokit.errors import InvalidArgument
 
-if TYPE_CHECKING:  # The annotations of pymavlink are stricter than its behaviour.
+if TYPE_CHECKING:  # This class has looser annotations than pymavlink's, which are stricter than its behaviour.
 
     class _MAVLink:
         total_packets_sent: int

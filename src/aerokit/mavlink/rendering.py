@@ -208,7 +208,7 @@ def _default(field: FieldDefinition) -> str:
 
 def _render_init(message: MessageDefinition) -> list[str]:
     """Return the lines of a message's ``__init__`` method."""
-    # A parameter without a default that follows one with a default must be keyword-only in Python, i.e. follow a "*".
+    # In Python, a parameter without a default cannot follow one with a default, unless a "*" makes it keyword-only.
     arguments: list[str] = []
     optional = False
     for field in message.fields:

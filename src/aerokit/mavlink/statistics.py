@@ -73,7 +73,7 @@ class SourceStatistics(SourceFields):
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_base` is missing
         self._missing_base = sequence  # value of `expected` to which `_missing` refers
         self._late_sequence = -1  # sequence number of the last repeated frame
-        self._late_count = -1  # value of `received` at that frame
+        self._late_count = -1  # value of `received` when that frame arrived
         self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations = 0  # how often the two streams have alternated
@@ -159,7 +159,7 @@ class SourceStatistics(SourceFields):
     def _on_repeated(self, sequence: int, now: float) -> int:
         """Process a frame with an old number that was not missing. Return a result of :meth:`out_of_order`.
 
-        A single such frame is a repetition. Several in direct succession show that the sender rebooted.
+        A single old number is a repetition. Several in direct succession show that the sender rebooted.
         """
         follows = sequence == (self._late_sequence + 1) & 0xFF
         is_direct_succession = follows and self._late_count == self.received
@@ -194,7 +194,7 @@ class SourceStatistics(SourceFields):
         """Process a frame that continues the other stream. Return a result of :meth:`out_of_order`.
 
         Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
-        other one does.
+        other stream counts as the sender's.
         """
         count = self.received - self._stream_start
         is_other_longer = self._other_count > count

@@ -63,7 +63,8 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
             if records:
                 yield from records
                 continue
-        # A fast path for unsigned MAVLink 2 frames. It takes half the time of `_record_end`.
+        # A fast path for an unsigned MAVLink 2 frame before another one, in half the time of `_record_end`. A time of
+        # 8 bytes precedes each frame, which has 12 bytes in addition to its payload.
         try:
             end = begin + 20 + data[begin + 9]
             if (
@@ -76,7 +77,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
                 or data[end : end + 2] > _MAX_TIME_PREFIX
             ):
                 end = _record_end(data, begin, min_time)
-        except IndexError:  # This is the last record, or garbage.
+        except IndexError:  # The data ends here, so this is the last record, or garbage.
             end = _record_end(data, begin, min_time)
         if end is None:
             if len(data) - begin <= 8:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 # transmissions after it.
 OVERTAKEN = 3
 
-# ArduPilot queues at most five requests, processes one every 2 ms, and drops further requests.
+# Number of requests that are sent at once. ArduPilot queues at most five, processes one every 2 ms, and drops the rest.
 BURST_SIZE = 4
 
 # Pause between further requests, after the first ``BURST_SIZE`` were sent at once.
@@ -21,7 +21,7 @@ SPACING_S = 0.002
 # An answer that arrives sooner than this fraction of the fastest round trip belongs to an earlier transmission.
 MIN_ROUND_TRIP_FRACTION = 0.5
 
-# Requests back off after this many consecutive timeouts. Fewer mean nothing, because radios lose single frames.
+# Requests back off after this many consecutive timeouts. Fewer may be caused by single frames that a radio has lost.
 TIMEOUTS_BEFORE_BACKOFF = 3
 
 # An answer is fast if it takes at most FAST_FACTOR times the fastest answer plus FAST_MARGIN_S.

@@ -87,7 +87,7 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# While an order waits for a new HEARTBEAT to be sent again, it checks for one at this interval.
+# An order is sent again only after a new HEARTBEAT. While it waits for the HEARTBEAT, it checks at this interval.
 POLL_INTERVAL_S = 0.05
 
 MAX_HEARTBEAT_AGE_S = 2.5
@@ -255,7 +255,7 @@ class CommandExchange(Exchange[CommandAck]):
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
         # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored. A command
-        # that is sent only once ignores none: if an ignored acknowledgement was its own, no other would follow.
+        # that is sent only once ignores none, because it would wait in vain if it ignored its own acknowledgement.
         may_ignore = self._sent_count == 1 and self._attempts > 1
         is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
         if message.result != MavResult.IN_PROGRESS:

@@ -241,6 +241,7 @@ class SettingWrite(Transfer[Setting]):
             self._read(now)
 
     def _on_ack(self, result: int, reported: Setting, now: float) -> None:
+        """Process PARAM_EXT_ACK: finish, wait for a slow write, read the value again, or fail."""
         if result == ParamAck.ACCEPTED and settings_equal(reported.value, self._value):
             self._measure(now)
             self._finish(reported)

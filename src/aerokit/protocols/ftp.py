@@ -201,7 +201,7 @@ SLOW_ANSWER_S = 0.25
 # Maximum number of times that a request gets a new sequence number.
 MAX_RENUMBERED = 3
 
-# Retries back off after this many attempts. Fewer mean nothing, because radios lose single frames.
+# Retries back off after this many attempts. Fewer failures may be caused by single frames that a radio has lost.
 ATTEMPTS_BEFORE_BACKOFF = 3
 
 SESSION_OPCODES = (MavFtpOpcode.READFILE, MavFtpOpcode.WRITEFILE, MavFtpOpcode.BURSTREADFILE)

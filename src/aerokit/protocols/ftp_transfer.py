@@ -42,7 +42,7 @@ MAX_GAPS = 512
 BURST_BLOCKS = 500
 # After each received block of a burst, the server counts as busy for the time of this many blocks.
 BUSY_BLOCKS = 3
-# Minimum seconds to wait for the first block of a long file, in which even a slow radio carries a few blocks.
+# Minimum seconds to wait for the first block of a long file. In this time, even a slow radio carries a few blocks.
 FIRST_BLOCK_TIMEOUT_S = 0.5
 SHORT_FILE = 20 * DATA_SIZE  # Up to this size in bytes, repeating a burst costs little.
 MAX_REPEATED_BURSTS = 3
@@ -234,7 +234,7 @@ class FtpDownload(FtpExchange[int]):
         is_end = reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
-        elif is_end:  # The offset is at or after the end: an ACK without data, EOF, or any error after the known size.
+        elif is_end:  # An ACK without data also means that the offset is not before the end of the file.
             self._end_at(offset)
         else:
             self._fail(self._refused(reply))

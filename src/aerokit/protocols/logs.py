@@ -78,7 +78,7 @@ class LogDownload(Transfer[int]):
         self._range_end = into.position
         self._latest_offset = self._range_end  # largest offset received in the current range
         self._max_range_blocks = FIRST_RANGE
-        self._requested_blocks = 0  # of the current range
+        self._requested_blocks = 0  # number of requested blocks of the current range
         self._received_blocks = 0
         self._early_ends = 0
         self._has_checked_gaps = True

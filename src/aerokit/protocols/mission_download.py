@@ -123,6 +123,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # --------------------------------------------------------------------------------- answers
 
     def _on_count(self, message: MissionCount, now: float) -> None:
+        """Process MISSION_COUNT: discard items of another plan, and request the missing ones."""
         opaque_id = message.opaque_id
         if self._count is None:
             # PX4, whose window is 1, repeats MISSION_COUNT by itself, so its arrival does not measure the round trip.
@@ -157,6 +158,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._proceed(now)
 
     def _on_ack(self, result: int, now: float) -> None:
+        """Process MISSION_ACK, by which the vehicle refuses or interrupts the download."""
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
@@ -240,7 +242,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # ------------------------------------------------------------------------------------ end
 
     def _end(self) -> None:
-        # PX4 (window 1) accepts no upload for 5 s if the acknowledgement is lost, so it is sent twice.
+        # If PX4 (window 1) misses the acknowledgement, it accepts no upload for 5 s. PX4 therefore gets two of them.
         transmissions = 2 if self._window == 1 else 1
         self._outbox += [self._ack(MavMissionResult.ACCEPTED)] * transmissions
         items = tuple(self._items[seq] for seq in self._indices)

@@ -163,6 +163,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     # ------------------------------------------------------------------------------- requests
 
     def _on_request(self, seq: int, now: float) -> None:
+        """Answer the request for an item. It shows that the vehicle has all items before this one."""
         # The vehicle never skips an item, so a request beyond the next item belongs to another transfer.
         if seq > self._sent_end:
             return
@@ -200,6 +201,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     # ------------------------------------------------------------------------ acknowledgements
 
     def _on_ack(self, ack: MissionAck, now: float) -> None:
+        """Process MISSION_ACK: the result of the upload, or a request to repeat items or to start again."""
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
@@ -224,6 +226,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         return self._is_partial and not self._is_accepted
 
     def _on_error(self, now: float) -> None:
+        """Process an ERROR that may be temporary: repeat an item first, and end the upload after a second ERROR."""
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
         # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
         # therefore repeated.
@@ -253,7 +256,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _restart(self, now: float) -> None:
         """Begin again, because the vehicle's transfer has expired or was cancelled."""
-        if not self._is_accepted:  # An older transfer was cancelled.
+        if not self._is_accepted:  # The vehicle has cancelled an older transfer, not this one.
             return
         if self._is_partial or self._restarts >= MAX_RESTARTS:
             self._refuse(MavMissionResult.OPERATION_CANCELLED)

@@ -242,7 +242,7 @@ class SetCurrentItem(Transfer[None]):
                 )
             )
         elif status is not None and status.heartbeat_at < min_heartbeat_at:
-            self.deadline = now + POLL_INTERVAL_S  # No recent HEARTBEAT since the last transmission: wait for one.
+            self.deadline = now + POLL_INTERVAL_S  # Wait for a recent HEARTBEAT after the last transmission.
         else:
             self._send(now)
 

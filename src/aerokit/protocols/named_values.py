@@ -35,8 +35,8 @@ BY_NAME = -1
 PROBE, PROBE_INDEX = "", 0
 # A name without an answer counts as unknown once the probability that all its answers were lost is below this value.
 MAX_LOSS_PROBABILITY = 1e-4
-# A write ends with an unexpected value after this many answers with the same value. More answers are needed if it is
-# the value from before the write, because the vehicle may have sent them before the write arrived.
+# A write ends with an unexpected value after this many answers with the same value. The value from before the write
+# needs more answers, because the vehicle may have sent some of them before the write arrived.
 ANSWERS_TO_SETTLE, ANSWERS_TO_SETTLE_UNCHANGED = 2, 8
 
 

@@ -227,6 +227,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ------------------------------------------------------------------------------------- result
 
     def _finish_when_complete(self) -> None:
+        """Finish if all values are known, unless some of them may be from before a change of the list."""
         count = self._count
         if count is None or len(self._received) < count:
             return

@@ -156,7 +156,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             reported = parameter_of(message, self._bytewise)
             old_value = self._possibly_stale.pop(name, None)
             if old_value is not None and same_value(old_value, reported.value):
-                self._window.request(name)  # A delayed message may have had the old value, so it is read once more.
+                self._window.request(name)  # Read it once more, because a delayed message may have had the old value.
             else:
                 self._settle(name, reported, now)
                 self._reject_alternatives(name, now)
@@ -242,13 +242,13 @@ class ParameterWrites(ParameterRequests):
         """Accept the reported value as the result, or request it again, because it may be old or unintended."""
         name = message.param_id
         if not self._window.attempts(name):
-            return  # This answers another station, because our write of this name was not sent yet.
+            return  # The message answers another station, because our write of the name was not sent yet.
         requested = self._requested[name]
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recent:
-            # This may be the late answer to the earlier write, so the value is read once more.
+            # The message may be the late answer to the earlier write, so the value is read once more.
             self._recent.remove(name)
             unexpected.add(reported)
             self._window.on_answer(name, now)
@@ -264,7 +264,7 @@ class ParameterWrites(ParameterRequests):
             return
         unexpected.add(reported)
         self._window.on_answer(name, now)
-        before = self._before.get(name)  # None: unknown, so the value may be unchanged
+        before = self._before.get(name)  # None if unknown; the reported value may then be the old one
         is_unchanged = before is None or same_value(reported.value, before)
         if is_unchanged and not is_as_requested:
             self._to_set.add(name)  # The value is still the old one, so PARAM_SET is sent again.

@@ -199,7 +199,7 @@ class RequestWindow(Generic[KeyT]):
 
     def _on_second_answer(self, key: KeyT) -> None:
         # Two answers mean that the first transmission was not lost, but repeated too early. The first answer therefore
-        # belongs to it, and measures a round trip that makes the time-out longer.
+        # belongs to the first transmission, and this longer round trip makes the time-out longer.
         seconds = self._ambiguous.pop(key, None)
         if seconds is not None:
             self._round_trip.add_sample(seconds)

@@ -61,7 +61,7 @@ def rtcm_messages(data: bytes) -> list[bytes]:
     """
     messages: list[bytes] = []
     begin = 0
-    while True:  # The first iteration also refuses empty data.
+    while True:  # `while begin < len(data)` would accept empty data.
         size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
         subject = f"rtcm (byte {begin} of {len(data)})"
         if size is None:

@@ -75,7 +75,7 @@ class BlockingContext:
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         self.close()
 
-    if not TYPE_CHECKING:  # Without these methods, type checkers report the misuse.
+    if not TYPE_CHECKING:  # Hidden from type checkers, so that they report `await` and `async with`.
 
         def __await__(self) -> NoReturn:
             self._misused("await")

@@ -264,7 +264,7 @@ class OpenContext(Generic[T]):
             loop.wait_for(opened)
             if not opened.has_result:  # __aenter__ has failed.
                 loop.wait_for(self._call)
-                self._call.result()  # This raises the exception of __aenter__.
+                self._call.result()  # raises the exception of __aenter__
         except BaseException:
             loop._cancel(self._call)
             raise

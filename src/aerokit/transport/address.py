@@ -363,7 +363,7 @@ class _Parser:
         return self.error(f"{scheme}: {reason}{did_you_mean(scheme, _SCHEMES)}")
 
     def error(self, reason: str) -> InvalidArgument:
-        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # This hides the password of a broker's URL.
+        shown = re.sub(r"(//[^/@:]*):.*@", r"\1:…@", self.text)  # hides the password in a broker's URL
         return InvalidArgument(f"{shown!r} is not a link address: {reason}. Accepted:\n{ACCEPTED_FORMS}")
 
 

@@ -25,7 +25,7 @@ class LinkPeer(NamedTuple):
     link: int
     """Index of the link."""
     peer: Peer
-    """Peer of that link; None: all of its peers."""
+    """Peer of that link; None stands for all of its peers."""
 
 
 @runtime_checkable
@@ -71,7 +71,7 @@ class MultiLink(Link):
         self._factories = tuple(factories)
         self._links = [make_link() for make_link in factories]
         self._survives_loss = survives_loss
-        self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
+        self._receiver: Receiver | None = None  # None before the opening and after the end, when no callback runs
         self._was_opened = self._is_closed = False
         self._is_available = [False] * len(self._links)
         # For each link, the peers that the receiver keeps. After a reopening, `keep_peer` is called again for them.
@@ -232,7 +232,7 @@ class MultiLink(Link):
             if error is None:
                 return
             logger.debug("the link still cannot be opened: %s", error)
-            # open() does not report a failure to the receiver, because the connection has no subscribers then. The
+            # open() does not report a failure to the receiver, because the connection has no subscribers yet. The
             # first failed retry is reported instead.
             if not is_reported and isinstance(self._receiver, MemberLinkListener):
                 is_reported = True

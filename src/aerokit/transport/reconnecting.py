@@ -86,7 +86,7 @@ class ReconnectingLink(Link):
         self._make_link = make_link
         self._link = make_link()
         self._backoff = Backoff(min_delay_s, max_delay_s)
-        self._receiver: Receiver | None = None  # None before the opening and after the end, when nothing is called
+        self._receiver: Receiver | None = None  # None before the opening and after the end, when no callback runs
         self._current: _CurrentReceiver | None = None  # receiver of the current link; callbacks of others are ignored
         self._was_opened = self._is_closed = False
         self._is_up = False  # True while the current link is open
@@ -136,7 +136,7 @@ class ReconnectingLink(Link):
         try:
             await self._link.open(current)
         except BaseException:
-            self._cancel_reopening()  # It is running if the link was lost while it was being opened.
+            self._cancel_reopening()  # A reopening runs if the link was lost while it was being opened.
             self._receiver = self._current = self._lost_at = None
             self._was_opened = False
             raise

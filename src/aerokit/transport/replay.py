@@ -39,7 +39,7 @@ class Replay(BaseLink):
         self._loop: asyncio.AbstractEventLoop | None = None  # None before the opening
         self._records: Iterator[tuple[float, bytes]] = iter(())
         # (time stamp, frame); None at the end of the recording.
-        self._next: tuple[float, bytes] | None = None  # (time stamp, frame)
+        self._next: tuple[float, bytes] | None = None
         self._due = 0.0  # time of the next frame, on the loop's clock
         self._wake_up: asyncio.Handle | None = None  # pending call of `_play`
 

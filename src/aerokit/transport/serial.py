@@ -229,7 +229,7 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
     try:
         return write(data)
     except (BlockingIOError, InterruptedError):
-        raise  # The transport retries such a write by itself.
+        raise  # The transport itself retries a write that would block.
     except OSError as error:
         on_failure(error)
         return len(data)  # Report the data as written, so that the transport does not retry: the link is closed soon.

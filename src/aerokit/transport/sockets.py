@@ -47,7 +47,7 @@ async def bound_socket(host: str, port: int, kind: socket.SocketKind) -> socket.
     """
     addresses = await resolve(host, port, kind)
     for address in addresses[:-1]:
-        with contextlib.suppress(OSError):  # If it cannot be bound, the next address is tried.
+        with contextlib.suppress(OSError):  # If this address cannot be bound, the next one is tried.
             return bind_to(address, kind)
     return bind_to(addresses[-1], kind)
 

@@ -36,7 +36,7 @@ SEND_BUFFER = 16 * 1024
 NOT_SENT_LOW_WATER = 1024
 """Limit of unsent data in the kernel (TCP_NOTSENT_LOWAT, where available)."""
 
-# Maximum number of loop iterations between accepting a client and `connection_made`. A closed link waits for so many
+# Maximum number of loop iterations between accepting a client and `connection_made`. A closed link waits for this many
 # iterations, because the connection of a client can only be closed once `connection_made` was called.
 ACCEPT_ITERATIONS = 5
 

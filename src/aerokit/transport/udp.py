@@ -290,7 +290,7 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         """Return True if another sender than the present peer may be received.
 
-        Another port of the same host is passed on to a receiver that keeps peers. The receiver checks its frames before
+        Another port of the same host is passed on to a receiver that keeps peers. The receiver checks the frames before
         it accepts the port by `keep_peer`.
         """
         host, *_ = source

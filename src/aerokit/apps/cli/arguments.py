@@ -159,7 +159,7 @@ def number(low: float, high: float) -> Callable[[str], float]:
         try:
             value = float(text)
         except ValueError:
-            value = math.nan  # in no range
+            value = math.nan  # NaN is in no range
         if not low <= value <= high:
             raise ArgumentTypeError(f"{text!r} is not a number from {low:g} to {high:g}")
         return value

@@ -85,6 +85,7 @@ def _add_publishing(
 
 
 def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> None:
+    """Add the options that all bridges have. ``rate_hz`` is the default rate, ``what`` names what is sent."""
     action.add_argument(
         "--rate",
         type=number(0.1, 50 if rate_hz < 10 else 100),
@@ -110,7 +111,7 @@ def _network(text: str) -> str:
 
 def _broker(text: str) -> str:
     try:
-        _without_password(text)  # error messages must not show the password
+        _without_password(text)  # only for its errors, which do not show the password
     except InvalidArgument as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return text
@@ -123,6 +124,7 @@ def _without_password(broker: str) -> str:
 
 
 async def _foxglove(options: argparse.Namespace) -> int:
+    """Serve vehicles to Foxglove until Ctrl-C or the end of the connection."""
     import_extra("foxglove", "foxglove")
     from aerokit.apps.foxglove import foxglove_bridge
     from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
@@ -154,6 +156,7 @@ def _rates(options: argparse.Namespace) -> dict[type[Message], float] | None:
 
 
 async def _publish(options: argparse.Namespace) -> int:
+    """Publish the states of all vehicles until Ctrl-C or the end of the connection."""
     import_extra(*options.module_and_extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for

@@ -28,7 +28,7 @@ _BAR_WIDTH = 30
 _CANCEL_TIMEOUT_S = 20.0
 
 _GROUND = "    ~~~~~~~~~~~~~~~~~~~~~~~~~~~~"
-# Poses whose pictures show the vehicle from behind. The other pictures show its right side, with the nose to the right.
+# Poses whose pictures show the vehicle from behind. The other pictures show its right side.
 _FROM_BEHIND = (CalibrationPose.LEFT, CalibrationPose.RIGHT)
 PICTURES: dict[CalibrationPose, str] = {
     CalibrationPose.LEVEL: r"""
@@ -148,6 +148,7 @@ class Display:
         self._shown: tuple[CalibrationPose | None, str] = (None, "")
 
     def show(self, step: CalibrationStep) -> None:
+        """Print a new pose with its picture, otherwise a new instruction, and in a terminal the progress."""
         if step.result is not None:
             self._show_result(step)
             return
@@ -155,7 +156,7 @@ class Display:
         del record["result"]
         shown_pose, shown_instruction = self._shown
         self._shown = step.pose, step.instruction
-        text = None  # unless the pose changes, the step only reports progress
+        text = None  # if neither pose nor instruction has changed, the step only reports progress
         if step.pose is not shown_pose:
             text = "\n".join(lines_of(step))
         elif step.instruction != shown_instruction:

@@ -81,6 +81,7 @@ async def run_demo(options: argparse.Namespace) -> int:
 
 
 async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptStack) -> int:
+    """Fly the square with a given or a simulated vehicle. Return the exit code."""
     async with _address(options) as address, AsyncExitStack() as stack:
         emit(options, "connecting", {"address": address}, f"connecting to {address}")
         stack.enter_context(new_recording(options.record))
@@ -149,6 +150,7 @@ class _SquareFlight(SupervisedFlight):
         return DONE
 
     async def _take_off(self, altitude_m: float) -> None:
+        """Wait until the vehicle is ready, then arm it and take off."""
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready")
         if vehicle.autopilot.take_off(altitude_m, 0.0, is_vtol=vehicle.is_vtol) is None:

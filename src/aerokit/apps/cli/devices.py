@@ -120,7 +120,7 @@ async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -
     record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
     emit(options, "picture", record, text)
     if options.to is None or not capture.success:
-        has_failed = capture.success is False  # None: the camera has not reported the result
+        has_failed = capture.success is False  # None if the camera has not reported the result
         return not has_failed
     name = _file_name(capture)
     if name is None:
@@ -231,11 +231,12 @@ def add_gimbal_arguments(command: argparse.ArgumentParser) -> None:
 @asynccontextmanager
 async def _gimbal(options: argparse.Namespace, *, changes: bool = True) -> AsyncIterator[Gimbal]:
     async with connected(options, changes=changes) as vehicle:
-        await vehicle.gimbals.discover()  # until gimbals are found, commands go to the autopilot
+        await vehicle.gimbals.discover()  # before gimbals are found, commands go to the autopilot
         yield vehicle.gimbal if options.gimbal is None else vehicle.gimbals.get(options.gimbal)
 
 
 async def _gimbal_info(options: argparse.Namespace) -> int:
+    """Print the description of the gimbal and, if it arrives soon, the attitude."""
     async with _gimbal(options, changes=False) as gimbal:
         try:
             information = await gimbal.information()

@@ -43,7 +43,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 """Maps extras to their modules. A test compares them with pyproject.toml."""
 
-# Network ports: number, usual purpose, and True for UDP (False: TCP).
+# Each network port has a number, a usual purpose, and True for UDP or False for TCP.
 _COMMON_PORTS = (
     (14550, "the port of ground stations such as QGroundControl and MAVProxy", True),
     (14540, "PX4's simulator sends to it", True),
@@ -167,6 +167,7 @@ async def run_doctor(options: argparse.Namespace) -> int:
 
 
 def _check_computer(report: Callable[[Finding], None]) -> None:
+    """Report findings on the installation, the serial ports and the common network ports."""
     for finding in check_installation():
         report(finding)
     ports = serial_ports()

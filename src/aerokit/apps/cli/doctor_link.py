@@ -169,6 +169,7 @@ class LinkExamination:
         return not set(self._frames) - {self._own_ids}
 
     def _silence(self) -> Iterator[Finding]:
+        """Yield the problem that no autopilot was received, with advice that depends on what was received instead."""
         connection = self._connection
         if any(is_autopilot(heartbeat) for heartbeat in connection.heartbeats.values()):
             return
@@ -230,6 +231,7 @@ class LinkExamination:
             )
 
     def _senders(self) -> Iterator[Finding]:
+        """Yield a finding for each component that has sent a heartbeat."""
         for source, heartbeat in sorted(self._connection.heartbeats.items()):
             if source == self._own_ids:
                 continue
@@ -250,6 +252,7 @@ class LinkExamination:
                 yield Finding("ok", "sender", text, _STATUS_ADVICE if is_autopilot(heartbeat) else "")
 
     def _signing(self) -> Iterator[Finding]:
+        """Yield problems with signatures: frames that the key does not fit, or signed frames without a key."""
         signing = self._connection.signing
         if signing is not None:
             if problems := self._connection.describe_signature_problems():

@@ -134,6 +134,7 @@ async def _list_logs(options: argparse.Namespace) -> int:
 
 
 async def _get_logs(options: argparse.Namespace) -> int:
+    """Download the chosen logs into the folder ``--to``. Return FAILED if the vehicle has no logs."""
     async with connected(options) as vehicle:
         entries = await vehicle.logs.list(idle_timeout_s=options.patience)
         options.to.mkdir(parents=True, exist_ok=True)

@@ -43,6 +43,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def _convert(options: argparse.Namespace) -> int:
+    """Convert a log, and print what was written. An existing target is replaced only with ``--force``."""
     # Without a suffix, OUT is a folder of tables.
     suffix = options.out.suffix.lower() or f".{options.tables}"
     module = _REQUIRED_MODULES.get(suffix)
@@ -101,6 +102,7 @@ def add_report_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def _report(options: argparse.Namespace) -> int:
+    """Write the report on one log or on the comparison of two logs, and print its summary."""
     import_extra("plotly", "report")
     logs = [options.log] if options.other is None else [options.log, options.other]
     if any(log.suffix.lower() == ".ulg" for log in logs):
@@ -109,7 +111,7 @@ async def _report(options: argparse.Namespace) -> int:
 
     target = options.output or options.log.with_suffix(".html")
     for log in logs:
-        check_log_name(log)  # before the target is checked, because its default is derived from this name
+        check_log_name(log)  # before the target, whose default is derived from the log's name
     check_not_existing(target, options)
     with progress_bar(options.log.name, "B") as on_progress:
         report = write_report(
@@ -129,6 +131,7 @@ async def _report(options: argparse.Namespace) -> int:
 
 
 def _report_text(report: Report) -> str:
+    """Return the summaries and failsafes of the flights, followed by the file and the falls."""
     lines = []
     # A report covers one log, or two logs called A and B.
     for letter, sentences, failsafes in zip("AB", report.summaries, report.failsafes, strict=False):

@@ -64,7 +64,7 @@ async def record_to_end(
             if stillness.has_lasted:
                 break
             await anyio.sleep(_POLL_INTERVAL_S)
-        return DONE  # `interrupts.run` returns None after an interrupt only
+        return DONE  # `interrupts.run` returns None only after an interrupt
 
     reason = "interrupted" if await interrupts.run(wait) is None else "end of the recording"
     print_line(f"{reason}: {vehicle.describe_now()}")

@@ -60,6 +60,7 @@ class PlanFlight(SupervisedFlight):
         """Text about what was sent to the vehicle before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
+        """Upload the plan, ask for confirmation if needed, arm, and fly the mission to its end."""
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}")
         self._check_vehicle()
@@ -149,7 +150,7 @@ class PlanFlight(SupervisedFlight):
             self._report.prints_status = True
 
     async def _print_progress(self) -> None:
-        """Print each new mission item. Explain a change of the mode, after which the flight does not end at once."""
+        """Print each new mission item. If the mode changes, explain why the flight does not end at once."""
         with (
             self._vehicle.subscribe(events.MissionCurrentChanged, events.ModeChanged, capacity=100) as changes,
             suppress(AerokitError),
@@ -272,6 +273,7 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
 async def _connect_and_fly(
     options: argparse.Namespace, plan: Plan, interrupts: InterruptStack, flights: list[PlanFlight]
 ) -> int:
+    """Connect to the vehicle or simulate one, fly the plan, and print the summary. Return the exit code."""
     async with AsyncExitStack() as stack:
         stack.enter_context(new_recording(options.record))
         link: str | Link = options.connect or default_address()

@@ -93,6 +93,7 @@ def _rate(text: str) -> tuple[str, dict[str, float]]:
 
 
 async def _hub(options: argparse.Namespace) -> int:
+    """Run the hub until Ctrl-C or ``--seconds``, and print its statistics at intervals and at the end."""
     from aerokit.hub import Hub
 
     endpoints = _endpoints(options)
@@ -112,7 +113,7 @@ async def _hub(options: argparse.Namespace) -> int:
                         await stop.wait()
                     if not stop.is_set():
                         _emit_statistics(options, hub)
-            _emit_statistics(options, hub)  # of the whole time
+            _emit_statistics(options, hub)  # totals since the start
     # Without --seconds, Ctrl-C is the normal end of the command.
     return INTERRUPTED if stop.is_set() and options.seconds is not None else DONE
 
@@ -122,6 +123,7 @@ def _how_long(options: argparse.Namespace) -> str:
 
 
 def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
+    """Return the endpoints with their options. InvalidArgument if an option names an unknown endpoint."""
     from aerokit.hub import Endpoint
 
     names = [name for name, _ in options.endpoints]

@@ -113,6 +113,7 @@ async def _wait_for_end(connection: Connection, options: argparse.Namespace) -> 
 
 
 def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], seconds: float) -> None:
+    """Print how many frames of which messages were recorded. The keys of ``counts`` are (system id, message id)."""
     from aerokit.mavlink.dialect import STANDARD
 
     messages: Counter[str] = Counter()
@@ -152,7 +153,7 @@ async def run_events(options: argparse.Namespace) -> int:
 
     async with AsyncExitStack() as stack:
         connection = await stack.enter_async_context(opened(options, reconnect=True))
-        # Subscribes before the vehicles are connected, so that their first events are printed, too.
+        # The task starts before the vehicles are connected, so that their first events are printed, too.
         printing = asyncio.create_task(_print_all(connection, options))
         stack.push_async_callback(_cancel, printing)
         await stack.enter_async_context(vehicles_on(connection, rates={}))
@@ -220,7 +221,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
 
         def force_exit_later(signal_number: int) -> None:
-            # Runs in the signal handler, because a blocked event loop would not run it.
+            # The signal handler itself starts the timer, because a blocked event loop could not do so.
             if signal_number == getattr(signal, "SIGHUP", None):
                 _detach_terminal()
             timer = threading.Timer(EXIT_TIMEOUT_S, os._exit, (INTERRUPTED,))

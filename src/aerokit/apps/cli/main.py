@@ -156,7 +156,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        # Also matches coordinates: argparse would take "-35.36,149.16,584" for an option, but "-35" for a number.
+        # With argparse's own pattern, coordinates such as "-35.36,149.16,584" would be options, not values.
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
@@ -203,7 +203,7 @@ class Parser(argparse.ArgumentParser):
         super().error(message)
 
 
-# Names of actions that users may try as commands. The library has them, but the command line does not.
+# Actions that users may try as commands. Vehicles have methods for them, but the command line does not.
 _ARMING_WORDS = ("arm", "disarm", "takeoff", "take_off", "take-off", "land", "goto", "go_to", "rtl")
 
 
@@ -211,6 +211,7 @@ class _TopParser(Parser):
     """The parser of ``aerokit`` itself. Its help lists the commands by task."""
 
     def format_help(self) -> str:
+        """Return the help, in which the commands are grouped as in `GROUPS`."""
         *options, subparsers = self._actions
         assert isinstance(subparsers, argparse._SubParsersAction)
         commands = {action.dest: action for action in subparsers._get_subactions()}
@@ -278,8 +279,8 @@ def make_parser(only: str | None = None) -> argparse.ArgumentParser:
     """Make the parser for the command line.
 
     Args:
-        only: the only command whose arguments are added, because importing all modules is slow. None: all
-            commands.
+        only: the only command whose arguments are added, because importing all modules is slow. None adds the
+            arguments of all commands.
     """
     from aerokit import __version__
 

@@ -118,7 +118,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
         count = len(content.to_items())
         if count == 0:
             continue
-        with progress_bar(part, None) as on_progress:  # a percentage, because the unit is items or, over MAVFTP, bytes
+        with progress_bar(part, None) as on_progress:  # None, because the unit may be items or, over MAVFTP, bytes
             try:
                 await getattr(vehicle, part).upload(
                     content,
@@ -127,7 +127,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
                     on_progress=on_progress,
                 )
             except InvalidArgument as error:
-                # The library's text names its argument, which is an option of the command line.
+                # Name the option of the command line instead of the library's argument.
                 text = str(error).replace("a greater max_distance_m", "a greater --max-distance-m")
                 raise InvalidArgument(text.replace("plan, item", f"{part} item")) from None
         emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")
@@ -220,6 +220,7 @@ async def _show(options: argparse.Namespace) -> int:
 
 
 async def _download(options: argparse.Namespace) -> int:
+    """Write the mission to a waypoint file or, with fence and rally points, to a ``.plan`` file."""
     from aerokit.missions import Plan, write_plan_file, write_waypoint_file
 
     check_not_existing(options.file, options)
@@ -248,12 +249,13 @@ async def _upload(options: argparse.Namespace) -> int:
 
 
 async def _check(options: argparse.Namespace) -> int:
+    """Print the items of a plan file, and warnings and notes about them. Nothing is sent."""
     plan = read_plan(options.file)
     has_items = False
     for part in PARTS:
         items = getattr(plan, part).to_items()
         has_items = has_items or bool(items)
-        if items or options.json:  # because "fence: 0 items" would look as if the upload cleared the fence
+        if items or options.json:  # "fence: 0 items" would look as if the upload cleared the fence
             emit_items(options, part, items, "in the file")
     if not has_items and not options.json:
         print(f"{options.file} has no items")

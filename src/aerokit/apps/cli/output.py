@@ -142,7 +142,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _rewrite_for_commands(record: logging.LogRecord) -> bool:
-    """Logging filter: reword warnings about an ``async with`` block and a blocked loop, which are a program's code."""
+    """Logging filter that rewords warnings about the code of a program, which users of a command do not see."""
     if str(record.msg).startswith("the async with block of vehicle %d was left: "):
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):

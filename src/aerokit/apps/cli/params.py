@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.parameters.parameters import ParameterWrite
     from aerokit.vehicle.vehicle import Vehicle
 
-# How long to read the names of the vehicle's parameters, if only a suggestion needs them.
+# How long to read the names of the vehicle's parameters when only a suggestion needs them.
 _NAMES_TIMEOUT_S = 10.0
 # If the given name begins with a known name of at least this length, the known name is suggested.
 _MIN_BEGINNING = 5
@@ -95,6 +95,7 @@ def connected(options: argparse.Namespace, *, changes: bool = False) -> Abstract
 
 
 async def _list(options: argparse.Namespace) -> int:
+    """Print the parameters whose names match a pattern. A pattern without wildcards matches parts of names."""
     metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
@@ -151,6 +152,7 @@ async def _save(options: argparse.Namespace) -> int:
 
 
 async def _diff(options: argparse.Namespace) -> int:
+    """Print the differences from a file. Return FAILED if there are any."""
     from aerokit.parameters import read_parameter_file
 
     file_values = read_parameter_file(options.file)
@@ -166,10 +168,11 @@ async def _diff(options: argparse.Namespace) -> int:
 
 
 async def _set(options: argparse.Namespace) -> int:
+    """Set parameters, after a check of the values against the metadata, and print the results."""
     values = dict(options.values)
     metadata = load_metadata_option(options)
     if not options.force:
-        check_allowed(metadata, values)  # with a file of metadata, already before connecting
+        check_allowed(metadata, values)  # if --metadata is given, values are checked before connecting
     async with connected(options, changes=True) as vehicle:
         if metadata is None:
             metadata = await metadata_for_check(vehicle, from_file=None, options=options)
@@ -188,6 +191,7 @@ async def _set(options: argparse.Namespace) -> int:
 
 
 async def _load(options: argparse.Namespace) -> int:
+    """Set the parameters of a file, and print the results that are not "unchanged" (all results with --json)."""
     from aerokit.parameters import read_parameter_file
 
     file_values = read_parameter_file(options.file)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Parameters with the system id. ArduPilot uses a new id at once (GCS_Common.cpp, update_send); PX4 and old versions of
 # ArduPilot use it after a reboot.
 _SYSTEM_ID_NAMES = ("SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID")
-# How long to read the metadata from the vehicle. Over a slow radio, the time may end before all is read.
+# How long to read the metadata from the vehicle. Over a slow radio, this may be too short for all of it.
 _READ_TIMEOUT_S = 10.0
 
 
@@ -83,9 +83,10 @@ async def metadata_for_check(
 
 
 async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
+    """Return the vehicle's metadata; None, with a message on stderr, if it cannot be read."""
     from aerokit.parameters.metadata import parse_metadata
 
-    problem = f"time-out after {_READ_TIMEOUT_S:g} s"  # unless another error is raised before
+    problem = f"time-out after {_READ_TIMEOUT_S:g} s"  # unless reading fails before the time-out
     with anyio.move_on_after(_READ_TIMEOUT_S):
         try:
             content = await vehicle.component(vehicle.component_id).metadata("parameter")

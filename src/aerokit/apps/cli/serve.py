@@ -73,6 +73,7 @@ async def _run(options: argparse.Namespace) -> int:
 
 
 async def _serve_vehicles(uvicorn: Any, serve: Any, options: argparse.Namespace, metadata: Metadata | None) -> int:
+    """Serve the vehicles of a connection until Ctrl-C. Return the exit code."""
     async with _connection(options) as connection:
         if options.record is not None:
             connection.record(options.record)
@@ -145,6 +146,7 @@ def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
 
 
 async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> int:
+    """Run uvicorn until Ctrl-C. Return the exit code."""
     server = _server_class(uvicorn)(config_of(uvicorn, app, options.host, options.port))
     server.on_started = lambda port: _emit_serving(options, app, port)
 
@@ -183,6 +185,7 @@ def _server_class(uvicorn: Any) -> Any:
 
 
 def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None:
+    """Print the address of the page, with the token if the page needs it."""
     # A browser cannot open an address that stands for all interfaces.
     host = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(str(options.host), str(options.host))
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"

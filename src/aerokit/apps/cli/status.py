@@ -45,6 +45,7 @@ _MESSAGE_TIMEOUT_S = 0.3
 
 
 def _vehicle_record(vehicle: Vehicle, checks: Readiness) -> dict[str, Any]:
+    """Return the state of a vehicle as fields of a JSON record."""
     version = vehicle.version.latest
     return {
         **overview(vehicle),
@@ -60,6 +61,7 @@ def _vehicle_record(vehicle: Vehicle, checks: Readiness) -> dict[str, Any]:
 
 
 def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
+    """Return the state of a vehicle as lines of text."""
     version = vehicle.version.latest
     heartbeat = vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))
     frame = _frame_fields(heartbeat)
@@ -107,6 +109,7 @@ def _component_record_and_text(heartbeat: Heartbeat, system_id: int, component_i
 
 
 def _link_line(record: Mapping[str, Any]) -> str:
+    """Return the numbers of a record of type "link" as one line of text."""
     total = record["frames"] + record["frames_lost"]
     is_recording = record["address"].startswith("replay:")
     parts = [
@@ -260,6 +263,7 @@ async def _request(vehicle: Vehicle, message: Any, cell: Any) -> None:
 
 
 def _emit_link(connection: Connection, options: argparse.Namespace, seconds: float) -> None:
+    """Print what was received in these ``seconds``, from all senders together."""
     statistics = list(connection.statistics())
     record = {
         "address": connection.link.address,

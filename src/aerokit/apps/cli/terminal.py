@@ -56,7 +56,7 @@ def _discard_typed_input() -> None:
         import termios
     except ImportError:  # on Windows
         return
-    with suppress(termios.error, OSError, ValueError):  # stdin is not a terminal
+    with suppress(termios.error, OSError, ValueError):  # raised if stdin is not a terminal
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
@@ -85,7 +85,7 @@ async def _read_line() -> str:
 
 
 def _signals() -> tuple[signal.Signals, ...]:
-    hang_up: signal.Signals | None = getattr(signal, "SIGHUP", None)  # not on Windows
+    hang_up: signal.Signals | None = getattr(signal, "SIGHUP", None)  # Windows has no SIGHUP
     if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN:  # nohup sets SIG_IGN
         return signal.SIGINT, signal.SIGTERM
     return signal.SIGINT, signal.SIGTERM, hang_up
@@ -190,7 +190,7 @@ def progress_bar(what: str, unit: str | None) -> Iterator[OnProgress]:
         unit_scale=is_bytes,
         unit_divisor=1024 if is_bytes else 1000,
         file=sys.stderr,
-        disable=None,  # tqdm then hides the bar if stderr is not a terminal
+        disable=None,  # None hides the bar if stderr is not a terminal
         leave=False,
         dynamic_ncols=True,
     ) as bar:

@@ -41,7 +41,7 @@ REFRESH_INTERVAL_S = 0.5
 WIDE_SIZE = 120, 30
 """Minimum columns and rows of a terminal in which less important values are displayed, too."""
 TALL_ROWS = 48
-"""Minimum rows of a wide terminal in which the state has more lines, for all reasons that prevent a flight."""
+"""Minimum rows of a wide terminal in which the state lists all reasons that prevent a flight."""
 ANSI_THEMES = ("ansi-dark", "textual-ansi", "textual-dark")
 """Names of the theme that uses the terminal's colours. The name depends on the version of Textual."""
 TRACK_STYLES = ("green", "magenta", "red", "blue", "cyan", "yellow")
@@ -283,11 +283,12 @@ class Monitor(App[None]):
         except AerokitError as error:
             add_line(f"{command} failed: {error}", "bold red")
         else:
-            # `hold` returns when the vehicle reports the mode. A vehicle with PX4 may then still be moving.
+            # `hold` returns when the vehicle reports the mode. A PX4 vehicle may still be moving then.
             done = f"in {vehicle.mode_name}, may still be stopping" if method == "hold" else "done"
             add_line(f"{command}: {done}", "bold green")
 
     def _update_list(self, options: OptionList) -> None:
+        """Add new vehicles to the list, select the first one if none is selected, and redraw changed rows."""
         vehicles = self._model.vehicles
         for system_id in vehicles:
             if system_id not in self._listed_ids:
@@ -370,7 +371,7 @@ class Monitor(App[None]):
         texts = {name: _rate_text(hz) for name, hz in self._model.rates(vehicle.system_id) if hz}
         if not texts:
             return Text(UNKNOWN, "dim")
-        # Sorts by the displayed numbers, not by the exact rates, so that equal numbers stay in the order of the names.
+        # Sort by the displayed numbers, not by the exact rates. Names with equal numbers are in alphabetical order.
         names = sorted(texts, key=lambda name: (-float(texts[name]), name))
         lines = "\n".join(f"{texts[name]:>5} {name}" for name in names)
         return Text(lines, no_wrap=True, overflow="ellipsis")

@@ -81,10 +81,11 @@ class VehicleText:
             width = columns - max(len(label) for label, _ in rows) - _LABEL_PADDING
             unused_lines = lines - len(rows)
             label = "missing" if self._failsafe is None else "failsafe"
-            rows[1] = (label, self._missing(1 + unused_lines, width))  # replaces the row with one reason only
+            rows[1] = (label, self._missing(1 + unused_lines, width))  # replaces the row that shows only one reason
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
+        """Return the labels and values of the rows that are always shown."""
         vehicle = self._vehicle
         cell = self.cell
         rows = [

@@ -35,7 +35,7 @@ SEVERITY_STYLES = (DANGER, DANGER, DANGER, "bold red", "bold magenta", "bold", "
 
 
 class _CountSample(NamedTuple):
-    """A copy of the numbers of received messages, by system id and message id, and its time."""
+    """Numbers of messages received until a time, by system id and message id."""
 
     at: float
     counts: Counter[tuple[int, int]]

@@ -163,7 +163,7 @@ class MqttLink(BaseLink):
         client.on_socket_close = self._on_socket_close
         loop.add_reader(sock, self._read, client, sock)
         self._poll(client)
-        # Does not use asyncio.wait_for, which before Python 3.12 could lose a cancellation.
+        # asyncio.wait_for is not used, because it could lose a cancellation before Python 3.12.
         await asyncio.wait((self._connect_result,), timeout=CONNECT_TIMEOUT_S)
         if self._connect_result.done():
             refusal = self._connect_result.result()
@@ -195,7 +195,7 @@ class MqttLink(BaseLink):
     def _read(self, client: Any, sock: Any) -> None:
         try:
             client.loop_read()
-            # The event loop does not report data that TLS has decrypted already, because it has left the socket.
+            # The event loop does not report data that TLS has decrypted already, because that data has left the socket.
             while client.socket() is sock and isinstance(sock, ssl.SSLSocket) and sock.pending():
                 client.loop_read()
         except Exception as error:  # paho 2.1 raises arbitrary errors for malformed packets
@@ -223,7 +223,7 @@ class MqttLink(BaseLink):
         loop = asyncio.get_running_loop()
         loop.remove_reader(sock)
         loop.remove_writer(sock)
-        # After a loss, data that the kernel has not sent must not arrive when the network is back.
+        # If the connection was lost, its unsent data must not arrive when the network is back.
         if client is self._client:
             discard_on_close(sock)
 

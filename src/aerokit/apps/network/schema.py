@@ -120,7 +120,7 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
     if isinstance(value_type, type) and issubclass(value_type, Snapshot):
         name = value_type.__name__
         if name not in definitions:
-            definitions[name] = {}  # set first, because the type may refer to itself
+            definitions[name] = {}  # prevents endless recursion if the type refers to itself
             definitions[name] = _snapshot_schema(value_type, definitions)
         return {"$ref": f"#/$defs/{name}"}
     return dict(_PLAIN_SCHEMAS[value_type])

@@ -121,7 +121,7 @@ _ORDER: dict[str, Any] = {
     },
 }
 _METADATA = ("short_description", "description", "unit", "minimum", "maximum", "reboot_required", "read_only")
-# Names of the bits of states, which the page displays.
+# Maps states to the names of their bits, which the page displays.
 _BITS = {
     state: {str(int(bit)): str(bit.name) for bit in flags}
     for state, flags in {
@@ -131,7 +131,7 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# With wait=false, an order is answered after this time or, if the library refuses it sooner, with the reason.
+# With wait=false, the response is sent after this time. If the library refuses the order sooner, it has the reason.
 _REFUSAL_TIMEOUT_S = 0.2
 
 
@@ -181,6 +181,7 @@ def _operation(operation: Operation) -> dict[str, Any]:
 
 
 def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
+    """Yield the OpenAPI parameters of an operation: in the path, in the query and, for orders, in the headers."""
     for name in re.findall(r"{(\w+)}", operation.path):
         schema = {"type": "integer", "minimum": 1, "maximum": 255} if name == "system_id" else {"type": "string"}
         yield {"name": name, "in": "path", "required": True, "schema": schema}
@@ -359,7 +360,7 @@ class HttpApi:
 
     async def _vehicle(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
-        # Some vehicles report the names of their modes, which may include others than those of the firmware.
+        # A vehicle may report the names of its modes, and may have more of them than its firmware has by default.
         names = dict.fromkeys([*vehicle.autopilot.modes.names, *vehicle.telemetry.mode_names.values()])
         unselectable = vehicle.autopilot.unselectable_modes
         return json_response({**overview(vehicle), "modes": [name for name in names if name not in unselectable]})
@@ -504,7 +505,7 @@ def _parameter(parameter: Parameter, metadata: Metadata | None) -> dict[str, Any
 
 
 async def _wait_until_ended(record: OrderRecord, timeout_s: float | None) -> None:
-    # Does not use asyncio.wait_for, which before Python 3.12 could lose a cancellation.
+    # asyncio.wait_for is not used, because it could lose a cancellation before Python 3.12.
     waiting = asyncio.ensure_future(record.ended.wait())
     try:
         await asyncio.wait((waiting,), timeout=timeout_s)

@@ -22,7 +22,7 @@ DISARM_ORDER_MAX_AGE_S = 5.0
 CRASH_STILL_S = 2.0
 """A crashed vehicle does not move for this many seconds."""
 CRASH_STILL_SAMPLES = 3
-"""In these seconds, a crashed vehicle sends at least this many reports of its velocity."""
+"""Minimum number of velocity reports in ``CRASH_STILL_S`` that show that a vehicle does not move."""
 CRASH_STILL_WITHIN_S = 3.0
 """A crashed vehicle comes to rest at most this many seconds after the impact."""
 CRASH_EVIDENCE_WITHIN_S = 10.0
@@ -71,16 +71,16 @@ class FlightWatch:
         self._impact_height_m: float | None = None
         self._was_sudden_stop = False
         self._is_impact_dismissed = False
-        # Since when the vehicle has been still after the impact, and in how many reports of its velocity.
+        # Start of the time without motion after the impact, and number of velocity reports since then.
         self._still_since = math.inf
         self._still_samples = 0
-        self._moving_since = math.inf  # since when the crashed vehicle has been moving
-        self._take_off_height_m: float | None = None  # where the crashed vehicle reported a take-off
+        self._moving_since = math.inf  # when the crashed vehicle began to move
+        self._take_off_height_m: float | None = None  # height at which the crashed vehicle reported a take-off
         self._armed_at: float | None = None  # None if the vehicle was armed before this object was created
         self._armed_until = -math.inf  # when the vehicle was last disarmed
-        self._was_in_air = False  # since the last arming
+        self._was_in_air = False  # True if the vehicle was in the air since the last arming
         self._disarm_ordered_at = -math.inf
-        self._disarming: tuple[float, float] | None = None  # when, and after how many seconds armed
+        self._disarming: tuple[float, float] | None = None  # time of the disarming, and seconds armed before it
         self._detachments: tuple[Callable[[], None], ...] = (
             vehicle.velocity.observe(self._on_velocity, every_arrival=True),
             vehicle.armed.observe(self._on_armed),
@@ -139,6 +139,7 @@ class FlightWatch:
             self._disarm_ordered_at = self._now()
 
     def _on_armed(self, before: bool | None, is_armed: bool) -> None:
+        """Record when the vehicle is armed, and a disarming on the ground that no order of this server caused."""
         now = self._now()
         if is_armed:
             # If the vehicle was armed before this program started, the time of arming is unknown.

@@ -90,7 +90,7 @@ class OrderType:
                 raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {names}")
         for name, argument in self.arguments.items():
             value = values.get(name)
-            # Checks only bools, which Python accepts as ints: True is not the number of a mode.
+            # Python accepts bools as ints, but True is not the number of a mode. The library checks all other types.
             if value is not None and isinstance(value, bool) != (argument.type == "boolean"):
                 raise InvalidArgument(
                     f"{self.name}: {name} = {value!r:.40} is not allowed: its type must be {argument.type}"
@@ -126,7 +126,7 @@ async def _pause(vehicle: Vehicle, _: dict[str, Any]) -> object:
 
 
 async def _resume(vehicle: Vehicle, values: dict[str, Any]) -> None:
-    # After a finished mission, an ArduCopter on the ground would take off and fly from the first item.
+    # If its mission is finished, an ArduCopter on the ground would take off and fly the mission again.
     is_on_ground = is_reported_on_ground(vehicle, max_age_s=_LANDED_STATE_MAX_AGE_S)
     if vehicle.is_armed and is_on_ground and vehicle.autopilot.vehicle_type not in SURFACE_TYPES:
         raise OperationRejected(
@@ -397,6 +397,7 @@ class OrderRunner:
     async def _run(
         self, vehicle: Vehicle, order_type: OrderType, record: OrderRecord, arguments: dict[str, Any]
     ) -> None:
+        """Run an order, and store and publish its result or error."""
         try:
             record.result = to_jsonable(await order_type.run(vehicle, arguments))
             record.state = "done"

@@ -187,6 +187,7 @@ class ServedVehicles:
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
     async def _record_tracks(self) -> None:
+        """Add the positions of all vehicles to their tracks, without end. Thin out a track that is full."""
         silent: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
@@ -214,7 +215,7 @@ class ServedVehicles:
             await anyio.sleep(TRACK_INTERVAL_S)
 
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
-        """Return the overview of a vehicle, with what the page shows besides: see docs/serve.md.
+        """Return the overview of a vehicle, and further values that the page shows (docs/serve.md).
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
         wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
@@ -247,7 +248,7 @@ class ServedVehicles:
 
 
 async def _read_return_altitude(vehicle: Vehicle) -> None:
-    with suppress(AerokitError):  # the altitude then stays unknown
+    with suppress(AerokitError):  # after an error, the altitude stays unknown
         await vehicle.return_altitude()
 
 

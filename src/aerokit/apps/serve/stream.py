@@ -46,6 +46,7 @@ class StateStream:
         self._anonymous: set[WebSocket] = set()
 
     async def endpoint(self, socket: WebSocket) -> None:
+        """Handle one WebSocket, from its request until its end."""
         try:
             rate_hz = self._admit(socket)
         except HttpProblem as problem:
@@ -150,7 +151,7 @@ class StateStream:
 
 
 async def _send(socket: WebSocket, text: str) -> None:
-    with anyio.fail_after(SEND_TIMEOUT_S):  # not wait_for, which before Python 3.12 could lose a cancellation
+    with anyio.fail_after(SEND_TIMEOUT_S):  # wait_for could lose a cancellation before Python 3.12
         await socket.send_text(text)
 
 

@@ -19,7 +19,7 @@ MAX_REMEMBERED = 4096  # number of remembered frames, enough for 10 s at 400 fra
 # An equal frame over another link is always a duplicate if it arrives within this time after the first.
 COPY_WINDOW_S = 3.0
 
-# A copy over a slow link may arrive up to this time after the first copy. Later than COPY_WINDOW_S, an equal frame can
+# A copy over a slow link may arrive up to this time after the first copy. After COPY_WINDOW_S, an equal frame can
 # only be a duplicate if the first copy was accepted.
 LATE_COPY_WINDOW_S = 10.0
 
@@ -52,7 +52,7 @@ class Copies:
         # (body, checksum, signature) → what is known about the frame.
         self._seen: dict[tuple[bytes, int, bytes], _Seen] = {}
         self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
-        self._current: _Seen | None = None  # of the last checked frame; None before the first
+        self._current: _Seen | None = None  # record of the last checked frame; None before the first
         self.is_late: bool = False
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
@@ -103,7 +103,7 @@ class Copies:
             self._current.is_accepted = True
 
 
-# After a switch to another link, answers to earlier requests may still arrive over the previous link for this time.
+# For this time after a switch to another link, answers to earlier requests may arrive over the previous link.
 ANSWER_TIMEOUT_S = 3.0
 
 # A component counts as reachable over a link until it has sent nothing over this link for this time.
@@ -132,7 +132,7 @@ class _Stream:
 
     def __init__(self, link_count: int) -> None:
         self.received_at = [-math.inf] * link_count
-        self.newest_sequence = -1  # sequence number of the newest accepted frame; -1: none
+        self.newest_sequence = -1  # sequence number of the newest accepted frame; -1 if there is none
         # Acknowledgement's payload → how often each link delivered it since the last switch to another link.
         self.acknowledgements: dict[bytes, list[int]] = {}
 
@@ -185,7 +185,7 @@ class MergedStreams:
         choice = self._choices.get(frame.system_id)
         if choice is None or choice.used is None:
             self.copies.accept()
-            return True  # No link was chosen, because the sender sends no heartbeats, e.g. a radio.
+            return True  # No link is chosen for a sender without heartbeats, e.g. a radio.
         candidate = choice.candidates.get(link)
         if candidate is not None and not choice.may_be_used(candidate):
             return False

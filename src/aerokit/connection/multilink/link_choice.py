@@ -17,7 +17,7 @@ PROBED_TIMEOUT_S = 1.0
 # missing.
 UNPROBED_TIMEOUT_S = 2.5
 
-# Consecutive matching clock samples that prove that a second link leads to the same vehicle.
+# This many consecutive matching clock samples prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
 # A vehicle that answers this many TIMESYNC probes after the request for its hardware id, but not the request itself,
@@ -231,8 +231,8 @@ class LinkChoice:
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is our time at that moment."""
         candidate = self.candidates[link]
-        # True if the link in use did not answer since the previous answer over this link. This is determined before the
-        # new answer is recorded.
+        # True if the link in use has not answered since the previous answer over this link. Recording the new answer
+        # would change the result, so it follows below.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
@@ -284,10 +284,9 @@ class LinkChoice:
 
     def choose(self, now: float) -> str | None:
         """Select the link to use. Return the reason if it changes, otherwise None."""
-        alive = sorted(
-            (link for link in self.candidates.values() if self.may_be_used(link) and link.is_alive(now)),
-            key=lambda candidate: (candidate.is_costly, candidate.cost_s),
-        )
+        usable = filter(self.may_be_used, self.candidates.values())
+        alive = [candidate for candidate in usable if candidate.is_alive(now)]
+        alive.sort(key=lambda candidate: (candidate.is_costly, candidate.cost_s))
         if not alive:
             return None
         best, used = alive[0], self.used
@@ -296,6 +295,7 @@ class LinkChoice:
         if used not in alive:
             return self._change(best, used.failure(), now)
         is_better = best.is_costly < used.is_costly or best.cost_s < MAX_COST_RATIO * used.cost_s
+        # A better link replaces the link in use only after it has stayed the best for MIN_BETTER_S.
         if best is used or not is_better:
             self._better = None
         elif best is not self._better:

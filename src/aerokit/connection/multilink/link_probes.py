@@ -69,7 +69,7 @@ class LinkProbes:
         *,
         is_attached: bool,
     ) -> None:
-        """Send a probe if one is due. ``is_attached``: the system has a vehicle object."""
+        """Send a probe if one is due. ``is_attached`` is True if the system has a vehicle object."""
         # An unused costly link is probed rarely once it is known whether the link leads to the vehicle.
         is_idle = candidate.is_costly and candidate is not choice.used
         is_new = not candidate.is_proven and not candidate.is_doubted
@@ -81,7 +81,7 @@ class LinkProbes:
             return
         self._probed_at[key] = now
         # The answer contains `ts1`, which identifies the probe. It is our time in nanoseconds. The last three digits
-        # are a number of the system and the link, because several probes may be sent at the same time.
+        # depend on the system and the link, because several probes may be sent at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
         if ts1 <= 0 or ts1 in self._pending:
             return  # The number is invalid, or belongs to another pending probe. The next call tries again.

@@ -47,7 +47,7 @@ class LinkStates:
     ) -> None:
         self._link, self._choices, self._publish = link, choices, publish
         self._states = [LinkState.LOST] * len(link.names)
-        self._updated_at = -math.inf  # time of the last update of the cell; −inf: an update is due
+        self._updated_at = -math.inf  # time of the last update of the cell; −inf if an update is due
         self.cell: StateCell[tuple[LinkStatus, ...]] = StateCell("links", clock, "frame")
 
     def update(self, now: float) -> None:
@@ -112,7 +112,7 @@ COMMANDS = frozenset(
     )
 )  # fmt: skip
 
-# Broadcasts that a vehicle may receive several times, because they have no effect. They go to every peer on every link.
+# Broadcasts that a vehicle may receive several times without effect. They go to every peer on every link.
 BROADCASTS = frozenset(message_type.ID for message_type in (m.Heartbeat, m.Timesync, m.Ping))
 
 

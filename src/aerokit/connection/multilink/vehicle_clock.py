@@ -16,12 +16,12 @@ MAX_SAMPLES = 20
 TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
 MAX_DRIFT_S = 0.5  # Without this limit, any clock would match after a long enough silence.
-# A measured speed of 1 ± this value counts as 1. Otherwise its error would grow with the length of a silence.
+# A measured clock rate of 1 ± this value counts as 1. Otherwise its error would grow with the length of a silence.
 REAL_TIME_TOLERANCE = 0.05
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time
 MAX_PAUSE_S = 10.0  # A simulation that was paused for longer counts as rebooted.
-SPEED_MAX_AGE_S = 5.0  # The speed measured before a pause or reboot remains valid for this time.
+SPEED_MAX_AGE_S = 5.0  # A clock rate measured before a pause or reboot remains valid for this time.
 
 
 class VehicleClock:
@@ -32,7 +32,7 @@ class VehicleClock:
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
         """True if the last sample was as expected from the speed; False after a pause or reboot."""
-        self._previous_speed: tuple[float, float] | None = None  # speed before the last pause or reboot, and its time
+        self._previous_speed: tuple[float, float] | None = None  # clock rate before the last pause or reboot, and when
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
@@ -44,7 +44,7 @@ class VehicleClock:
         if not self.is_steady:
             if (speed := self._measured_speed) is not None:
                 self._previous_speed = speed, at
-            self._samples.clear()  # The pause would make the speed measured over older samples too small.
+            self._samples.clear()  # The pause would make the clock rate measured over older samples too small.
         self._samples.append((at, vehicle_s))
         return continues
 
@@ -60,7 +60,7 @@ class VehicleClock:
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample is as expected from the last sample and the speed; None if the speed is unknown."""
+        """Return True if a sample is as expected from the last one and the clock's speed; None if that is unknown."""
         speed = self._speed
         if speed is None:
             return None
@@ -74,7 +74,7 @@ class VehicleClock:
         advance_s = vehicle_s - last_vehicle_s
         speed = self._measured_speed
         if speed is None:
-            # The speed of the vehicle's clock is not measured yet. In a simulation, it may be up to MAX_SPEED.
+            # The rate of the vehicle's clock is not measured yet. A simulation may run up to MAX_SPEED times as fast.
             max_advance_s = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
             return -TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
         tolerance_s = self._tolerance_s(at, round_trip_s, speed)

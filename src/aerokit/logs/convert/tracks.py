@@ -85,7 +85,7 @@ class _TrackWriter:
             return
         scale = 1e7 if item.NAME == "MISSION_ITEM_INT" else 1.0
         latitude, longitude = item.x / scale, item.y / scale
-        # Skips items without valid coordinates: 0, 0 means the current position, and NaN fails both comparisons.
+        # Items without valid coordinates are skipped: 0, 0 means the current position, and NaN fails both comparisons.
         is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
         if is_valid and math.isfinite(item.z):
             self._tracks[system_id].waypoints[item.seq] = Waypoint(

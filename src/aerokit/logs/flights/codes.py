@@ -112,9 +112,9 @@ _ERROR_DETAILS: Mapping[tuple[int, int], str] = {
     (18, 2): "glitch",
 }
 
-# The error codes of these subsystems have their own meaning.
-_MODE_CHANGE = 10  # the number of the refused mode
-_ESTIMATOR_SWITCH = 24  # the number of the new estimator
+# Subsystems whose error code is not the number of an error, but the value in the comment.
+_MODE_CHANGE = 10  # number of the refused mode
+_ESTIMATOR_SWITCH = 24  # number of the new estimator
 _FENCE = 9  # bits of AC_FENCE_TYPE
 _FENCE_TYPES = {
     1: "above the maximum altitude",
@@ -218,5 +218,5 @@ def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
     if gcs_meanings is not None:
         return gcs_meanings.get(value, "")
     meanings = _ACTIONS.get(firmware, {}).get(parameter, ())
-    is_known = value in range(len(meanings))  # False for a fraction, too
+    is_known = value in range(len(meanings))  # also False for a fraction
     return meanings[int(value)] if is_known else ""

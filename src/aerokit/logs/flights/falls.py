@@ -26,7 +26,7 @@ _DISARM_TIMEOUT_S = 30.0
 # Disarming and status texts may explain a descent if they are at most _REASON_BEFORE_S before its start. Status texts
 # may also explain it if they are at most _TEXT_AFTER_S after its end.
 _REASON_BEFORE_S, _TEXT_AFTER_S = 3.0, 5.0
-# Disarming later than this before the end of a descent may be caused by the impact.
+# Disarming less than this before the end of a descent may be a consequence of the impact, not the cause.
 _IMPACT_DISARM_S = 0.3
 _NEAR_HOME_HEIGHT_M = 3.0  # above this height, an armed vehicle that keeps its height may be hovering
 
@@ -94,7 +94,7 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
                 yield begin_s, time_s, sink_m_s, True
             begin_s, sink_m_s = time_s, 0.0
         previous_s = time_s
-    is_fast_at_end = last_fast_s == previous_s > begin_s
+    is_fast_at_end = last_fast_s == previous_s and last_fast_s > begin_s
     if is_fast_at_end:
         yield begin_s, last_fast_s, sink_m_s, False
 
@@ -128,7 +128,7 @@ def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
     """Return True if the vehicle keeps this height until it is disarmed, or stays armed near the height of home."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
-    was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # armed spans end with the log, too
+    was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log
     if not was_disarmed and height_m > _NEAR_HOME_HEIGHT_M:
         return False  # the vehicle may be hovering
     heights = flight.track.between("altitude_relative_m", time_s + _IMPACT_S, until_s)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MAGIC = b"\xa3\x95"
-_MAX_UNREADABLE_TAIL = 4096  # up to this many bytes at the end are ignored: power-off may cut off rows
+_MAX_UNREADABLE_TAIL = 4096  # bytes ignored at the end, because power-off may cut off rows
 _NO_UTC = "no GNSS time in the log: times count from power-on, which is shown as 1970-01-01"
 _A_YEAR_S = 365 * 86_400.0
 _MAX_UNIX_S = 4_102_444_800.0  # the year 2100; `aerokit.mavlink.tlog` has the same limit
@@ -50,7 +50,7 @@ def opened_bin(path: Path, on_percent: Callable[[float], object] | None = None) 
         if not head.startswith(_MAGIC):
             raise FileFormatError(f"{path} is not an ArduPilot log: it does not begin with A3 95")
     reader_class = import_module("pymavlink.DFReader").DFReader_binary
-    reader = reader_class.__new__(reader_class)  # __init__ follows separately: if it raises, `reader` has open files
+    reader = reader_class.__new__(reader_class)  # __init__ is called below; if it raises, `reader` can be closed
     try:
         with redirect_stdout(sys.stderr):  # pymavlink prints about damage, but stdout may be for JSON
             reader.__init__(str(path), progress_callback=on_percent)
@@ -104,7 +104,7 @@ class _RowReader(LogReader):
 def _column_kind(value: object) -> str:
     if isinstance(value, float):
         return "float"
-    return "int" if isinstance(value, int) else "str"  # bytes and arrays are converted to "str", too
+    return "int" if isinstance(value, int) else "str"  # bytes and arrays are also converted to "str"
 
 
 def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
@@ -135,6 +135,7 @@ class BinReader(_RowReader):
             close_bin(self._reader)
 
     def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
+        """Yield a record for each row, except descriptions of tables. Report the progress to ``on_bytes``."""
         count = 0
         while (message := self._next(reader)) is not None:
             count += 1
@@ -314,8 +315,8 @@ class _Px4States:
         elif table == "battery_status":
             remaining = row["remaining"]
             percent = round(remaining * 100) if math.isfinite(remaining) and remaining >= 0 else None
-            current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1: unknown
-            voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0: unknown
+            current_a = _finite_or_none(row["current_a"]) if row["current_a"] >= 0 else None  # -1 means unknown
+            voltage_v = _finite_or_none(row["voltage_v"]) if row["voltage_v"] > 0 else None  # 0 means unknown
             battery = Battery(id=0, voltage_v=voltage_v, current_a=current_a, remaining_percent=percent)
             return (("batteries", (battery,)),)
         elif table == "logged_messages":

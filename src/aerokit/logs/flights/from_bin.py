@@ -166,7 +166,7 @@ def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
         return list(values)
-    if 0 < scale < 1:  # division is more exact: 100 is a binary number, 0.01 is not
+    if 0 < scale < 1:  # Dividing by 100 is more exact than multiplying by 0.01.
         divisor = round(1 / scale)
         return [value / divisor for value in values]
     return [value * scale for value in values]
@@ -262,13 +262,13 @@ class _Reader:
                 track.add(time, latitude, longitude, amsl, relative)
         if len(track):
             return
-        # Without a position of the estimator, use that of the GPS receiver, if it has a 3D fix.
+        # If the estimator has no positions, use those of the GPS receiver that have a 3D fix.
         for time, status, latitude, longitude, amsl in self._tables.rows("GPS", "Status", "Lat", "Lng", "Alt"):
             if status >= GpsFixType.TYPE_3D_FIX:
                 track.add(time, latitude, longitude, amsl, NAN)
 
     def _velocity(self) -> None:
-        table = "XKF1" if self._tables.has("XKF1", "VN", "VE", "VD") else "NKF1"  # NKF1: the estimator of old logs
+        table = "XKF1" if self._tables.has("XKF1", "VN", "VE", "VD") else "NKF1"  # old logs have NKF1
         core_columns = ("C",) if self._tables.has(table, "C") else ()
         for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
             if not core or core == [0]:  # one estimator, or the first of several
@@ -360,6 +360,6 @@ class _Reader:
     def _errors(self) -> None:
         for time, subsystem, code in self._tables.rows("ERR", "Subsys", "ECode"):
             kind, text = ERRORS.get(subsystem, ("general", f"subsystem {subsystem}"))
-            if code:  # 0: the error is over
+            if code:  # 0 means that the error is over
                 description = f"{error_text(subsystem, code, text)} (ERR {subsystem}/{code})"
                 self._flight.failsafe_evidence.append(FailsafeEvidence(time, kind, description))

@@ -89,7 +89,7 @@ class _Reader:
         self._mode_commands = RecordedModeCommands(flight, self._autopilot)
         self._system_status = 0
         self._has_battery_status = False
-        self._charge_states: dict[int, int] = {}  # by battery
+        self._charge_states: dict[int, int] = {}  # MAV_BATTERY_CHARGE_STATE by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
         self._local_position = (NAN, NAN, NAN)  # metres north, east and down of the estimator's origin
         self._relative_m = NAN
@@ -98,7 +98,7 @@ class _Reader:
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
         self._mission = RecordedMission(flight)
-        # Commands that the vehicle itself has sent are not handled, because it sends them to its components. For
+        # Commands that the vehicle itself has sent are ignored, because they are for its own components. For
         # example, PX4 informs its components when it has decided to return.
         commands: dict[type[Message], Callable[[float, Any], None]] = {
             m.CommandLong: self._mode_commands.on_command,
@@ -143,6 +143,7 @@ class _Reader:
                     message_id, sender, sequence = raw[5:6] + b"\0\0", raw[3:5], raw[2]
                 if sender == source:
                     new_frames += 1
+                    # To save calls, frames are counted together until a frame is missing or a second ends.
                     if sequence != expected_sequence or unix_s >= next_second:
                         if unix_s - last_frame_at >= MIN_SILENCE_S:
                             link.add_silence(
@@ -196,7 +197,7 @@ class _Reader:
         setpoints, destinations = self._flight.position_target, self._destinations
         if setpoints.has("latitude_deg"):
             return
-        has_heights = setpoints.has()  # set-points without latitudes have only heights
+        has_heights = setpoints.has()  # without latitudes, set-points have only heights
         rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints), strict=True))
         columns = (destinations[name] for name in destinations)
         for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
@@ -390,8 +391,9 @@ class _Reader:
         )
 
     def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
+        """Add the values of a battery, and evidence of a failsafe if its charge state has become worse."""
         cells_mv = [mv for mv in message.voltages if mv != _U16]
-        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0: the cell does not exist
+        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 means a missing cell
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         state = message.charge_state
@@ -423,7 +425,7 @@ class _Reader:
     def _on_servo_output(self, time_s: float, message: m.ServoOutputRaw) -> None:
         if message.port == 0:  # the main outputs
             pulses = (getattr(message, f"servo{number}_raw") for number in range(1, 9))
-            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0: the output is not used
+            self._flight.outputs.add(time_s, *(pulse or NAN for pulse in pulses))  # 0 means an unused output
 
     def _on_radio(self, time_s: float, message: m.RadioStatus | m.Radio) -> None:
         self._flight.radio.add(time_s, message.rssi, message.remrssi, message.noise, message.remnoise)
@@ -437,7 +439,7 @@ def _message_id_bytes(kind: type[Message]) -> bytes:
 def _decoded(raw: bytes, unix_s: float) -> Message | None:
     """Decode the frame of a record; None if its checksum is wrong."""
     if raw[0] == MAGIC_V2:
-        # This is faster than `Frame.parse`. A signature after the checksum is ignored.
+        # Setting the attributes is faster than `Frame.parse`. A signature after the checksum is ignored.
         frame = Frame()
         end = 10 + raw[1]  # the end of the payload
         frame.body = raw[1:end]

@@ -153,6 +153,7 @@ class _Reader:
         self._began_us = min([int(log.start_timestamp), *first_times])
 
     def read(self) -> None:
+        """Fill the flight with the texts, the parameters and all topics of the log."""
         flight, log = self._flight, self._log
         flight.autopilot = "PX4"
         flight.vehicle = _version(log)
@@ -207,7 +208,7 @@ class _Reader:
         fields = ("nav_state", "nav_state_user_intention", "failsafe")
         for time_s, state, intended_state, failsafe in status.rows(*fields):
             name = _NAV_STATES.get(int(state), f"MODE {int(state)}")
-            # The autopilot itself changed the mode if it is not the mode that the pilot or a program requested.
+            # If the mode is not the one that the pilot or a program requested, the autopilot itself has changed it.
             by_autopilot = None if math.isnan(intended_state) else bool(state != intended_state)
             reason = ""
             if failsafe == 1:
@@ -217,11 +218,12 @@ class _Reader:
             self._flight.add_mode(time_s, name, reason, by_autopilot)
 
     def _failsafe_flags(self) -> None:
+        """Add evidence of failsafes for the flags that were set while the vehicle was armed."""
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
 
-        # Flags on the ground, until one second after arming, are ignored, because many are set there.
+        # Flags are ignored until one second after arming, because many flags are set on the ground.
         def is_armed(time_s: float) -> bool:
             return any(begin + 1 < time_s <= end for begin, end in flight.armed)
 
@@ -239,6 +241,7 @@ class _Reader:
                 )
 
     def _movement(self) -> None:
+        """Read home, track, velocity, attitude and airspeed."""
         flight = self._flight
         home = self._topic("home_position")
         if home is not None:
@@ -267,7 +270,7 @@ class _Reader:
     def _track_of_receiver(self) -> None:
         receiver = self._topic("vehicle_gps_position", "sensor_gps")
         if receiver is not None:
-            has_integers = "lat" in receiver  # old versions: 1e-7 degrees and millimetres
+            has_integers = "lat" in receiver  # old versions of PX4 log 1e-7 degrees and millimetres
             fields = ("lat", "lon", "alt") if has_integers else ("latitude_deg", "longitude_deg", "altitude_msl_m")
             per_degree, per_metre = (1e7, 1e3) if has_integers else (1, 1)
             for time_s, fix_type, latitude, longitude, amsl in receiver.rows("fix_type", *fields):
@@ -287,6 +290,7 @@ class _Reader:
         _extend(columns, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
 
     def _targets(self) -> None:
+        """Read the set-points. PX4 logs positions in metres from the local origin."""
         flight = self._flight
         self._angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
         setpoint = self._topic("vehicle_local_position_setpoint")
@@ -322,14 +326,15 @@ class _Reader:
         return origin
 
     def _equipment(self) -> None:
+        """Read batteries, GPS receivers, the estimator, vibration and links."""
         flight = self._flight
         for number, battery in self._topics("battery_status"):
             remaining = battery.array("remaining") * 100
             remaining[remaining < 0] = NAN
             current = battery.array("current_a")
-            current[current < 0] = NAN  # -1: unknown
+            current[current < 0] = NAN  # -1 means unknown
             voltage, used = battery.array("voltage_v"), battery.array("discharged_mah")
-            voltage[voltage <= 0] = NAN  # 0: unknown
+            voltage[voltage <= 0] = NAN  # 0 means unknown
             used[used < 0] = NAN
             _extend(
                 flight.battery(number),
@@ -366,6 +371,7 @@ class _Reader:
         self._links()
 
     def _links(self) -> None:
+        """Read the loss of messages and the values of the telemetry radio."""
         # PX4 may have several links. The data of the link that received the most messages is used.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 NAN = math.nan
 _MAX_SEQUENCE_GAP = 200
-_ALL_LOST = (100.0, 0)  # a row of the link's time series: the percentage of lost messages, and the received ones
+_ALL_LOST = (100.0, 0)  # row of the link's time series: percentage of lost messages, number of received messages
 MIN_SILENCE_S = 3.0
 """Minimum seconds without a message that count as a silence. Autopilots send HEARTBEAT once a second."""
 

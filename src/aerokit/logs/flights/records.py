@@ -199,7 +199,7 @@ class _VehicleStates:
         names = self._states_by_message.get(type(message).__name__, ())
         if names:
             if message.received_frame is not None:
-                message.received_frame.received_at = now
+                message.received_frame.received_at = now  # becomes the time of the states
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
             telemetry.expire(now)  # publishes status texts whose last parts are missing

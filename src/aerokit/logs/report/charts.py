@@ -99,7 +99,7 @@ def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[in
         end = count * (piece + 1) // pieces
         part = values[begin:end]
         known = part
-        if math.isnan(sum(part)):  # at least one value is unknown
+        if math.isnan(sum(part)):  # the sum is NaN if any value is unknown
             known = [value for value in part if not math.isnan(value)]
             # Draw a gap only if most values of the part are unknown.
             if len(known) * 2 < len(part):

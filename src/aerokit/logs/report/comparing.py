@@ -151,8 +151,8 @@ def _overlay_section(
             names_without_data.append(NAMES[number])
             continue
         times, values = points(columns, column)
-        begin = _armed_at(flight)
-        traces.append({"x": [round(time - begin, 2) for time in times], "y": values, **_line_style(number)})
+        armed_s = _armed_at(flight)
+        traces.append({"x": [round(time - armed_s, 2) for time in times], "y": values, **_line_style(number)})
     if not traces:
         return Section(title, missing="Neither log contains this.")
     begin = min(-_armed_at(flight) for flight in flights)

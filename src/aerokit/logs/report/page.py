@@ -187,6 +187,7 @@ def _section(number: int, section: Section) -> Iterator[str]:
 
 
 def _part(part: Part) -> Iterator[str]:
+    """Yield the HTML of a part of a section."""
     if isinstance(part, Chart):
         size = " large" if part.height > 400 else ""
         yield (
@@ -206,6 +207,7 @@ def _part(part: Part) -> Iterator[str]:
 
 
 def _table(table: Table) -> Iterator[str]:
+    """Yield the HTML of a table. Long tables are collapsed, and very long ones are not printed."""
     count = len(table.rows)
     if count > MAX_OPEN_ROWS:
         print_attribute = ' data-print="no"' if count > MAX_PRINTED_ROWS else ""

@@ -170,11 +170,11 @@ class Captures:
         """Number of older images that the log has dropped. The log's first image has this image index."""
         self.interval_s: float = 0.0
         """Seconds between two images of the current series."""
-        self._remaining = 0  # number of images of the series that are still to be taken; -1: no limit
+        self._remaining = 0  # number of images of the series that are still to be taken; -1 if unlimited
         self._is_exposing = False  # True while an image is being taken
         self._is_late = False  # True if the next image is due, but the previous one is not finished
         self._series = 0  # number of the series; callbacks of earlier series are ignored
-        self._recording_since = math.nan  # start of the video; NaN: no video
+        self._recording_since = math.nan  # start of the video; NaN while there is no video
 
     def switch_off(self) -> None:
         """End the series and the video at once, as a power failure does. The image log is kept."""

@@ -363,6 +363,7 @@ class MissionServer:
             self._drop(upload)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
+        """Clear one list or all lists, unless a transfer is open or another request to clear is running."""
         client, kind = sender_of(request), request.mission_type
         if kind not in (*self.lists, MavMissionType.ALL):
             self._acknowledge(client, kind, _Result.UNSUPPORTED, channel)

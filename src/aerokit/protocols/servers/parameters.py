@@ -188,6 +188,7 @@ class TypedParameterServer(ParameterProtocolServer):
             self.send_error(sender_of(request), unknown_name, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
+        """Store a received value and answer with it. Refuse an invalid value or an unknown name by PARAM_ERROR."""
         name, names, store = request.param_id, self.names, self._store
         if name not in names:
             self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)

@@ -114,7 +114,7 @@ class ControlLease:
     """
 
     def __init__(self) -> None:
-        self._holder: str | None = None  # None: no client had the lease yet, or it was released
+        self._holder: str | None = None  # None if the lease was released, or no client had it yet
         self._received_at = 0.0  # time of the last data of the holder
 
     def holder(self, now: float) -> str | None:
@@ -152,7 +152,7 @@ class ClientFilter:
         self._client, self._lease = client, lease
         self._framer = _framer()
         # Nonce of the program that uses this client name; None before its first datagram.
-        self._nonce: int | None = None  # nonce of the program that uses this client name
+        self._nonce: int | None = None
         self._nonce_at = 0.0  # time of the last datagram from that program
         # Message name → time of the last notice, and the number of refused messages since then.
         self._notices: dict[str, tuple[float, int]] = {}
@@ -366,7 +366,7 @@ class VehicleSideTracker:
         self.received_at: float = 0.0
         """Time of the last valid beacon."""
         self._nonce, self._mode = nonce, mode
-        self._beacon_number = 0  # number of the last valid beacon; 0: none
+        self._beacon_number = 0  # number of the last valid beacon; 0 if there is none
         self._sequence = 0  # number of the last datagram sent
         self._delays = DelayEstimator()
 

@@ -106,7 +106,7 @@ class Beacon(Snapshot):
     clock_s: float
     """Time on the vehicle side's clock, in seconds."""
     lease_holder: str | None = None
-    """Client that has control; None: free."""
+    """Client that has control; None if no client has it."""
 
     def encode(self) -> bytes:
         fields = {"version": VERSION, "epoch": self.epoch, "number": self.number, "clock_s": self.clock_s}

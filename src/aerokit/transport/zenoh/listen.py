@@ -33,7 +33,7 @@ from aerokit.transport.zenoh.session import (
 )
 
 MAX_CLIENTS = 64
-"""Maximum number of clients. A new client is then ignored, unless a client has been silent for `CLIENT_TIMEOUT_S`."""
+"""Maximum number of clients. A further client is ignored unless another was silent for `CLIENT_TIMEOUT_S`."""
 
 CLIENT_TIMEOUT_S = 30.0
 """A client may be replaced by a new client after this silence."""
@@ -174,7 +174,7 @@ class ZenohListen(NetworkLink):
         self._clients.clear()
         if session is not None and self._is_serving:
             self._is_serving = False
-            # Clients recognise by the deletion of the beacon, with a send time of 0, that the vehicle side was closed.
+            # The deletion of the beacon, with a send time of 0, tells clients that the vehicle side was closed.
             goodbye = encode_sent_at(self._freshness.epoch, 0.0)
             drop = self._zenoh.CongestionControl.DROP
             with contextlib.suppress(Exception):
@@ -218,7 +218,7 @@ class ZenohListen(NetworkLink):
     def _remove_silent_client(self) -> None:
         """Remove the client that has been silent longest, if this is long enough.
 
-        New clients must not be blocked by a client that has left without a notice of its liveliness token.
+        New clients must not be blocked by a client that has left although zenoh did not report the end of its token.
         """
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
