@@ -168,12 +168,12 @@ def test_heartbeat_is_outdated_by_up_to_127_frames(behind: int, after_s: float, 
 
 def test_peer_with_vehicle_object_is_never_evictable() -> None:
     for attached, at, forgotten in (
-        ({1}, 1000.0, []),
-        (set[int](), 1.0 + PEER_TTL_S, []),
-        (set[int](), 1.1 + PEER_TTL_S, [HOME]),
+        ({1}, 1000.0, None),
+        (set[int](), 1.0 + PEER_TTL_S, None),
+        (set[int](), 1.1 + PEER_TTL_S, HOME),
     ):
-        assert Stage(attached).routes.evictable_peers([HOME], at) == forgotten
-    assert Stage().routes.evictable_peers([HOME, OTHER_HOST, SAME_HOST], 1.0) == [OTHER_HOST]
+        assert Stage(attached).routes.evict_idle_peer([HOME], at) == forgotten
+    assert Stage().routes.evict_idle_peer([HOME, OTHER_HOST, SAME_HOST], 1.0) == OTHER_HOST
 
 
 def test_full_table_drops_expired_routes_and_keeps_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,7 +23,7 @@ def _turn_quickly(stage: Stage) -> None:
     if stage.is_px4:
         stage.simulated.calibration.side_s = 0.1  # type: ignore[union-attr]
     else:
-        stage.simulated.calibrations.compasses.turns_s = 1.0  # type: ignore[union-attr]
+        stage.simulated.calibrations.compasses.turning_time_s = 1.0  # type: ignore[union-attr]
 
 
 def _all_steps(name: str) -> Do:

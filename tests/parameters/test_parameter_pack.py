@@ -184,7 +184,7 @@ def test_pack_rejects_unsupported_parameters(parameter: Parameter, text: str) ->
 
 def test_pack_size_limits() -> None:
     rows = [Parameter(f"{i * 7919 % 10000:04}{i:012}", 1, ParameterType.INT32) for i in range(8000)]
-    with pytest.raises(InvalidArgument, match="at most 65535"):
+    with pytest.raises(InvalidArgument, match="the file can hold 65535 bytes"):
         pack_parameters(rows)
     assert len(pack_parameters(rows[:2000])) < 65536
     with pytest.raises(InvalidArgument, match=r"start = 8000 must be in 0\.\.7999"):

@@ -16,10 +16,10 @@ from aerokit.protocols.command import (
     MAX_ATTEMPTS,
     UNREPEATABLE_COMMANDS,
     CommandExchange,
+    allowed_attempts,
     command_int,
     command_long,
     command_name,
-    max_attempts,
     result_name,
 )
 
@@ -130,7 +130,7 @@ def test_unrepeatable_order_is_sent_once(command: int) -> None:
     what, where = UNREPEATABLE_COMMANDS[command]
     params = [0.0] * 7 if where is None else [1.0 - where[1]] * 7
     if where is not None:
-        assert max_attempts(command, params) == MAX_ATTEMPTS
+        assert allowed_attempts(command, params) == MAX_ATTEMPTS
         params[where[0]] = where[1]
     order_status, now = Status(), 0.0
     message = command_long(1, 1, command, tuple(params))

@@ -44,7 +44,7 @@ def test_compass_calibration_reports_progress() -> None:
 
 def test_compass_calibration_without_rotation_makes_no_progress() -> None:
     copter, client = streaming_copter()
-    copter.calibrations.compasses.turns_s = math.inf
+    copter.calibrations.compasses.turning_time_s = math.inf
     client.command(MavCmd.DO_START_MAG_CAL, 2)
     client.run(60.0)
     assert {(report.compass_id, report.completion_pct) for report in client.all(m.MagCalProgress)} == {(1, 0)}

@@ -42,7 +42,7 @@ class PeerTable:
     A sender becomes a peer with its first valid frame, and from then on gets broadcasts. When the table is full, the
     first peer without a vehicle is evicted; if there is none, new senders are ignored.
 
-    ``evictable_peers`` is :meth:`Routes.evictable_peers`. ``configure(framer)`` is called with each new framer,
+    ``evict_idle_peer`` is :meth:`Routes.evict_idle_peer`. ``configure(framer)`` is called with each new framer,
     ``on_evict(peer)`` with each evicted peer.
     """
 
@@ -50,12 +50,12 @@ class PeerTable:
         self,
         link: Link,
         dialect: Dialect,
-        evictable_peers: Callable[[Iterable[Peer], float], Iterable[Peer]],
+        evict_idle_peer: Callable[[Iterable[Peer], float], Peer | None],
         configure: Callable[[Framer], object],
         on_evict: Callable[[Peer], object] | None = None,
     ) -> None:
         self._link, self._dialect, self._configure = link, dialect, configure
-        self._evictable_peers, self._on_evict = evictable_peers, on_evict
+        self._evict_idle_peer, self._on_evict = evict_idle_peer, on_evict
         self.framers: dict[Peer, Framer] = {}
         """Framers of verified peers."""
         self._unverified: dict[Peer, Framer] = {}  # framers of senders without a valid frame, oldest first
@@ -106,12 +106,13 @@ class PeerTable:
         """Evict a peer if the table is full. Return False if no peer may be evicted."""
         if len(self.framers) < MAX_PEERS:
             return True
-        evicted = list(self._evictable_peers(self.framers, now))
-        for peer in evicted:
-            if self._on_evict is not None:
-                self._on_evict(peer)
-            self.forget(peer)
-        return bool(evicted)
+        peer = self._evict_idle_peer(self.framers, now)
+        if peer is None:
+            return False
+        if self._on_evict is not None:
+            self._on_evict(peer)
+        self.forget(peer)
+        return True
 
 
 _HEARTBEAT_ID = Heartbeat.ID
@@ -144,7 +145,7 @@ class FrameReceiver:
     ) -> None:
         self._bus, self._gate, self._clock = bus, gate, clock
         self._routes, self._multilink = routes, multilink
-        self._peers = PeerTable(link, bus.dialect, routes.evictable_peers, self._update_framer)
+        self._peers = PeerTable(link, bus.dialect, routes.evict_idle_peer, self._update_framer)
         self.framers: dict[Peer, Framer] = self._peers.framers
         self.heartbeats: dict[tuple[int, int], Heartbeat] = {}
         """Last HEARTBEAT of every (system id, component id) on the link."""
@@ -197,7 +198,10 @@ class FrameReceiver:
             self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
-        """Deliver the frames that pass all checks, and pass them to the recording and the observers."""
+        """Deliver the frames that pass all checks, and pass them to the observers.
+
+        With one link, the recording also gets frames that only a check after the signature check refuses.
+        """
         framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
         may_be_stale = bool(framer.late or framer.foreign)
         for frame in frames:
@@ -208,8 +212,8 @@ class FrameReceiver:
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
             if not gate.is_open and not self._is_admitted(frame, is_other_peer):
                 continue
-            # With one link, each frame that the signature check admits is recorded here, even if a check below refuses
-            # it. With several links, frames are recorded further below, after `accepts` has removed the copies.
+            # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that
+            # are not in use.
             if observers.recording is not None and multilink is None:
                 observers.recording.write(frame.raw, self._clock())
             if is_other_peer and not self._claims_route(framer, frame, peer):

@@ -257,8 +257,8 @@ class Routes:
             claim.is_duplicate_reported = True
             self._publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
 
-    def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
-        """Return the first peer without a live component, as a list of at most one peer, after dropping its claims.
+    def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
+        """Drop the claims of the first peer without a live component, and return the peer; None if there is none.
 
         A component is live if it has a vehicle object, or sent a heartbeat in the last 30 s.
         """
@@ -268,10 +268,8 @@ class Routes:
             if system_id in self._attached or now - route.heartbeat_at <= PEER_TTL_S
         }
         evicted = next((peer for peer in peers if peer not in live), None)
-        if evicted is None:
-            return []
         self._claims = {(source, peer): claim for (source, peer), claim in self._claims.items() if peer != evicted}
-        return [evicted]
+        return evicted
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
         """Return the peers reported as duplicates: they send as the autopilot, but another peer owns its route."""

@@ -15,7 +15,7 @@ from aerokit.dronekit.exceptions import APIException, TimeoutError, classic_erro
 from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message, decoder_of
-from aerokit.protocols.command import max_attempts
+from aerokit.protocols.command import allowed_attempts
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -284,7 +284,7 @@ class Core:
 
     def command(self, kind: str, command: int, *params: float, **options: Any) -> BackgroundCall:
         """Send a command to all components of the vehicle without waiting. Only the autopilot's answer counts."""
-        options.setdefault("retries", max_attempts(command, params) - 1)
+        options.setdefault("retries", allowed_attempts(command, params) - 1)
         return self.order(kind, self.check_link().command, command, *params, component_id=0, **options)
 
     def send(self, message: Message) -> None:

@@ -275,7 +275,7 @@ class FleetAction:
             self._publish_completed()
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
-        """Return the policy's orders. If the program's policy function raises an error, the others hold for safety."""
+        """Return the policy's orders. If the policy function raises an error, all other members are ordered to hold."""
         try:
             return self._context.rules.decide(failure)
         except Exception as error:

@@ -71,7 +71,7 @@ class Attachment:
         self._ports: dict[Peer, Port] = {}
         self._guard = IdentityGuard(self.link, self._report_peer)
         self._peers = PeerTable(
-            self.link, dialect, self._guard.evictable_peers, _keep_unknown, on_evict=self._forget_port
+            self.link, dialect, self._guard.evict_idle_peer, _keep_unknown, on_evict=self._forget_port
         )
         self._is_full_reported = False  # True if it was reported that the endpoint has too many peers
         self.counters: EndpointCounters = EndpointCounters(Counter())

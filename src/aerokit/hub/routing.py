@@ -287,8 +287,9 @@ class Router(Generic[PortT]):
     def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
         """Return True if a frame is a copy of an earlier frame, not the first frame of a restarted program.
 
-        A restarted program starts its sequence numbers again. The first command may equal an earlier command and must
-        not be lost. It arrives at a new port after the former port was removed, or at the same port after a while.
+        A restarted program numbers its frames from the start again. Its first command may therefore be the same bytes
+        as an earlier command, and must not be lost as a copy. Such a frame comes over a new port after the program's
+        former port was removed, or over the same port after a while.
         """
         first_port, port_count, received_at = earlier
         if first_port == number:

@@ -178,10 +178,10 @@ class IdentityGuard:
     def exclude_pause(self, now: float, paused_s: float) -> None:
         self._routes.exclude_pause(now, paused_s)
 
-    def evictable_peers(self, peers: Iterable[Peer], now: float) -> Iterable[Peer]:
-        """Return the first peer without a heartbeat in the last 30 s, if any."""
+    def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
+        """Drop the claims of the first peer without a heartbeat in the last 30 s, and return the peer."""
         silent = (peer for peer in peers if now - self._heartbeat_at.get(peer, -math.inf) > PEER_TTL_S)
-        return self._routes.evictable_peers(silent, now)
+        return self._routes.evict_idle_peer(silent, now)
 
     def forget(self, peer: Peer) -> None:
         self._heartbeat_at.pop(peer, None)

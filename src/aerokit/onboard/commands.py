@@ -211,7 +211,7 @@ class ComponentCommands:
                 self._running.finish(started, Outcome(MavResult.CANCELLED))
 
         running = self._running.start(command, cancel)
-        if running is None:  # The command was already answered, because it is repeated or must wait.
+        if running is None:  # start() has answered already: the command is a repetition, or another command is running.
             return
         started = running  # This name tells type checkers that the value is not None in the closure.
         loop = asyncio.get_running_loop() if self.uses_threads else None

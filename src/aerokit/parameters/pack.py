@@ -119,7 +119,7 @@ def pack_parameters(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -
         previous_name = name
     length = HEADER.size + len(body)
     if length > _MAX_SIZE:
-        raise InvalidArgument(f"{len(rows)} parameters need {length} bytes; at most {_MAX_SIZE} are possible")
+        raise InvalidArgument(f"{len(rows)} parameters need {length} bytes; the file can hold {_MAX_SIZE} bytes")
     # In an upload, the last field of the header is the size of the file.
     return HEADER.pack(MAGIC, len(rows), length) + bytes(body)
 

@@ -20,10 +20,10 @@ __all__ = [
     "UNREPEATABLE_COMMANDS",
     "CommandExchange",
     "OrderStatus",
+    "allowed_attempts",
     "command_int",
     "command_long",
     "command_name",
-    "max_attempts",
     "rejection",
     "result_name",
 ]
@@ -70,7 +70,7 @@ UNREPEATABLE_COMMANDS: Mapping[int, tuple[str, tuple[int, float] | None]] = {
 }
 
 
-def max_attempts(command: int, params: Sequence[float]) -> int:
+def allowed_attempts(command: int, params: Sequence[float]) -> int:
     """Return how often a command may be sent: `MAX_ATTEMPTS`, or once if a repetition would have a further effect."""
     if command not in UNREPEATABLE_COMMANDS:
         return MAX_ATTEMPTS
@@ -97,8 +97,9 @@ Two HEARTBEATs may be lost. Ground-station failsafes act later (FS_GCS_TIMEOUT 5
 be older when it is processed, if the event loop was blocked.
 """
 
-# An order is repeated at the earliest after this fraction of ``attempt_timeout``. The fraction is below 1, because a
-# repetition follows a HEARTBEAT, and HEARTBEATs arrive at 1 Hz with some jitter.
+# The arrival of a HEARTBEAT triggers the repetition of an order, but not before this fraction of ``attempt_timeout``
+# has passed. If it were 1, a HEARTBEAT that arrives slightly early would not count, and the repetition would be late by
+# a second.
 MIN_RESEND_FRACTION = 0.75
 
 
@@ -122,8 +123,8 @@ def command_long(
     """Build a COMMAND_LONG. ``params`` are param1 to param7; missing ones are 0, and NaN is allowed.
 
     Raises:
-        InvalidArgument: there are more than seven parameters, a parameter is infinite or not a number, or the target is
-            0.
+        InvalidArgument: there are more than seven parameters, a parameter is infinite or of another type, or the target
+            is 0.
     """
     _check_target(target_system, command)
     if len(params) > 7:
@@ -221,10 +222,10 @@ class CommandExchange(Exchange[CommandAck]):
         super().__init__()
         is_unrepeatable = False
         if attempts is None:
-            attempts = MAX_ATTEMPTS if order_status is None else max_attempts(message.command, _params_of(message))
+            attempts = MAX_ATTEMPTS if order_status is None else allowed_attempts(message.command, _params_of(message))
             is_unrepeatable = attempts == 1
         if attempt_timeout is None:
-            # A command that is sent only once waits as long as all attempts of another command together.
+            # An order that must not be repeated waits as long as all attempts of another command together.
             attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
         if attempt_timeout > 0:  # Other values are refused below, with the value that the caller gave.
             attempt_timeout = max(attempt_timeout, min_timeout_s)
@@ -315,7 +316,7 @@ class CommandExchange(Exchange[CommandAck]):
         """Return the end of the error text: why the order was not sent more often; empty after the last attempt."""
         if self._sent_count < self._attempts:
             return "; not sent again: no HEARTBEAT received since then"
-        if self._attempts == 1 and max_attempts(self._message.command, _params_of(self._message)) == 1:
+        if self._attempts == 1 and allowed_attempts(self._message.command, _params_of(self._message)) == 1:
             effect, _ = UNREPEATABLE_COMMANDS[self._message.command]
             return f"; not sent again, because a repetition {effect}"
         return ""

@@ -1703,7 +1703,11 @@ class Logs(TwinOf["AsyncLogs"]):
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
         """Receive the flight log while PX4 writes it, during an ``async with`` block (MAV_CMD_LOGGING_START).
 
-        ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
+        Example::
+
+            async with vehicle.logs.stream() as stream:
+                async for data in stream:
+                    file.write(data)
 
         Args:
             idle_timeout_s: reading fails after this many seconds without data; above 0, at most 3600.
@@ -3233,7 +3237,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
-            NotSupported: the camera records no video. Nothing was sent.
+            NotSupported: the camera cannot record video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: the camera did not answer; it may be recording.
             OperationTimeout: the camera accepted the command but does not record, or no camera was found.
@@ -3244,7 +3248,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Stop recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera reports that it has stopped.
 
         Raises:
-            NotSupported: the camera records no video. Nothing was sent.
+            NotSupported: the camera cannot record video. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: the camera did not answer.
             OperationTimeout: the camera accepted the command but still records, or no camera was found.
@@ -4322,7 +4326,8 @@ class Vehicle(VehicleTwin):
             timeout: seconds until the vehicle is silent.
 
         Raises:
-            InvalidArgument: the intent is another text. Nothing was sent.
+            InvalidArgument: the intent is another text (found by its annotation, before this method runs). Nothing was
+                sent.
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.

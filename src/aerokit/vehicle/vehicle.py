@@ -361,10 +361,10 @@ def overview(vehicle: Vehicle) -> dict[str, Any]:
     """Return a summary of the vehicle's state that can be written as JSON. Sends nothing.
 
     Returns:
-        ``system_id``, ``autopilot`` and ``firmware`` (names), ``vehicle_type`` (MAV_TYPE), ``link`` (``state`` as of
-        :class:`aerokit.LinkState`, ``heartbeat_age_s``, frames received and frames lost by their sequence numbers)
-        and ``states``: for each state of docs/states.md that has a value, ``value`` (converted by
-        :func:`aerokit._internal.formatting.to_jsonable`) and ``age_s``, its age in seconds.
+        ``system_id``, ``autopilot`` and ``firmware`` (names), ``vehicle_type`` (MAV_TYPE), ``link`` and ``states``.
+        ``link`` has ``state`` (of :class:`aerokit.LinkState`), ``heartbeat_age_s``, ``frames_received`` and
+        ``frames_lost`` (gaps in the sequence numbers). ``states`` has, for each state of docs/states.md with a value,
+        ``value`` (converted by :func:`aerokit._internal.formatting.to_jsonable`) and ``age_s``, its age in seconds.
     """
     from aerokit._internal.formatting import to_jsonable
 

@@ -144,7 +144,7 @@ async def test_lost_control_publishes_event_and_ends_waits() -> None:
             async with flight.vehicle.gimbal.control() as control:
                 asyncio.get_running_loop().call_later(1.0, takes_control, flight)
                 began = now()
-                with pytest.raises(GimbalTaken, match="254/190 has it now") as caught:
+                with pytest.raises(GimbalTaken, match="254/190 has control now") as caught:
                     await flight.vehicle.gimbal.point(-80.0, 0.0, timeout=30)
                 assert now() - began < 3.0
                 assert (caught.value.system_id, caught.value.component_id) == OTHER
@@ -591,7 +591,7 @@ async def test_px4_control_uses_explicit_ids() -> None:
 async def test_px4_return_takes_control() -> None:
     async with px4_with_gimbal() as flight:
         await flight.take_off(20.0)
-        with pytest.raises(GimbalTaken, match="it has no controller now"):
+        with pytest.raises(GimbalTaken, match="no controller has control now"):
             async with flight.vehicle.gimbal.control() as control:
                 await flight.vehicle.set_mode("RTL")
                 assert await control.until_lost() == (0, 0)

@@ -309,8 +309,8 @@ def _emit_results(
 ) -> int:
     """Print a line for each result, and return the exit code. ``known`` are names for suggestions.
 
-    The exit code is that of the first error, as for ``get``. Without an error, it is FAILED if a value differs from the
-    requested value by more than rounding.
+    The exit code is that of the first error with a code of its own, as for ``get``. If there is none, it is FAILED
+    after any error, or if a value differs from the requested value by more than rounding.
     """
     code = DONE
     for result in results:
@@ -318,8 +318,8 @@ def _emit_results(
             reboot = reboot_note(metadata, result.name, result.value)
             result = result.replace(note="; ".join(filter(None, (result.note, reboot))))
         if result.error is None:
-            is_same = result.before is None or result.outcome == "unchanged"
-            value = _text(result.value) if is_same else f"{_text(result.before)} → {_text(result.value)}"
+            shows_one_value = result.before is None or result.outcome == "unchanged"
+            value = _text(result.value) if shows_one_value else f"{_text(result.before)} → {_text(result.value)}"
             text = f"{result.name:16} {value:<12} {result.outcome} {result.note}".rstrip()
         else:
             text = f"{result.name:16} not set: {_with_hint(result.name, result.error, known)}"

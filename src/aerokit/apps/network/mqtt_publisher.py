@@ -177,7 +177,7 @@ class MqttLink(BaseLink):
         client.publish(self._alive_topic, b"online", retain=True)
 
     def _send_unsent(self) -> None:
-        """Publish the buffered values until the socket accepts no more data; continue when it does."""
+        """Publish the buffered values while the socket accepts data; publish the rest when it accepts data again."""
         client = self._client
         # publish() may detect that the connection is lost, and call _on_disconnect(), which resets self._client.
         while self._client is not None and self._unsent and not client.want_write():

@@ -80,9 +80,9 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise InvalidArgument if an argument is unknown or missing, or if it is wrongly a bool or no bool.
+        """Raise InvalidArgument if an argument is unknown or missing, or if just one of its value and its type is bool.
 
-        The library checks the other values.
+        The called method checks other types, and ranges.
         """
         for name in values:
             if name not in self.arguments:

@@ -131,12 +131,12 @@ class Candidate:
 
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
+        was_other, self.is_other_hardware = self.is_other_hardware, is_other
         if is_other:
             self._doubt()
             self.was_proven = False  # The link now leads to another vehicle, so an earlier proof is void.
-        elif self.is_other_hardware:
+        elif was_other:  # The link leads to this vehicle again.
             self.is_doubted = False
-        self.is_other_hardware = is_other
 
     def count_answer(self) -> None:
         """Count a TIMESYNC answer after a request for the hardware id."""
@@ -339,7 +339,7 @@ class LinkChoice:
             self.hardware, self._hardware_link = hardware, used.link
 
     def _must_wait(self, used: Candidate, now: float) -> bool:
-        """Return True while an earlier command may be in transit, which a command over a faster link would overtake."""
+        """Return True while a command over a faster link could overtake an earlier command over the link in use."""
         transit_s = (used.round_trip_s or 0.0) + JITTER_S
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S

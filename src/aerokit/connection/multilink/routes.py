@@ -185,13 +185,13 @@ class MultiLinkRoutes:
         for routes in self._routes:
             routes.exclude_pause(now, paused_s)
 
-    def evictable_peers(self, peers: Iterable[Peer], now: float) -> list[Peer]:
-        """Return the first peer, of any link, that :meth:`Routes.evictable_peers` would evict."""
+    def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
+        """Evict one idle peer of any link, see :meth:`Routes.evict_idle_peer`."""
         for index, routes in enumerate(self._routes):
-            evictable = routes.evictable_peers((peer for peer in peers if _link_index(peer) == index), now)
-            if evictable:
-                return evictable
-        return []
+            evicted = routes.evict_idle_peer([peer for peer in peers if _link_index(peer) == index], now)
+            if evicted is not None:
+                return evicted
+        return None
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers that get a message for this component, all of them on the best link.

@@ -171,7 +171,7 @@ class _Reader:
         for time_us, name, value in (*initial, *log.changed_parameters):
             if isinstance(value, (int, float)):
                 flight.set_parameter(self._time(time_us), str(name), float(value))
-        self._status()
+        self._read_status()
         self._movement()
         self._targets()
         self._equipment()
@@ -191,10 +191,10 @@ class _Reader:
     def _topic(self, *names: str) -> _Topic | None:
         return next((topic for _, topic in self._topics(*names)), None)
 
-    def _status(self) -> None:
+    def _read_status(self) -> None:
         flight, status = self._flight, self._topic("vehicle_status")
         if status is not None:
-            self._modes(status)
+            self._read_modes(status)
             for time_s, state in status.changes("arming_state"):
                 flight.set_armed(time_s, state == _ARMING_STATE_ARMED)
             for time_s, failsafe in status.changes("failsafe"):
@@ -202,9 +202,9 @@ class _Reader:
                     flight.failsafe_evidence.append(
                         FailsafeEvidence(time_s, "general", "failsafe active (vehicle_status.failsafe)", is_action=True)
                     )
-        self._failsafe_flags()
+        self._read_failsafe_flags()
 
-    def _modes(self, status: _Topic) -> None:
+    def _read_modes(self, status: _Topic) -> None:
         fields = ("nav_state", "nav_state_user_intention", "failsafe")
         for time_s, state, intended_state, failsafe in status.rows(*fields):
             name = _NAV_STATES.get(int(state), f"MODE {int(state)}")
@@ -217,7 +217,7 @@ class _Reader:
                 reason = "autopilot"
             self._flight.add_mode(time_s, name, reason, by_autopilot)
 
-    def _failsafe_flags(self) -> None:
+    def _read_failsafe_flags(self) -> None:
         """Add evidence of failsafes for the flags that were set while the vehicle was armed."""
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:

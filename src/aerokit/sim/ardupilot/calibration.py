@@ -95,14 +95,15 @@ _FITNESS = 5.0
 class CompassCalibration:
     """Compass calibration, with the commands DO_START_MAG_CAL, DO_ACCEPT_MAG_CAL and DO_CANCEL_MAG_CAL.
 
-    ``turns_s`` is the number of seconds after which the vehicle has been turned in all directions. With infinity, as in
-    SITL, the progress stays at 0 % until the calibration is cancelled. The vehicle cannot be armed meanwhile.
+    ``turning_time_s`` is the number of seconds after which the vehicle has been turned in all directions. With
+    infinity, as in SITL, the progress stays at 0 % until the calibration is cancelled. The vehicle cannot be armed
+    during a calibration.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
-        self.turns_s: float = 30.0
-        self._compass_mask = 0  # bit for each compass that is calibrated; 0 if none is
+        self.turning_time_s: float = 30.0
+        self._compass_mask = 0  # bit for each compass whose calibration was started and is not over; 0 if none
         self._started_at = math.inf  # infinite before the start
         self._saves_at_once = False  # True if the result needs no DO_ACCEPT_MAG_CAL
         self._progress_compass = 0  # compass of the last progress message
@@ -122,7 +123,7 @@ class CompassCalibration:
         if not self._compass_mask:
             return 0
         seconds = self._vehicle.now - self._started_at - _SETTLING_S
-        return max(0, min(100, int(100.0 * seconds / self.turns_s)))
+        return max(0, min(100, int(100.0 * seconds / self.turning_time_s)))
 
     @property
     def commands(self) -> dict[int, CommandHandler]:

@@ -40,8 +40,9 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
     except InvalidArgument:
         return None
     motion = vehicle.motion  # type: ignore[attr-defined]
-    height = getattr(vehicle, "altitude_m", -motion.down)
-    return Pose(place, height, motion.roll, motion.pitch, motion.yaw)
+    # Only models of autopilots have a home. For the others, the origin is the home.
+    height_m = getattr(vehicle, "altitude_m", -motion.down)
+    return Pose(place, height_m, motion.roll, motion.pitch, motion.yaw)
 
 
 def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpServer[FileTree]:

@@ -72,7 +72,7 @@ class VideoMixin(CameraMixin):
 
         Raises:
             InvalidArgument: ``status_hz`` is out of range. Nothing was sent.
-            NotSupported: the camera records no video. Nothing was sent.
+            NotSupported: the camera cannot record video. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: the camera did not answer; it may be recording.
             OperationTimeout: the camera accepted the command but does not record, or no camera was found.
@@ -94,7 +94,7 @@ class VideoMixin(CameraMixin):
         """Stop recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera reports that it has stopped.
 
         Raises:
-            NotSupported: the camera records no video. Nothing was sent.
+            NotSupported: the camera cannot record video. Nothing was sent.
             CommandRejected: the camera refused.
             CommandTimeout: the camera did not answer.
             OperationTimeout: the camera accepted the command but still records, or no camera was found.

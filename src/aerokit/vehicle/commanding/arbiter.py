@@ -119,10 +119,10 @@ class CommandArbiter:
     # ------------------------------------------------------------------------------- steering
 
     def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion"), ends_flight: bool = False) -> Order:
-        """Create a steering order that may lead to these modes.
+        """Create a steering order. ``modes`` are the modes that the vehicle may enter because of it.
 
-        The new order supersedes the previous steering order, and posted orders about these subjects. With
-        ``ends_flight``, a failsafe does not end the order.
+        The new order supersedes the previous steering order, and the posted orders about these subjects (orders whose
+        effect nobody awaits). With ``ends_flight``, a failsafe does not end the order.
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)

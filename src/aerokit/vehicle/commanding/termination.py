@@ -82,7 +82,8 @@ class TerminationActions(VehicleBase):
             timeout: seconds until the vehicle is silent.
 
         Raises:
-            InvalidArgument: the intent is another text. Nothing was sent.
+            InvalidArgument: the intent is another text (found by its annotation, before this method runs). Nothing was
+                sent.
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.

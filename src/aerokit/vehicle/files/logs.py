@@ -222,7 +222,11 @@ class Logs:
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
         """Receive the flight log while PX4 writes it, during an ``async with`` block (MAV_CMD_LOGGING_START).
 
-        ``async with vehicle.logs.stream() as stream: async for data in stream: file.write(data)``
+        Example::
+
+            async with vehicle.logs.stream() as stream:
+                async for data in stream:
+                    file.write(data)
 
         Args:
             idle_timeout_s: reading fails after this many seconds without data; above 0, at most 3600.

@@ -312,9 +312,11 @@ class GimbalControl:
         if controller == self._orders.own_ids or self._taken is not None:
             return
         system_id, component_id = controller
-        text = f"{system_id}/{component_id} has it now" if controller != (0, 0) else "it has no controller now"
+        holder = f"{system_id}/{component_id}" if controller != (0, 0) else "no controller"
         self._taken = GimbalTaken(
-            f"{self._orders.name}: control was lost: {text}", system_id=system_id, component_id=component_id
+            f"{self._orders.name}: control was lost: {holder} has control now",
+            system_id=system_id,
+            component_id=component_id,
         )
         device_id = 0 if self._device is None else self._device.device_id
         self._session.publish(GimbalControlLost, device_id, self._is_primary, system_id, component_id)

@@ -237,7 +237,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
-    """Return all batteries reported so far, the first with the values of SYS_STATUS; None if SYS_STATUS has none."""
+    """Update battery 0 from SYS_STATUS and return all batteries; None if SYS_STATUS has no values of a battery."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = known(message.battery_remaining, unknown=-1)
     if voltage is None and remaining is None:
