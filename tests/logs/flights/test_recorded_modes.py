@@ -163,3 +163,12 @@ def test_estimator_failsafe_without_satellites_is_one_failsafe(tmp_path: Path) -
 ])  # fmt: skip
 def test_values_of_failsafe_parameters_are_explained(vehicle: str, parameter: str, value: float, meaning: str) -> None:
     assert failsafe_action(vehicle, parameter, value) == meaning
+
+
+def test_first_text_of_px4_is_joined(tmp_path: Path) -> None:
+    """PX4 numbers its texts from 0, which by the standard is the id of texts without chunks."""
+    begin, end = "Preflight Fail: the first text after the start of ", "this link has two chunks"
+    chunks: list[tuple[float, Message]] = [(1.0, m.Statustext(2, begin, 0, 0)), (1.1, m.Statustext(2, end, 0, 1))]
+    for alive, texts in ((px4_heartbeat(PX4_HOLD), [begin + end]), (heartbeat(AUTO), [begin.rstrip(), end])):
+        flight = written(tmp_path / "log.tlog", [*((float(second), alive) for second in range(4)), *chunks])
+        assert [text.text for text in flight.texts] == texts

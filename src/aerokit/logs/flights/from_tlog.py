@@ -216,7 +216,7 @@ class _Reader:
             m.LocalPositionNed: self._on_local_position,
             m.Attitude: self._on_attitude,
             m.VfrHud: self._on_vfr_hud,
-            m.Statustext: lambda time_s, message: self._add_texts(time_s, self._texts.receive(message, time_s)),
+            m.Statustext: self._on_status_text,
             m.SysStatus: self._on_sys_status,
             m.BatteryStatus: self._on_battery_status,
             m.GpsRawInt: lambda time_s, message: self._on_gps(time_s, message, 0),
@@ -286,6 +286,10 @@ class _Reader:
             frame = Frame.parse(raw)
             if is_autopilot(m.Heartbeat.decode_body(frame.body, frame)):
                 self._other_vehicles.add(system_id)
+
+    def _on_status_text(self, time_s: float, message: m.Statustext) -> None:
+        joins_id_0 = self._autopilot.has_status_text_id_0
+        self._add_texts(time_s, self._texts.receive(message, time_s, joins_id_0=joins_id_0))
 
     def _add_texts(self, time_s: float, texts: list[Any]) -> None:
         self._flight.texts += [LoggedText(time_s, text.severity, clean_text(text.text)) for text in texts]
