@@ -8,9 +8,8 @@
    directly in the slots of their class. The offset of each slot is found once for each class (`slot_of`).
 
    The module uses only the limited API, so one binary serves all versions of Python from 3.10. Only constants are
-   static, and each interpreter has its own module state. Two kinds of interpreters use the Python code instead: those
-   with their own GIL, because a module can declare support for them only with the API of 3.12, and free-threaded ones,
-   which have no limited API. */
+   static; each interpreter has its own module state. Interpreters with their own GIL need a declaration of the API of
+   3.12, and free-threaded ones have no limited API. Both use the Python code. */
 
 #include <Python.h>
 #include <float.h>
@@ -209,8 +208,7 @@ static PyMemberDef counter_members[] = {MEMBER("bytes", T_ULONGLONG, Number, num
 typedef struct {
     int kind;        /* "s" for a text, "p" for bytes, otherwise the code in Python's struct */
     int count;       /* number of elements; 0 if the field is not an array */
-    int offset;      /* position in the payload */
-    int size;        /* size of one element in bytes */
+    int offset, size; /* position in the payload; size of one element in bytes */
     Py_ssize_t slot; /* offset of the slot in the message object */
 } Field;
 
@@ -226,8 +224,7 @@ static PyObject **at_slot(PyObject *object, Py_ssize_t slot) { return (PyObject 
 
 OWNER(layout, Layout, message_class, 1)
 
-/* Return the offset of a slot, 0 if it cannot be found, or -1 after an error. A probe object is stored in the slot, and
-   the slot is where exactly one pointer to the probe appears in the message. */
+/* Find the offset of a slot by storing a probe object in it. Return 0 if it cannot be found, or -1 after an error. */
 static Py_ssize_t slot_of(PyObject *message_class, PyObject *name) {
     PyObject *size = PyObject_GetAttrString(message_class, "__basicsize__");
     Py_ssize_t end = size == NULL ? -1 : PyLong_AsSsize_t(size), found = -1;
@@ -278,8 +275,7 @@ static int fill_layout(Layout *self, PyObject *rows) {
            self->id <= 0xFFFFFF && self->crc_extra >= 0 && self->crc_extra <= 0xFF;
 }
 
-/* layout(class, id, CRC_EXTRA, length, base length, ((name, kind, count), …)): return the layout of a class, or None if
-   only Python code can handle the class. */
+/* layout(class, id, CRC_EXTRA, length, base length, ((name, kind, count), …)): None if the class needs Python code. */
 static PyObject *wire_layout(PyObject *module, PyObject *args) {
     State *state = PyModule_GetState(module);
     PyObject *message_class, *rows;
@@ -301,8 +297,7 @@ static PyObject *wire_layout(PyObject *module, PyObject *args) {
 typedef union { float number; uint32_t bits; } Single;
 typedef union { double number; uint64_t bits; } Double;
 
-/* Return the number at ``at``. Return NULL without an exception for a signalling NaN, so that Python code decodes it,
-   because the resulting float depends on the version of Python. */
+/* Return the number at ``at``; NULL without an exception for a signalling NaN, because Python versions differ there. */
 static PyObject *decode_number(int kind, const uint8_t *at) {
     Single single;
     int is_signalling;
@@ -345,8 +340,7 @@ static PyObject *decode_field(const Field *field, const uint8_t *payload) {
     return items;
 }
 
-/* Decode a `Frame.body`, which has a header of nine bytes before the payload. The caller must own references to
-   ``body`` and ``frame``. */
+/* Decode a `Frame.body`: a header of nine bytes, then the payload. The caller must own references to both arguments. */
 static PyObject *decode_body(Layout *self, PyObject *body, PyObject *frame) {
     PyObject *message = NULL, *value;
     if (!PyBytes_CheckExact(body) || self->message_class == NULL)
@@ -441,8 +435,7 @@ static int encode_field(const Field *field, PyObject *value, uint8_t *at) {
     return 1;
 }
 
-/* Encode a message to ``frame``, which has room for MAX_FRAME bytes. ``head`` has the flags, sequence number, system id
-   and component id. Return the size without the signature, or 0 if Python code must encode the message. */
+/* Encode a message to ``frame`` (MAX_FRAME bytes). Return its size without the signature, or 0 if Python code must. */
 static Py_ssize_t encode(State *state, PyObject *message, int version, const uint8_t head[4], uint8_t *frame) {
     Py_ssize_t total = 0;
     Layout *layout = (Layout *)PyObject_GetAttr((PyObject *)Py_TYPE(message), state->layout_name);
@@ -499,9 +492,8 @@ static PyObject *wire_encode_frame(PyObject *module, PyObject *args) {
 /* ------------------------------------------------------------------------------------------- dialects */
 
 typedef struct {
-    PyObject *id;     /* message id as a Python int; NULL in a free row */
-    PyObject *layout; /* NULL before the first message of this class */
-    uint32_t number;  /* message id */
+    PyObject *id, *layout; /* `number` as a Python int, NULL in a free row; NULL before the first message of the class */
+    uint32_t number;       /* message id */
     int extra, base_length, length;
 } Row;
 
@@ -617,8 +609,7 @@ typedef struct {
     PyObject *framer, *data, *now, *wanted, *sources, *table, *frames;
     const uint8_t *bytes;
     Py_ssize_t size;
-    int is_continued; /* 1 if the data begins with the rest of an earlier call */
-    int is_simple;    /* value of `Framer.is_simple` when the call began */
+    int is_continued, is_simple; /* 1 if the data begins with the rest of an earlier call; as in Framer, at the begin */
 } Run;
 
 enum { GOOD, WAIT, OTHER };
@@ -736,8 +727,7 @@ static int receive(Run *run) {
     return 0;
 }
 
-/* Take references to the objects of a call, and put the data kept from earlier calls before the new data. Return 0, or
-   -1 after an error. */
+/* Take references to the objects of a call, and join its data with that of earlier calls. Return 0; -1 for an error. */
 static int begin_run(Run *run, PyObject *data) {
     Framer *self = (Framer *)run->framer;
     int is_ready = run->state->classes[FRAME] != NULL;
@@ -834,8 +824,7 @@ static PyObject *wire_tlog_records(PyObject *module, PyObject *args) {
         for (int i = 0; i < 8; i++)
             microseconds = microseconds << 8 | data[begin + i];
         PyObject *frame = PyBytes_FromStringAndSize((const char *)data + begin + 8, end - begin - 8);
-        /* The format "y#" is not used, because the type of its size depends on the headers of Python. */
-        PyObject *record = Py_BuildValue("dN", (double)microseconds / 1e6, frame);
+        PyObject *record = Py_BuildValue("dN", (double)microseconds / 1e6, frame); /* "y#" depends on the headers */
         if (record == NULL || PyList_Append(records, record) < 0) {
             Py_XDECREF(record);
             Py_DECREF(records);
