@@ -247,6 +247,7 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         page.wait_for_function(SHOWS_ITEMS, arg=[])
         page.evaluate(DROP, ["field.plan", format_plan(plan)])
         page.locator("dialog[open]", has_text="Its first place is 200 m north of the vehicle.").wait_for()
+        page.locator("dialog .detail", has_text="It keeps its rally points, because the file has none.").wait_for()
         page.wait_for_function(SHOWS_ITEMS, arg=["1", "2"])
         picture(page, "preview")
         cancel(page)

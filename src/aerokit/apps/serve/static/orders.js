@@ -88,14 +88,15 @@ export class Orders {
       const parts = [[count, "mission items"], [areas, "fence areas"], [rally, "rally points"]];
       const [distance, warning] = distanceOfPlan(checked.items, vehicle);
       const replaced = parts.filter(([each]) => each).map(([each, what]) => `${each} ${each === 1 ? what.slice(0, -1) : what}`);
+      const kept = parts.filter(([each]) => !each).map(([, what]) => what);
       this.confirm({
         order: "mission/upload", title: "Upload", fields: [], fixed: { name, plan }, preview: checked, place: "beside",
-        text: `get ${replaced.join(", ") || "nothing"} from ${file.name}, instead of those it has`,
+        text: `get ${replaced.join(", ") || "nothing"} from ${file.name}, in place of any it has`,
         about: [
           vehicle.states.armed?.value ? "The vehicle is armed." : "",
           "The map shows the plan.",
           distance,
-          areas && rally ? "" : "What the file does not contain (fence, rally points) stays as it is.",
+          kept.length ? `It keeps its ${kept.join(" and ")}, because the file has none.` : "",
         ].filter(Boolean),
         facts: warning ? [warning] : [],
       });
