@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import shutil
 import struct
 from collections.abc import Iterator
@@ -151,6 +152,25 @@ def test_folder_has_table_per_message_type(tmp_path: Path, kind: str) -> None:
         assert int(row["vx_cm_s"]) == position.vx
         assert int(row["time_boot_ms"]) == position.time_boot_ms
         assert int(row["system_id"]) == 1
+
+
+def test_csv_cells_of_rare_values(tmp_path: Path) -> None:
+    table = CsvTable(tmp_path / "values.csv", [])
+    for values in ((1, math.inf), (math.inf, -math.inf), (2, math.nan), (None, 3), ("=1+1", 4), ("a\r\nb", math.nan)):
+        table.add(0.0, values)
+    table.close()
+    time = "1970-01-01T00:00:00.000000+00:00"
+    rows = [
+        "",
+        f"{time},1,inf",
+        f"{time},inf,-inf",
+        f"{time},2,",
+        f"{time},,3",
+        f"{time},'=1+1,4",
+        f'{time},"a\r\nb",',
+        "",
+    ]
+    assert (tmp_path / "values.csv").read_bytes().decode() == "\n".join(rows)
 
 
 def test_integer_parameters_of_px4_are_written_as_numbers(tmp_path: Path) -> None:

@@ -151,7 +151,8 @@ def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], ob
             if not entries:
                 begins_at = entry.unix_s
             entries += 1
-            ends_at = max(ends_at, entry.unix_s)
+            if entry.unix_s > ends_at:
+                ends_at = entry.unix_s
             writer.write(entry)
         writer.close()
     except BaseException:

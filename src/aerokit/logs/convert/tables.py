@@ -58,9 +58,6 @@ FLIGHT = (
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
-_NUMBER_TYPES = (float, int)
-
-
 def _csv_cell(value: Any) -> Any:
     if isinstance(value, str):
         return _FORMULA.sub(r"\1'", value)
@@ -85,8 +82,13 @@ class CsvTable:
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row. The time is written as ISO 8601 in UTC with microseconds."""
-        # Most values are numbers, for which a call of _csv_cell would be slow. `value == value` is False for NaN.
-        cells = [value if type(value) in _NUMBER_TYPES and value == value else _csv_cell(value) for value in values]
+        # Most rows have only numbers, which need no conversion. Their sum is NaN, and not equal to itself, if a number
+        # is NaN; it cannot be computed if a value is a text or None.
+        try:
+            total = sum(values)
+        except TypeError:
+            total = math.nan
+        cells = values if total == total else [_csv_cell(value) for value in values]
         self._writer.writerow([_iso_time(unix_s), *cells])
         if len(self._lines) >= _LINES_PER_FLUSH:
             self._flush()
@@ -99,7 +101,11 @@ class CsvTable:
         self._file.close()
 
     def _flush(self) -> None:
-        self._file.write("".join([line.removesuffix("\r\n") + "\n" for line in self._lines]))
+        text = "".join(self._lines)
+        if text.count("\r\n") == len(self._lines):
+            self._file.write(text.replace("\r\n", "\n"))
+        else:  # A quoted text contains "\r\n", which must stay.
+            self._file.write("".join([line.removesuffix("\r\n") + "\n" for line in self._lines]))
         self._lines.clear()
 
 
@@ -185,7 +191,7 @@ class MessageTablesWriter:
         self._path, self._log, self._kind = path, log, kind
         log.needs_states = False
         # Maps each record type to its table and to the function that converts a record to a row.
-        self._tables: dict[str, tuple[Table, Callable[[LogRecord], list[Any]]]] = {}
+        self._tables: dict[str, tuple[Table, Callable[[LogRecord], Sequence[Any]]]] = {}
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
@@ -194,7 +200,7 @@ class MessageTablesWriter:
         table.add(record.unix_s, (record.system_id, record.component_id, *make_row(record)))
         self.written += 1
 
-    def _open_table(self, record: LogRecord) -> tuple[Table, Callable[[LogRecord], list[Any]]]:
+    def _open_table(self, record: LogRecord) -> tuple[Table, Callable[[LogRecord], Sequence[Any]]]:
         """Create the table for records of this type. Return it with the function that converts a record to a row."""
         columns = self._log.columns(record)
         # The name becomes a file name, but the log is untrusted input, so other characters are replaced.
@@ -227,7 +233,7 @@ def _iso_second(unix_s: float) -> str:
     return datetime.fromtimestamp(unix_s, timezone.utc).isoformat()[:19]
 
 
-def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], list[Any]]:
+def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], Sequence[Any]]:
     """Return a function that converts records of the same type as ``record`` to table rows."""
     if record.message is None:
         names = [column.field for column in columns]
@@ -237,6 +243,8 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[L
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
     text_positions = [position for position, column in enumerate(columns) if column.kind == "str"]
+    if not array_elements and not text_positions:
+        return lambda record: get_fields(record.message)[1:]
 
     def make_row(record: LogRecord) -> list[Any]:
         _, *values = get_fields(record.message)
