@@ -79,8 +79,8 @@ def _altitude_warnings(plan: Plan) -> list[str]:
     for index, item in enumerate(plan.mission.items):
         is_take_off = item.command in _TAKE_OFFS
         # A take-off has an altitude even without a position. In other commands without a position, z is no altitude.
-        is_above_home = canonical_frame(item.frame) == MavFrame.GLOBAL_RELATIVE_ALT
-        has_altitude = is_above_home and (is_take_off or item.position is not None)
+        is_relative_to_home = canonical_frame(item.frame) == MavFrame.GLOBAL_RELATIVE_ALT
+        has_altitude = is_relative_to_home and (is_take_off or item.position is not None)
         is_too_low = item.z < 0.0 or (is_take_off and item.z == 0.0)
         if has_altitude and is_too_low and item.command not in _LANDINGS:
             warnings.append(f"mission item {index}: {item.name} at {item.z:g} m above home")

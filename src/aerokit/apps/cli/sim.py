@@ -373,7 +373,7 @@ def _client_address(address: str, argument: str) -> str:
 
 
 def _zenoh_options(address: str) -> str:
-    """Return the query of a client's zenoh address, which connects to an endpoint of the simulator."""
+    """Return the query part of the zenoh address with which a client connects to the simulator."""
     parsed = parse_address(expand_address(address, 0, 1))
     endpoints = parsed.option("listen") or parsed.option("connect")
     config = parsed.option("config")

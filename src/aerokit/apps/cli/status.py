@@ -238,7 +238,7 @@ async def run_status(options: argparse.Namespace) -> int:
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
-    """Request the states that the vehicle does not stream, then return what it lacks."""
+    """Request the states that the vehicle does not stream, then return what it lacks for arming and for flight."""
     # `why_not_armable` requests the estimator's messages, which depend on the firmware, from disarmed vehicles only.
     needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()
     estimator_messages = [("estimator", message) for message in needed]

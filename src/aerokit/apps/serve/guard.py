@@ -174,9 +174,10 @@ RawHeaders = list[tuple[bytes, bytes]]
 
 
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
-    """Return the ``http`` class for `uvicorn.Config`, which limits anonymous connections.
+    """Return a class that limits anonymous connections, for the argument ``http`` of `uvicorn.Config`.
 
-    Connections with the token in a request are never closed, so that anonymous clients cannot exclude the owner.
+    A connection is anonymous until one of its requests has the token. Only anonymous connections are closed when there
+    are too many, so that their clients cannot exclude the owner.
     """
     anonymous: dict[_HttpConnection, None] = {}
 

@@ -58,7 +58,7 @@ class HttpProblem(Exception):
 def problem_of(error: Exception) -> dict[str, Any]:
     """Return the problem object (RFC 9457) of an error.
 
-    It has ``error``, ``detail`` and, if the vehicle has given reasons, ``reasons``.
+    Besides the standard members, it has ``error`` and, if the vehicle has given reasons, ``reasons``.
     """
     if isinstance(error, HttpProblem):
         status, kind = error.status, error.kind

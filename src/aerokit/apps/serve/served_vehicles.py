@@ -49,8 +49,8 @@ TRACK_GAP_S = 3.0
 class ServedVehicles:
     """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
 
-    Requests nothing but the return altitude, once, and the reasons for not arming. These are requested when a disarmed
-    vehicle begins to report failing checks, and again when the failing sensors change.
+    Requests nothing but the return altitude, once, and the reasons for not arming. The reasons are requested when a
+    disarmed vehicle begins to report failing checks, and again when the failing sensors change.
 
     ``source`` is a connection (its vehicles are added as they appear), one vehicle, or a mapping from system id to
     vehicle, which may grow.
@@ -218,7 +218,7 @@ class ServedVehicles:
         """Return the overview of a vehicle, and further values that the page shows (docs/serve.md).
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
-        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
+        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if the vehicle can arm in its mode.
         """
         watch = self._watch(vehicle)
         missing = vehicle.missing_for_flight()

@@ -126,7 +126,10 @@ def metres_from_home(flight: FlightLog) -> list[tuple[float, float]]:
 
 
 def time_in_modes(flight: FlightLog) -> dict[str, float]:
-    """Return how many seconds the vehicle was armed in each mode, in the order of first use."""
+    """Return how many seconds the vehicle was armed in each mode, in the order of first use.
+
+    If it was never armed, the times in the whole log are returned.
+    """
     seconds_by_mode: dict[str, float] = {}
     for change, end in flight.mode_spans():
         for armed_from, armed_to in flight.armed or [(0.0, flight.duration_s)]:
