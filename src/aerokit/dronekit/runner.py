@@ -147,7 +147,8 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         prog: name of this command.
 
     Returns:
-        Exit code: 0, 1 if the simulated vehicle cannot be served, or 2 if the program cannot be opened.
+        Exit code: 0; 2 if the program's file cannot be opened; 1 if the program cannot be started for another reason,
+        or the simulated vehicle cannot be served.
     """
     own_arguments, program_arguments = _split_at_program(arguments)
     options = parser(prog).parse_args(own_arguments)

@@ -211,7 +211,7 @@ class BlockRequests:
         self._in_flight[offset] = block
 
     def _requeue_overtaken(self, number: int) -> None:
-        """Repeat the requests that were sent long before transmission ``number``, which was answered first."""
+        """Queue those requests again that were sent long before transmission ``number``, which was answered first."""
         overtaken = []
         for offset, block in self._in_flight.items():
             if block.transmission_number > number - OVERTAKEN:

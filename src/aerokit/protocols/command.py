@@ -123,8 +123,8 @@ def command_long(
     """Build a COMMAND_LONG. ``params`` are param1 to param7; missing ones are 0, and NaN is allowed.
 
     Raises:
-        InvalidArgument: there are more than seven parameters, a parameter is infinite or of another type, or the target
-            is 0.
+        InvalidArgument: there are more than seven parameters, a parameter cannot be converted to a 32-bit float or is
+            infinite, or the target is 0.
     """
     _check_target(target_system, command)
     if len(params) > 7:
@@ -194,7 +194,8 @@ class CommandExchange(Exchange[CommandAck]):
 
     Raises from ``result()``:
         CommandRejected: the result is neither ACCEPTED nor IN_PROGRESS. The caller adds status texts of the vehicle.
-        CommandTimeout: no acknowledgement arrived within ``attempts`` times ``attempt_timeout`` seconds.
+        CommandTimeout: no acknowledgement arrived within ``attempts`` times ``attempt_timeout`` seconds, or none
+            followed an IN_PROGRESS within ``progress_timeout`` seconds.
     """
 
     expects: tuple[type[Message], ...] = (CommandAck,)

@@ -222,7 +222,7 @@ class LogDownload(Transfer[int]):
 
 
 class LogStop(Transfer[None]):
-    """Sends LOG_REQUEST_END until the vehicle stops sending, because LOG_REQUEST_END is not acknowledged.
+    """Sends LOG_REQUEST_END until the vehicle sends no more log data, because LOG_REQUEST_END is not acknowledged.
 
     Args:
         is_sent: True if the caller itself makes the first transmission.
@@ -268,7 +268,7 @@ LAST_ID = 0xFFFF
 
 
 class LogList(Transfer[tuple[LogEntry, ...]]):
-    """Requests the entries of the logs from ``start`` to ``end`` (None: to the last log).
+    """Requests the entries of the logs with the ids ``start`` to ``end``; None: from the first, or to the last log.
 
     Args:
         first_id: the id of this autopilot's oldest log.

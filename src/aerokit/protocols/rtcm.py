@@ -95,7 +95,7 @@ class RtcmReader:
         self.skipped_bytes: int = 0
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Process bytes, and yield each complete message. At most one incomplete message (1029 bytes) is kept."""
+        """Process bytes, and yield each complete message. An incomplete message (up to 1028 bytes) is kept."""
         buffer = self._buffer + data
         begin = 0
         while True:

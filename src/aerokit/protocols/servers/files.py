@@ -273,7 +273,7 @@ class FileTree:
         del folder[name]
 
     def rename(self, path: str, to: str) -> None:
-        """Move a file or folder; replaces an existing file."""
+        """Move a file or folder. A file replaces an existing file, a folder an empty folder."""
         node = self._find(path)
         folder, name = self._parent(to)
         existing = folder.get(name)
