@@ -25,7 +25,7 @@ _FAILSAFE_REPORT_DURATION_S = 10.0
 def active_failsafe(vehicle: Vehicle) -> list[str] | None:
     """Return the vehicle's newest texts about its active failsafe, the oldest of them first; None if none is active.
 
-    ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which is meaningless while they are disarmed
+    ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which means nothing while the vehicle is disarmed
     (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).
     """
     if not vehicle.armed.latest or vehicle.system_status.latest not in FAILSAFE_STATES:

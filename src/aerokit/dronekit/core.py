@@ -211,7 +211,7 @@ class Core:
     ) -> LatestMessage[MessageT]:
         """Call a handler with each message of this type from the autopilot; return the holder of the latest message.
 
-        The handler is called on the loop thread and held by a weak reference.
+        The handler is called on the loop thread, as long as this object exists.
 
         If the handler only announces attributes, pass their ``names``. The handler is then called only while one of
         these attributes has no value yet, or has listeners on the vehicle or in ``listeners``.
@@ -223,7 +223,7 @@ class Core:
         return latest
 
     def announce(self, message_type: type[MessageT], *names: str) -> LatestMessage[MessageT]:
-        """Notify the listeners of these attributes of each message; return the holder of the latest message."""
+        """Notify the listeners of these attributes when a message arrives; return the holder of the latest message."""
 
         def announce(_: MessageT) -> None:
             for name in names:

@@ -181,8 +181,8 @@ class CommandExchange(Exchange[CommandAck]):
         message: the command.
         own_system: our system id.
         own_component: our component id.
-        attempts: maximum number of transmissions; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
-        attempt_timeout: seconds for each attempt; None: one, or four for an order in `UNREPEATABLE_COMMANDS`.
+        attempts: maximum number of transmissions; None: 4, or 1 for an order in `UNREPEATABLE_COMMANDS`.
+        attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for an order in `UNREPEATABLE_COMMANDS`.
         progress_timeout: seconds without any answer after an IN_PROGRESS, until the command fails.
         on_progress: called with each progress report.
         earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with

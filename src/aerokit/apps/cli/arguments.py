@@ -108,12 +108,12 @@ TRANSMITTER_ON_S = 1.0
 
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     """Parse ``NAME[=VALUE][@SECONDS]`` into a simulated fault, its value, and the simulated time at which it begins."""
-    name_and_value, _, begin = text.partition("@")
+    name_and_value, _, begin_text = text.partition("@")
     name, equals, value = name_and_value.partition("=")
     if name not in FAULTS:
         raise ArgumentTypeError(f"{name!r} is not a fault{suggestion(name, FAULTS)}; faults: {', '.join(FAULTS)}")
-    at_s = number(0, 1e6)(begin) if begin else 0.0
-    if name == "rc_lost":
+    at_s = number(0, 1e6)(begin_text) if begin_text else 0.0
+    if name == "rc_lost":  # ArduPilot ignores a transmitter that it never received
         at_s = max(at_s, TRANSMITTER_ON_S)
     if name in _SHARE_FAULTS:
         if not value:

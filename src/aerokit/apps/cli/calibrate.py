@@ -148,7 +148,7 @@ class Display:
         self._shown: tuple[CalibrationPose | None, str] = (None, "")
 
     def show(self, step: CalibrationStep) -> None:
-        """Print a new pose with its picture, otherwise a new instruction, and in a terminal the progress."""
+        """Print the result, a new pose with its picture, or a new instruction; in a terminal, also the progress."""
         if step.result is not None:
             self._show_result(step)
             return

@@ -49,7 +49,7 @@ def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
 
 
 def plan_warnings(plan: Plan) -> list[str]:
-    """Return warnings about parts of a plan that a vehicle will probably refuse, although they can be sent."""
+    """Return warnings about items that can be sent, but are unusual or will probably be refused by a vehicle."""
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard_commands = frozenset(MavCmd)
@@ -127,7 +127,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
                     on_progress=on_progress,
                 )
             except InvalidArgument as error:
-                # Name the option of the command line instead of the library's argument.
+                # Name the option of the command line instead of the argument of `upload`.
                 text = str(error).replace("a greater max_distance_m", "a greater --max-distance-m")
                 raise InvalidArgument(text.replace("plan, item", f"{part} item")) from None
         emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")

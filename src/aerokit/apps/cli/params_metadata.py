@@ -38,7 +38,7 @@ def metadata_source(vehicle: Vehicle) -> str:
 
 
 def defaults_source(vehicle: Vehicle) -> str:
-    """Return one sentence that says why the vehicle's defaults are unknown, and what to do instead."""
+    """Return a text that says why the vehicle's defaults are unknown, and what to do instead."""
     if vehicle.autopilot.name == "PX4":
         return (
             f"PX4 does not report the defaults of its parameters: --metadata FILE has them; {_PX4_FILE}. To"
@@ -122,7 +122,7 @@ def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
 
 
 def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
-    """Return the unit, range and meaning of a parameter as fields for its record; None if unknown."""
+    """Return the unit, range and meaning of a parameter as fields for its record. Unknown fields are None."""
     # The parameter's other names are not tried, because their metadata may have another unit.
     entry = None if metadata is None else metadata.get(parameter.name)
     if entry is None:

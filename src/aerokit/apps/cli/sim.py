@@ -64,7 +64,7 @@ def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     Kinds without ``boot_text`` ignore this option.
 
     Raises:
-        InvalidArgument: this kind does not have one of the options or parameters.
+        InvalidArgument: the kind is unknown, or lacks one of the options or parameters.
     """
     from aerokit.sim.kinds import kind_class, simulated
 

@@ -145,7 +145,7 @@ class SupervisedFlight(ABC):
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
 
     async def _after_failure(self, error: Exception) -> int:
-        """Disarm on the ground, if this program armed the vehicle. In the air, leave control to pilot or failsafe."""
+        """Disarm on the ground, if this program still has control. In the air, leave control to pilot or failsafe."""
         vehicle = self._vehicle
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
@@ -189,7 +189,7 @@ class SupervisedFlight(ABC):
         return DONE
 
     async def _watch_late_arming(self) -> None:
-        """Stay connected while an arm command may still arrive, so that the library can disarm the vehicle."""
+        """Stay connected while an arm command may still take effect, so that aerokit can disarm the vehicle then."""
         if not self._may_arm_late:
             return
         self._print(

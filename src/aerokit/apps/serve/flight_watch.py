@@ -102,7 +102,7 @@ class FlightWatch:
 
     @property
     def disarming(self) -> dict[str, Any] | None:
-        """The last disarming; None if the vehicle was in the air before it, or an order of this server caused it.
+        """The last disarming without a flight before it that no order of this server caused; None if there was none.
 
         ``age_s`` is the time since then, ``armed_for_s`` how long the vehicle was armed. ``parameter`` and ``delay_s``
         are the autopilot's setting for automatic disarming. ``is_automatic`` is true if the vehicle was armed for about

@@ -168,10 +168,10 @@ async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 
 def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
-    """Return the name, text and plan of a request body, which has a .plan as JSON object, or a text in either format.
+    """Return the name, text and plan of a request body. Its ``plan`` is a .plan as JSON object, or the text of a file.
 
     Raises:
-        FileFormatError: the body has neither format; the text names the position of the error.
+        FileFormatError: ``plan`` is neither a .plan nor QGC WPL 110; the text names the position of the error.
         InvalidArgument: an item of the plan cannot be sent to a vehicle.
     """
     name = values.get("name")
@@ -427,10 +427,10 @@ class OrderRunner:
             return None
         newest_key = None
         is_later = False
-        for other in self._records.values():  # the oldest first
-            if is_later and other.system_id == record.system_id and other.order not in _NOT_MOTION:
-                newest_key = other.key
-            is_later = is_later or other is record
+        for stored in self._records.values():  # the oldest first
+            if is_later and stored.system_id == record.system_id and stored.order not in _NOT_MOTION:
+                newest_key = stored.key
+            is_later = is_later or stored is record
         return newest_key
 
     def _publish(self, record: OrderRecord) -> None:

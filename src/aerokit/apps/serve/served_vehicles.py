@@ -118,7 +118,7 @@ class ServedVehicles:
         return [(position.latitude_deg, position.longitude_deg, is_after_gap) for position, is_after_gap in points]
 
     def snapshot(self) -> str:
-        """Return the current state of all vehicles as JSON, which is the message ``state`` of the stream."""
+        """Return the message ``state`` of the stream as JSON: all vehicles, at most `SNAPSHOT_MAX_AGE_S` ago."""
         now = asyncio.get_running_loop().time()
         if now - self._snapshot_at > SNAPSHOT_MAX_AGE_S:
             vehicles = [self._state_of(vehicle) for vehicle in self.vehicles.values()]
@@ -187,7 +187,7 @@ class ServedVehicles:
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
     async def _record_tracks(self) -> None:
-        """Add the positions of all vehicles to their tracks, without end. Thin out a track that is full."""
+        """Add the positions of all vehicles to their tracks until cancelled. Thin out a track that is full."""
         silent: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):

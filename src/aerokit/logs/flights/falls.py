@@ -61,7 +61,7 @@ def falls(flight: FlightLog) -> list[Fall]:
     true:
 
     - The vehicle stayed at that height until it was disarmed.
-    - The vehicle stayed armed and less than 3 m above home for 30 s.
+    - The vehicle stayed armed at that height for 30 s, less than 3 m above home.
     - The autopilot reported a crash.
 
     A descent near the ground also counts if the log ends during the descent.

@@ -91,7 +91,7 @@ class LinkCounter:
             self._series.add(ends_s, *_ALL_LOST)
 
     def _add_row(self, second: int) -> None:
-        """Add the row of the counted second, and count ``second`` from now on. No frames arrived in seconds between."""
+        """Add a row for the counted second, and start to count ``second``. No frames arrived in the seconds between."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
         if second - self._second > 1:  # the first and the last second without frames

@@ -78,7 +78,7 @@ def series_colour(number: int) -> str:
 
 
 def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
-    """Return the times and values of a column to draw. The value None interrupts the line."""
+    """Return the times and values to draw for a column. The value None interrupts the line."""
     values, times = columns[name], columns.times
     rows = rows_to_draw(values)
     return (

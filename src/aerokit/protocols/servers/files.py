@@ -194,7 +194,7 @@ class FileTree:
         self._root: _Folder = {}
 
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
-        """Create or replace a file and its folders. A function as content is called when the file is first read."""
+        """Create or replace a file, and create its folders. A function as content is called at the first access."""
         folder = self._root
         *parents, name = _parts(path)
         for parent in parents:

@@ -337,7 +337,7 @@ class MissionServer:
             self._finish(upload)
 
     def _finish(self, upload: ListUpload) -> None:
-        """Handle the arrival of the last item."""
+        """Validate the complete list, store it if it is accepted, and end the upload."""
         upload.is_being_validated = True
 
         def answer(result: int) -> None:
