@@ -215,7 +215,7 @@ class _TopicChannels:
         self._channels.clear()
 
     def _publish_states(self, system_id: int, vehicle: Vehicle) -> None:
-        """Send the states of a vehicle that are newer than the last ones sent, and at intervals its link."""
+        """Send the states that are newer than the last ones sent and, at intervals, the statistics of the link."""
         for state, cell in vehicle.telemetry.cells.items():
             value, name = cell.latest, topics.vehicle_topic(system_id, state)
             if value is None:
@@ -230,7 +230,7 @@ class _TopicChannels:
                 self._send(name, now, link)
 
     def _publish_pose(self, system_id: int, vehicle: Vehicle) -> None:
-        """Send the location, and the pose in the map frame, which combines position and attitude."""
+        """Send the location and, in the map frame, transform and pose, which combine position and attitude."""
         position, attitude = vehicle.position.latest, vehicle.attitude.latest
         if position is None:
             return

@@ -53,7 +53,10 @@ def _problem(metadata: Metadata, name: str, value: float) -> str | None:
 
 
 def metadata_entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Callable[[float], float]]:
-    """Return the metadata of a parameter under any of its names, and a function that converts values to its unit."""
+    """Return the metadata of a parameter under any of its names; None if there is none.
+
+    The second result is a function that converts values of ``name`` to the unit of that metadata.
+    """
     from aerokit.parameters.renames import resolve_rename
 
     for spelling in (name, name.upper()):

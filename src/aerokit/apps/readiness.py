@@ -25,7 +25,7 @@ _FAILSAFE_REPORT_DURATION_S = 10.0
 def active_failsafe(vehicle: Vehicle) -> list[str] | None:
     """Return the vehicle's newest texts about its active failsafe, the oldest of them first; None if none is active.
 
-    ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which is meaningless while they are disarmed
+    ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which means nothing while the vehicle is disarmed
     (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).
     """
     if not vehicle.armed.latest or vehicle.system_status.latest not in FAILSAFE_STATES:
@@ -134,10 +134,10 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
 
 
 def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return data about the current mode if the vehicle cannot arm in it; None if it can.
+    """Return data about the current mode if the vehicle cannot arm in it; None if it can, or the mode is unknown.
 
-    ``arms_in`` is the mode to which ``arm`` would change, or None. ``unless`` is the parameter that permits arming in
-    the current mode.
+    ``mode`` is the name of the current mode, ``arms_in`` that of the mode to which ``arm`` would change, or None.
+    ``unless`` is the parameter that can permit arming in the current mode, or None.
     """
     autopilot = vehicle.autopilot
     mode = vehicle.mode.latest
@@ -188,7 +188,7 @@ MIN_CHECK_INTERVAL_S = 5.0
 
 
 class ArmingCheckRequests:
-    """Decides when to request the arming checks of vehicles: when a check fails, and when other sensors fail."""
+    """Decides when to request the arming checks of vehicles: when a check begins to fail, or other sensors fail."""
 
     def __init__(self) -> None:
         self._failing: dict[Vehicle, tuple[str, ...]] = {}

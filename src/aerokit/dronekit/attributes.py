@@ -62,7 +62,7 @@ class Locations(HasObservers, LocationPrivates):
 
     @property
     def global_frame(self) -> LocationGlobal:
-        """Latitude, longitude in degrees and altitude above mean sea level in metres (GLOBAL_POSITION_INT).
+        """Latitude and longitude in degrees, altitude above mean sea level in metres (GLOBAL_POSITION_INT).
 
         A new object each time. Latitude and longitude are None without a fix; the altitude is None until it is known.
         """

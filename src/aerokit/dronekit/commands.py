@@ -170,7 +170,7 @@ class CommandSequence:
         Raises:
             TimeoutError: the vehicle did not answer in time.
             APIException: the vehicle refused; the text has the command's index in this sequence, and the reason.
-            InvalidArgument: a command is invalid (also a ValueError). Nothing was sent.
+            InvalidArgument: a command is invalid; nothing was sent. The error is also a ValueError.
         """
         self._require_downloaded()
         with self._lock:

@@ -211,10 +211,10 @@ class Core:
     ) -> LatestMessage[MessageT]:
         """Call a handler with each message of this type from the autopilot; return the holder of the latest message.
 
-        The handler is called on the loop thread and held by a weak reference.
+        The handler is called on the loop thread, as long as this object exists.
 
-        If the handler only announces attributes, pass their ``names``. The handler is then called only while these
-        attributes have listeners on the vehicle or in ``listeners``.
+        If the handler only announces attributes, pass their ``names``. The handler is then called only while one of
+        these attributes has no value yet, or has listeners on the vehicle or in ``listeners``.
         """
         if message_type not in self._latest:
             self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)
@@ -223,7 +223,7 @@ class Core:
         return latest
 
     def announce(self, message_type: type[MessageT], *names: str) -> LatestMessage[MessageT]:
-        """Notify the listeners of these attributes of each message; return the holder of the latest message."""
+        """Notify the listeners of these attributes when a message arrives; return the holder of the latest message."""
 
         def announce(_: MessageT) -> None:
             for name in names:
@@ -244,7 +244,10 @@ class Core:
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
 
     def watch_link(self) -> None:
-        """Report the age of the last heartbeat to its listeners 20 times a second; log when silence begins and ends."""
+        """Log when silence begins and ends, and report the heartbeat's age up to 20 times a second.
+
+        The age is reported to the listeners of ``last_heartbeat``.
+        """
         aio = self.aio
         if not aio.connection.is_open:
             return
@@ -344,12 +347,13 @@ class VehicleCore(HasObservers):
             still_waiting_interval: seconds between these calls.
 
         Returns:
-            True if all these attributes have values; False after ``timeout``, unless ``raise_exception`` is true.
+            True if all these attributes have values. If ``raise_exception`` is false, False after ``timeout``, or if
+            reading an attribute has failed.
 
         Raises:
             TimeoutError: a value is missing after ``timeout``, and ``raise_exception`` is true.
             ValueError: a name is not a string.
-            APIException: the link is down, or reading an attribute has failed.
+            APIException: the link is down, or reading an attribute has failed and ``raise_exception`` is true.
         """
         waits_for_defaults = not types or types == (True,)
         names = DEFAULT_ATTRIBUTES if waits_for_defaults else types

@@ -293,7 +293,7 @@ class FlightMethods(VehicleAttributes):
     ) -> None:
         """Wait until ``condition()`` is true; it is called every ``interval`` seconds on the caller's thread.
 
-        Raises TimeoutError with the text ``errmsg`` after ``timeout`` seconds (None: no limit).
+        Raises TimeoutError with the text ``errmsg`` after ``timeout`` seconds (None or 0: no limit).
         """
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not condition():

@@ -125,8 +125,7 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
 async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
     """Send DO_REPOSITION; if it is unsupported, send SET_POSITION_TARGET_GLOBAL_INT.
 
-    Latitude and longitude are in 1e-7 degrees. The altitude is in metres: on PX4, whose reposition command needs it,
-    above sea level, otherwise above home.
+    Latitude and longitude are in 1e-7 degrees. The altitude is in metres, above sea level on PX4, otherwise above home.
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     flags = MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0

@@ -183,7 +183,7 @@ class Master:
         blocking: bool = False,
         timeout: float | None = None,
     ) -> Any:
-        """Return the next message of one type, several types or any type that satisfies pymavlink's ``condition``.
+        """Return the next message of the given types (None: any) that satisfies pymavlink's ``condition``.
 
         The first call starts storing messages: up to 1,000, for up to five seconds. If none matches, returns None at
         once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises APIException if

@@ -152,11 +152,12 @@ class HasObservers:
         return attr_name
 
     def add_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Call ``observer(self, attr_name, value)`` when the attribute is updated, or when the parameter changes.
+        """Call ``observer(self, attr_name, value)`` when the attribute is updated.
 
         Listeners of sensor values are called with every message. Listeners of states (``mode``, ``armed``,
-        ``system_status``, ``ekf_ok``) are called on changes. ``'*'`` stands for every name. A listener that is
-        already registered is not added again. Names are not checked, because programs may define more attributes.
+        ``system_status``, ``ekf_ok``) and of parameters are called on changes. ``'*'`` stands for every name. A
+        listener that is already registered is not added again. Names are not checked, because programs may define more
+        attributes.
         """
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 

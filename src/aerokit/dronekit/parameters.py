@@ -108,7 +108,7 @@ class ParameterDownload:
     async def _request(self, name: str) -> bool:
         """Request a parameter under all its names; return True if it was received or the vehicle reported it missing.
 
-        While the vehicle sends the list, it may not answer, so a missing answer does not mean a missing parameter.
+        While the vehicle sends the list, it may ignore requests. No answer does not mean that the parameter is missing.
         """
         from aerokit.parameters.renames import other_names
 

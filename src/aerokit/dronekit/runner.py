@@ -147,7 +147,8 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
         prog: name of this command.
 
     Returns:
-        Exit code: 0, 1 if the simulated vehicle cannot be served, or 2 if the program cannot be opened.
+        Exit code: 0; 2 if the program's file cannot be opened; 1 if the program cannot be started for another reason,
+        or the simulated vehicle cannot be served.
     """
     own_arguments, program_arguments = _split_at_program(arguments)
     options = parser(prog).parse_args(own_arguments)
@@ -191,9 +192,11 @@ def parser(prog: str) -> argparse.ArgumentParser:
         action="store_true",
         help="serve a simulated vehicle on tcp:127.0.0.1:5760 and UDP port 14550",
     )
-    sim.add_argument("--vehicle", default="copter", metavar="KIND", help="copter, plane, rover, sub, px4 … (copter)")
-    sim.add_argument("--speedup", type=float, default=1.0, metavar="X", help="times real time (1)")
-    sim.add_argument("--home", metavar="LAT,LON,ALT", help="degrees, metres above sea level (near Canberra)")
+    sim.add_argument(
+        "--vehicle", default="copter", metavar="KIND", help="copter, plane, rover, sub, px4 … (default: copter)"
+    )
+    sim.add_argument("--speedup", type=float, default=1.0, metavar="X", help="times real time (default: 1)")
+    sim.add_argument("--home", metavar="LAT,LON,ALT", help="degrees, metres above sea level (default: Canberra)")
     parser.epilog = "Arguments after PROGRAM are passed to the program."
     return parser
 

@@ -108,8 +108,8 @@ class BlockRequests:
         self._in_flight: dict[int, _BlockRequest] = {}  # in the order in which they were sent
         self._blocks: dict[int, _BlockRequest] = {}
         self._sent_count = 0
-        self._timeouts = 0
-        self._busy_until = float("-inf")
+        self._timeouts = 0  # number of times that answers were overdue since the last answer
+        self._busy_until = float("-inf")  # until this time, the server is busy with a burst
         self._next_send_at = float("-inf")  # earliest time for the next request beyond the first `burst_size`
         self._must_wait_to_send = False  # True if a request fits into the window, but must wait until `_next_send_at`
 
@@ -211,7 +211,7 @@ class BlockRequests:
         self._in_flight[offset] = block
 
     def _requeue_overtaken(self, number: int) -> None:
-        """Repeat the requests that were sent long before transmission ``number``, which was answered first."""
+        """Queue those requests again that were sent long before transmission ``number``, which was answered first."""
         overtaken = []
         for offset, block in self._in_flight.items():
             if block.transmission_number > number - OVERTAKEN:

@@ -123,8 +123,8 @@ def command_long(
     """Build a COMMAND_LONG. ``params`` are param1 to param7; missing ones are 0, and NaN is allowed.
 
     Raises:
-        InvalidArgument: there are more than seven parameters, a parameter is infinite or of another type, or the target
-            is 0.
+        InvalidArgument: there are more than seven parameters, a parameter cannot be converted to a 32-bit float or is
+            infinite, or the target is 0.
     """
     _check_target(target_system, command)
     if len(params) > 7:
@@ -181,8 +181,8 @@ class CommandExchange(Exchange[CommandAck]):
         message: the command.
         own_system: our system id.
         own_component: our component id.
-        attempts: maximum number of transmissions; None: four, or one for an order in `UNREPEATABLE_COMMANDS`.
-        attempt_timeout: seconds for each attempt; None: one, or four for an order in `UNREPEATABLE_COMMANDS`.
+        attempts: maximum number of transmissions; None: 4, or 1 for an order in `UNREPEATABLE_COMMANDS`.
+        attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for an order in `UNREPEATABLE_COMMANDS`.
         progress_timeout: seconds without any answer after an IN_PROGRESS, until the command fails.
         on_progress: called with each progress report.
         earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with
@@ -194,7 +194,8 @@ class CommandExchange(Exchange[CommandAck]):
 
     Raises from ``result()``:
         CommandRejected: the result is neither ACCEPTED nor IN_PROGRESS. The caller adds status texts of the vehicle.
-        CommandTimeout: no acknowledgement arrived within ``attempts`` times ``attempt_timeout`` seconds.
+        CommandTimeout: no acknowledgement arrived within ``attempts`` times ``attempt_timeout`` seconds, or none
+            followed an IN_PROGRESS within ``progress_timeout`` seconds.
     """
 
     expects: tuple[type[Message], ...] = (CommandAck,)

@@ -54,7 +54,7 @@ def setting_of(message: ParamExtValue | ParamExtAck) -> Setting:
 class SettingList(ValueList[dict[str, Setting], Setting]):
     """Download of all settings: requests the list once, then missing indices as soon as a gap appears.
 
-    If the number of settings that the component reports changes, values received before the change are requested again.
+    If the component reports another number of settings than before, earlier values are requested again.
     A component without settings does not answer, so the transfer times out.
 
     Raises from ``result()``:

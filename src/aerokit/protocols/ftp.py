@@ -327,7 +327,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             client.next_sequence(), opcode, session=session, size=len(data), offset=offset, data=data
         )
         self._is_sent = is_sent
-        self._renumbered = 0
+        self._renumbered = 0  # number of times the request got a new sequence number
 
     @property
     def message(self) -> FileTransferProtocol:

@@ -284,7 +284,7 @@ class FtpDownload(FtpExchange[int]):
         for offset in self._requests.take_due(now, limit=limit):
             self._read(offset, now)
         if self._needs_burst:
-            self._burst(now)
+            self._request_burst(now)
         self._set_deadline()
 
     def _request_gaps(self) -> None:
@@ -312,7 +312,7 @@ class FtpDownload(FtpExchange[int]):
         self._reads[sequence] = _SentRequest(offset, now)
         self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, session=self._session, size=DATA_SIZE, offset=offset))
 
-    def _burst(self, now: float) -> None:
+    def _request_burst(self, now: float) -> None:
         """Request a burst of everything after the last block received."""
         offset = self._reassembly.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
@@ -358,7 +358,7 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._reassembly.end is None else self._reassembly.end
 
     def _end(self) -> None:
-        """Process the end of the file, which the server has reported before the announced size was reached."""
+        """Finish at the end of a file of unknown size. Fail if the file has ended before its announced size."""
         end = self._reassembly.position
         if self._size is None:  # The size of a virtual file is known only now.
             self._finish(end)

@@ -80,8 +80,8 @@ class LogDownload(Transfer[int]):
         self._max_range_blocks = FIRST_RANGE
         self._requested_blocks = 0  # number of requested blocks of the current range
         self._received_blocks = 0
-        self._early_ends = 0
-        self._has_checked_gaps = True
+        self._early_ends = 0  # number of short blocks before the end of the log
+        self._has_checked_gaps = True  # False while the last range may have long gaps
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -222,7 +222,7 @@ class LogDownload(Transfer[int]):
 
 
 class LogStop(Transfer[None]):
-    """Sends LOG_REQUEST_END until the vehicle stops sending, because LOG_REQUEST_END is not acknowledged.
+    """Sends LOG_REQUEST_END until the vehicle sends no more log data, because LOG_REQUEST_END is not acknowledged.
 
     Args:
         is_sent: True if the caller itself makes the first transmission.
@@ -268,7 +268,7 @@ LAST_ID = 0xFFFF
 
 
 class LogList(Transfer[tuple[LogEntry, ...]]):
-    """Requests the entries of the logs from ``start`` to ``end`` (None: to the last log).
+    """Requests the entries of the logs with ids from ``start`` (None: the first) to ``end`` (None: the last).
 
     Args:
         first_id: the id of this autopilot's oldest log.

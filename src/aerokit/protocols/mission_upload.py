@@ -302,7 +302,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
-        """Repeat all unconfirmed items and send ``ahead`` more items, because requests may have been lost."""
+        """Repeat the unconfirmed items that are not in flight, and send ``ahead`` more: requests may have been lost."""
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
             # PX4 takes any repeated item for the mission's last item and confirms the upload. This confirmation does
             # not prove that PX4 has all items.

@@ -270,7 +270,7 @@ class NamedReads(NamedRequests[ValueT]):
 
 
 class UnexpectedAnswers(Generic[ValueT]):
-    """Collects the answers to one write that have the same value, which is not the requested one."""
+    """Collects consecutive answers that have the same value, to a write that was not simply confirmed."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same

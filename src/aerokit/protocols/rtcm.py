@@ -95,7 +95,7 @@ class RtcmReader:
         self.skipped_bytes: int = 0
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Process bytes, and yield each complete message. At most one incomplete message (1029 bytes) is kept."""
+        """Process bytes, and yield each complete message. An incomplete message (up to 1028 bytes) is kept."""
         buffer = self._buffer + data
         begin = 0
         while True:
@@ -122,7 +122,7 @@ class RtcmReader:
 def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
 
-    Bit 0 of the flags is set for a fragment, bits 1 and 2 are the fragment number, bits 3 to 7 the sequence number. A
+    Bit 0 of the flags is set if the message is split, bits 1 and 2 are the fragment number, bits 3 to 7 ``sequence``. A
     receiver considers a message complete after four fragments, or after a fragment that is not full. If a message has
     fewer than four fragments and the last one is full, an empty fragment follows.
     """

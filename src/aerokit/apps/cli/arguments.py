@@ -107,13 +107,13 @@ TRANSMITTER_ON_S = 1.0
 
 
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
-    """Parse ``NAME[=VALUE][@SECONDS]``: a fault of the simulator, its value, and the time at which it begins."""
-    name_and_value, _, begin = text.partition("@")
+    """Parse ``NAME[=VALUE][@SECONDS]`` into a simulated fault, its value, and the simulated time at which it begins."""
+    name_and_value, _, begin_text = text.partition("@")
     name, equals, value = name_and_value.partition("=")
     if name not in FAULTS:
         raise ArgumentTypeError(f"{name!r} is not a fault{suggestion(name, FAULTS)}; faults: {', '.join(FAULTS)}")
-    at_s = number(0, 1e6)(begin) if begin else 0.0
-    if name == "rc_lost":
+    at_s = number(0, 1e6)(begin_text) if begin_text else 0.0
+    if name == "rc_lost":  # ArduPilot ignores a transmitter that it never received
         at_s = max(at_s, TRANSMITTER_ON_S)
     if name in _SHARE_FAULTS:
         if not value:
@@ -260,7 +260,7 @@ def add_faults(command: argparse._ActionsContainer) -> None:
         dest="faults",
         metavar="NAME[@S]",
         help="fault of every simulated vehicle, from the start or after S simulated seconds (repeatable):"
-        f" {', '.join(FAULTS)}; loss=0.2 loses a share, 'prearm_failures=TEXT' refuses to arm",
+        f" {', '.join(FAULTS)}; loss=0.2 loses a fifth of the frames, 'prearm_failures=TEXT' refuses to arm",
     )
     set_completions(faults, lambda: FAULTS)
 
@@ -288,7 +288,7 @@ def add_conditions(command: argparse._ActionsContainer) -> None:
 
 
 def conditions(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the values of the options of `add_conditions`, as arguments of a simulated vehicle."""
+    """Return parameters, wind and battery from the options of `add_conditions`, as arguments of a simulated vehicle."""
     from aerokit.sim import SimulatedWind
 
     arguments: dict[str, Any] = {}

@@ -49,7 +49,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="show these MAVLink messages too, unconverted: 'GPS_*' (repeatable)",
     )
-    _add_common(foxglove, 10.0, "topic")
+    _add_common(foxglove, 10.0, 100.0, "topic")
     zenoh = _add_publishing(actions, "zenoh", "to a zenoh network")
     zenoh.set_defaults(module_and_extra=("zenoh", "zenoh"), network_text=str)
     zenoh.add_argument(
@@ -58,7 +58,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="NETWORK",
         help="where to publish: zenoh://FLEET/NAME, zenoh://FLEET/NAME?connect=tcp/10.0.0.5:7447 …",
     )
-    _add_common(zenoh, 5.0, "state")
+    _add_common(zenoh, 5.0, 50.0, "state")
     mqtt = _add_publishing(actions, "mqtt", "to an MQTT broker")
     mqtt.set_defaults(module_and_extra=("paho", "mqtt"), network_text=_without_password)
     mqtt.add_argument(
@@ -67,7 +67,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         metavar="NETWORK",
         help="where to publish: mqtt://HOST/FLEET/NAME, mqtts://USER:PASSWORD@HOST/FLEET/NAME …",
     )
-    _add_common(mqtt, 5.0, "state")
+    _add_common(mqtt, 5.0, 50.0, "state")
 
 
 def _add_publishing(
@@ -84,14 +84,14 @@ def _add_publishing(
     return action
 
 
-def _add_common(action: argparse.ArgumentParser, rate_hz: float, what: str) -> None:
-    """Add the options that all bridges have. ``rate_hz`` is the default rate, ``what`` names what is sent."""
+def _add_common(action: argparse.ArgumentParser, default_hz: float, max_hz: float, what: str) -> None:
+    """Add the options that all bridges have. ``what`` names what is sent at the rate."""
     action.add_argument(
         "--rate",
-        type=number(0.1, 50 if rate_hz < 10 else 100),
-        default=rate_hz,
+        type=number(0.1, max_hz),
+        default=default_hz,
         metavar="HZ",
-        help=f"maximum rate of each {what} (default: {rate_hz:g})",
+        help=f"maximum rate of each {what} (default: {default_hz:g})",
     )
     action.add_argument(
         "--listen-only",

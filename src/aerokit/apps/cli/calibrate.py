@@ -124,7 +124,7 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
                 if step.needs_confirmation and not await press_enter():
                     scope.cancel()
                     await anyio.lowlevel.checkpoint()  # a cancellation takes effect here, before the next step
-        if scope.cancelled_caught:  # The calibration has not ended on the vehicle.
+        if scope.cancelled_caught:  # the calibration still runs on the vehicle
             return await _cancel(options, calibration)
     return DONE
 
@@ -148,7 +148,7 @@ class Display:
         self._shown: tuple[CalibrationPose | None, str] = (None, "")
 
     def show(self, step: CalibrationStep) -> None:
-        """Print a new pose with its picture, otherwise a new instruction, and in a terminal the progress."""
+        """Print the result, a new pose with its picture, or a new instruction; in a terminal, also the progress."""
         if step.result is not None:
             self._show_result(step)
             return

@@ -105,7 +105,7 @@ def add_address(
     Args:
         command: the parser or group.
         name: name of the argument; with leading dashes, name of the option.
-        what: text of the help before the examples.
+        what: beginning of the help text, before the examples.
         default_text: what the command does without an address, for the help; None if it uses the default address.
     """
     keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
@@ -226,7 +226,7 @@ async def connected(options: argparse.Namespace, *, changes: bool = False) -> As
 async def connect_to(
     options: argparse.Namespace, link: str | Link, *, changes: bool, **connecting: Any
 ) -> AsyncIterator[Vehicle]:
-    """Connect to the vehicle on a link, with a countdown. ``connecting`` is passed to :func:`aerokit.connect`.
+    """Connect to the vehicle on a link, and show a countdown. ``connecting`` is passed to :func:`aerokit.connect`.
 
     ``changes`` is as in :func:`connected`.
     """

@@ -121,14 +121,14 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
 
 
 class _SquareFlight(SupervisedFlight):
-    """A flight along a square. It always ends with a landing, even after an interrupt or a failure."""
+    """A flight along a square. After an interrupt or a failure it lands, unless another party has control."""
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack) -> None:
         super().__init__(vehicle, report, interrupts, "land")
         self._was_overruled = False  # True if another party's mode change has ended the flight along the square
 
     async def fly_square(self, altitude_m: float, side_m: float) -> int:
-        """Fly the square and return the exit code. Lands in any case."""
+        """Fly the square and land. Return the exit code."""
         self._altitude_m = altitude_m
         self._side_m = side_m
         try:

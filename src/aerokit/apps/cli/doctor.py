@@ -152,7 +152,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_doctor(options: argparse.Namespace) -> int:
-    """Print all findings. Return FAILED if there is a problem, NO_VEHICLE if the link is silent."""
+    """Print all findings. Return FAILED if there is a problem, NO_VEHICLE if the link is silent or cannot be opened."""
     levels: set[Level] = set()
 
     def report(finding: Finding) -> None:
@@ -185,7 +185,7 @@ def _check_computer(report: Callable[[Finding], None]) -> None:
 
 
 async def _check_link(options: argparse.Namespace, report: Callable[[Finding], None]) -> bool:
-    """Check the link and print the findings. Return True if anything was received."""
+    """Check the link and report findings. Return False if it cannot be opened, or no other system was received."""
     from aerokit.apps.cli.doctor_link import LinkExamination
 
     parsed = parse_address(options.address) if isinstance(options.address, str) else None
@@ -213,7 +213,7 @@ async def _check_link(options: argparse.Namespace, report: Callable[[Finding], N
 async def _find_baud_rate(
     options: argparse.Namespace, device: str, configured_baud: int, report: Callable[[Finding], None]
 ) -> int:
-    """Return the baud rate at which MAVLink is received; ``configured_baud`` if it is received at none."""
+    """Return the baud rate at which MAVLink is received, or ``configured_baud`` if none is found."""
     from aerokit.apps.cli.doctor_link import BAUD_RATES, listen_at
 
     port_finding = check_serial_port(device)

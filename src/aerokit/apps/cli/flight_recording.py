@@ -28,7 +28,7 @@ _MAX_HEIGHT_M = 3.0
 async def record_parameters(vehicle: Vehicle, print_line: Callable[[str], None]) -> None:
     """Request all parameters, so that a report on the recording can explain failsafes. Gives up after 10 s.
 
-    They are not read by MAVFTP, which is faster, because reports need the PARAM_VALUE messages of each parameter.
+    The faster MAVFTP is not used, because reports need a PARAM_VALUE message for each parameter.
     """
     try:
         table = await vehicle.parameters.download(method="list", timeout=_PARAMETERS_TIMEOUT_S)
@@ -43,8 +43,8 @@ async def record_to_end(
 ) -> None:
     """Stay connected to an armed vehicle until it is disarmed or silent for 10 s, or until Ctrl-C.
 
-    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion.
-    In a simulation, these are simulated seconds, which pass ``speedup`` times as fast.
+    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion. In
+    a simulation, the 20 s are simulated time, which passes ``speedup`` times as fast.
     """
     if not vehicle.is_armed or not vehicle.connection.is_open:
         return
@@ -71,7 +71,7 @@ async def record_to_end(
 
 
 class _StillnessNearGround:
-    """Detects that a vehicle has not moved for a time at the height of its home or a little above."""
+    """Detects that a vehicle at about the height of its home has not moved for ``min_duration_s``."""
 
     def __init__(self, vehicle: Vehicle, min_duration_s: float) -> None:
         self._vehicle = vehicle
@@ -82,7 +82,7 @@ class _StillnessNearGround:
         """True if the vehicle had been still for the whole time at the last `update`."""
 
     def update(self) -> None:
-        """Compare the vehicle's position with the one at which it was still. Must be called regularly."""
+        """Update ``has_lasted`` from the vehicle's latest position. Call this regularly."""
         now = self._vehicle.connection.now()
         position = self._vehicle.position.latest
         if position is None:

@@ -100,7 +100,7 @@ class PlanFlight(SupervisedFlight):
         return tuple((await self._vehicle.mission.download(idle_timeout_s=self._options.patience)).items)
 
     def _check_vehicle(self) -> None:
-        """Raise an error if the vehicle is armed or cannot fly the mission, or if it cannot do ``--on-interrupt``."""
+        """Raise an error if the vehicle is armed, cannot fly the mission, or has no mode for ``--on-interrupt``."""
         vehicle = self._vehicle
         interrupt_action = self._options.on_interrupt
         self._check_disarmed()
@@ -164,9 +164,9 @@ class PlanFlight(SupervisedFlight):
                 group.cancel_scope.cancel()
 
     async def _explain_wait(self, mode: str) -> None:
-        """Print why the flight does not fail at once when the mode changes.
+        """Print why the flight does not fail at once when the mode changes to ``mode``.
 
-        Nothing is printed in the first moment, in which the end of the mission may explain the mode.
+        Nothing is printed at first, because a report that the mission has ended may soon explain the mode.
         """
         delay_s = END_GRACE_S / 4
         await anyio.sleep(delay_s)

@@ -38,7 +38,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     set_completions(endpoints, addresses)
     _add_names(command, "--read-only", "do not forward messages received there, heartbeats included")
     _add_names(command, "--patient", "if it cannot be opened, start without it and keep trying")
-    only = f"send only these messages, at one endpoint or, without @NAME, at all: {_FILTER_EXAMPLE}"
+    only = f"send only these messages, to one endpoint or, without @NAME, to each: {_FILTER_EXAMPLE}"
     _add_filter(command, "--only", _messages, only)
     _add_filter(command, "--block", _messages, f"do not send these messages: {_FILTER_EXAMPLE}")
     _add_filter(command, "--rate", _rate, "limit messages to a rate in Hz, for each sender: 'ATTITUDE=5@NAME'")
@@ -123,7 +123,11 @@ def _how_long(options: argparse.Namespace) -> str:
 
 
 def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
-    """Return the endpoints with their options. InvalidArgument if an option names an unknown endpoint."""
+    """Return the endpoints with their options.
+
+    Raises:
+        InvalidArgument: an option names an unknown endpoint, or ``--signed`` is used without a key.
+    """
     from aerokit.hub import Endpoint
 
     names = [name for name, _ in options.endpoints]

@@ -58,7 +58,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_record)
     add_link(command)
     command.add_argument("file", type=log_file, metavar="FILE", help="flight.tlog; directly after ADDRESS")
-    add_seconds(command, "stop after S seconds (at Ctrl-C)")
+    add_seconds(command, "stop after S seconds (default: at Ctrl-C)")
     command.add_argument(
         "--as-is", action="store_true", help="request nothing; by default, request aerokit's usual message rates"
     )
@@ -143,7 +143,7 @@ def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], 
 def add_events_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_events)
     add_link(command)
-    add_seconds(command, "stop after S seconds (at Ctrl-C)")
+    add_seconds(command, "stop after S seconds (default: at Ctrl-C)")
     command.add_argument("--all", action="store_true", help="include the link quality of each vehicle, once a second")
 
 
@@ -242,7 +242,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _printing_kept_name(path: str | None) -> Iterator[None]:
-    """After the block, print the new name of an earlier recording. In the block, Textual hides log messages."""
+    """After the block, print the new name of a recording that was renamed. Textual hides the log message about it."""
     if path is None or not os.path.isfile(path):
         yield
         return

@@ -279,8 +279,8 @@ def make_parser(only: str | None = None) -> argparse.ArgumentParser:
     """Make the parser for the command line.
 
     Args:
-        only: the only command whose arguments are added, because importing all modules is slow. None adds the
-            arguments of all commands.
+        only: the only command whose arguments are added, because importing all modules is slow. "" adds no command's
+            arguments, None those of all commands.
     """
     from aerokit import __version__
 

@@ -49,7 +49,7 @@ def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
 
 
 def plan_warnings(plan: Plan) -> list[str]:
-    """Return warnings about parts of a plan that a vehicle will probably refuse, although they can be sent."""
+    """Return warnings about items that can be sent, but are unusual or will probably be refused by a vehicle."""
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard_commands = frozenset(MavCmd)
@@ -79,8 +79,8 @@ def _altitude_warnings(plan: Plan) -> list[str]:
     for index, item in enumerate(plan.mission.items):
         is_take_off = item.command in _TAKE_OFFS
         # A take-off has an altitude even without a position. In other commands without a position, z is no altitude.
-        is_above_home = canonical_frame(item.frame) == MavFrame.GLOBAL_RELATIVE_ALT
-        has_altitude = is_above_home and (is_take_off or item.position is not None)
+        is_relative_to_home = canonical_frame(item.frame) == MavFrame.GLOBAL_RELATIVE_ALT
+        has_altitude = is_relative_to_home and (is_take_off or item.position is not None)
         is_too_low = item.z < 0.0 or (is_take_off and item.z == 0.0)
         if has_altitude and is_too_low and item.command not in _LANDINGS:
             warnings.append(f"mission item {index}: {item.name} at {item.z:g} m above home")
@@ -127,7 +127,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
                     on_progress=on_progress,
                 )
             except InvalidArgument as error:
-                # Name the option of the command line instead of the library's argument.
+                # Name the option of the command line instead of the argument of `upload`.
                 text = str(error).replace("a greater max_distance_m", "a greater --max-distance-m")
                 raise InvalidArgument(text.replace("plan, item", f"{part} item")) from None
         emit_part(options, part, count, "uploaded", f"{part}: {count} items uploaded to vehicle {vehicle.system_id}")

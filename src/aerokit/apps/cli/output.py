@@ -119,7 +119,7 @@ def plain_text(error: BaseException) -> str:
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Within the block, warnings of this library are printed without advice on code, which does not help users."""
+    """Within the block, print aerokit's warnings without advice on code, which does not help users of a command."""
     import logging
     import warnings
 

@@ -38,7 +38,7 @@ def metadata_source(vehicle: Vehicle) -> str:
 
 
 def defaults_source(vehicle: Vehicle) -> str:
-    """Return one sentence that says why the vehicle's defaults are unknown, and what to do instead."""
+    """Return a text that says why the vehicle's defaults are unknown, and what to do instead."""
     if vehicle.autopilot.name == "PX4":
         return (
             f"PX4 does not report the defaults of its parameters: --metadata FILE has them; {_PX4_FILE}. To"
@@ -74,7 +74,10 @@ def load_metadata_option(options: argparse.Namespace) -> Metadata | None:
 async def metadata_for_check(
     vehicle: Vehicle, from_file: Metadata | None, options: argparse.Namespace
 ) -> Metadata | None:
-    """Return the metadata to check values with, from the file or else from the vehicle; None with ``--force``."""
+    """Return the metadata to check values with, from the file or else from the vehicle.
+
+    Return None with ``--force``, or if there is no metadata.
+    """
     if options.force:
         return None
     if from_file is not None or vehicle.autopilot.name != "PX4":  # ArduPilot has no component metadata
@@ -109,7 +112,7 @@ def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> Non
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
-    """Return a note on what is needed until a new value takes effect, such as a reboot; empty if nothing is known."""
+    """Return a note on when a new value takes effect, such as after a reboot; empty if nothing is known."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
     if metadata is None:
@@ -119,7 +122,7 @@ def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
 
 
 def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
-    """Return the unit, range and meaning of a parameter as fields for its record; None if unknown."""
+    """Return the unit, range and meaning of a parameter as fields for its record. Unknown fields are None."""
     # The parameter's other names are not tried, because their metadata may have another unit.
     entry = None if metadata is None else metadata.get(parameter.name)
     if entry is None:

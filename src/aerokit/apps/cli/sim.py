@@ -64,7 +64,7 @@ def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     Kinds without ``boot_text`` ignore this option.
 
     Raises:
-        InvalidArgument: this kind does not have one of the options or parameters.
+        InvalidArgument: the kind is unknown, or lacks one of the options or parameters.
     """
     from aerokit.sim.kinds import kind_class, simulated
 
@@ -373,7 +373,7 @@ def _client_address(address: str, argument: str) -> str:
 
 
 def _zenoh_options(address: str) -> str:
-    """Return the query of a client's zenoh address, which connects to an endpoint of the simulator."""
+    """Return the query part of the zenoh address with which a client connects to the simulator."""
     parsed = parse_address(expand_address(address, 0, 1))
     endpoints = parsed.option("listen") or parsed.option("connect")
     config = parsed.option("config")

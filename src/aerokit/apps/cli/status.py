@@ -85,7 +85,7 @@ def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
 
 def _readiness(vehicle: Vehicle, checks: Readiness) -> list[str]:
     lines = readiness_lines(vehicle, checks)
-    if lines and vehicle.armed.latest:  # the checks before arming do not matter in flight
+    if lines and vehicle.armed.latest:  # these are not reasons against arming, because the vehicle is armed
         return _aligned("missing", [*checks.against_arming, *checks.against_flight])
     if lines:
         return _aligned("arming", [text.replace("arm() changes to", "aerokit changes to") for text in lines])
@@ -211,7 +211,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_status(options: argparse.Namespace) -> int:
-    """Listen, request missing data, and print the status of all systems. Return 1 if a vehicle cannot arm."""
+    """Listen, request missing data, and print the status of all systems. Return 1 if a disarmed vehicle cannot arm."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with opened(options) as connection, vehicles_on(connection, rates={}) as vehicles:
@@ -238,7 +238,7 @@ async def run_status(options: argparse.Namespace) -> int:
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
-    """Request the states that the vehicle does not stream, then return what it lacks."""
+    """Request the states that the vehicle does not stream, then return what it lacks for arming and for flight."""
     # `why_not_armable` requests the estimator's messages, which depend on the firmware, from disarmed vehicles only.
     needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()
     estimator_messages = [("estimator", message) for message in needed]
@@ -263,7 +263,7 @@ async def _request(vehicle: Vehicle, message: Any, cell: Any) -> None:
 
 
 def _emit_link(connection: Connection, options: argparse.Namespace, seconds: float) -> None:
-    """Print what was received in these ``seconds``, from all senders together."""
+    """Print what was received from all senders together. ``seconds`` is the time since the first heartbeat."""
     statistics = list(connection.statistics())
     record = {
         "address": connection.link.address,

@@ -80,7 +80,7 @@ class SupervisedFlight(ABC):
         self._has_started = False  # True once a command of this program has changed the mode after arming
 
     async def fly(self) -> int:
-        """Perform the flight and return the exit code. After an error, make the vehicle safe and re-raise the error."""
+        """Perform the flight and return the exit code. After an error, make an armed vehicle safe and re-raise."""
         try:
             code = await self._interrupts.run(self._fly)
         except Exception as error:
@@ -145,7 +145,7 @@ class SupervisedFlight(ABC):
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
 
     async def _after_failure(self, error: Exception) -> int:
-        """Disarm on the ground, if this program armed the vehicle. In the air, leave control to pilot or failsafe."""
+        """Disarm on the ground, if this program still has control. In the air, leave control to pilot or failsafe."""
         vehicle = self._vehicle
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
@@ -156,7 +156,10 @@ class SupervisedFlight(ABC):
         return DONE
 
     async def _after_interrupt(self) -> int:
-        """Disarm a vehicle on the ground. In the air, perform ``--on-interrupt`` if this program still has control."""
+        """Disarm a vehicle on the ground. In the air, perform the action of ``--on-interrupt``.
+
+        No command is sent if that action is "nothing", or if this program no longer has control.
+        """
         vehicle = self._vehicle
         action = self._on_interrupt
         if vehicle.is_confirmed_disarmed:
@@ -186,7 +189,7 @@ class SupervisedFlight(ABC):
         return DONE
 
     async def _watch_late_arming(self) -> None:
-        """Stay connected while an arm command may still arrive, so that the library can disarm the vehicle."""
+        """Stay connected while an arm command may still take effect, so that aerokit can disarm the vehicle then."""
         if not self._may_arm_late:
             return
         self._print(
@@ -229,7 +232,7 @@ class SupervisedFlight(ABC):
 class FlightReport:
     """Prints the progress of a flight and the vehicle's status texts, and measures the track.
 
-    ``speedup`` is the speed of the simulation, 1.0 for a real vehicle. Durations are in simulated time.
+    ``speedup`` is the speed of the simulation, 1.0 for a real vehicle. Printed durations are simulated time.
     """
 
     def __init__(self, vehicle: Vehicle, options: argparse.Namespace, speedup: float) -> None:
@@ -409,7 +412,7 @@ class FlightReport:
             self._fast_sink_at = self._vehicle.velocity.updated_at
 
     def _on_position(self, _: Position | None, position: Position) -> None:
-        """Measure the track while the vehicle is armed. Like reports on recordings, ignore steps below a metre."""
+        """Measure the track while the vehicle is armed. Steps below a metre do not count, as in reports."""
         if not self._vehicle.is_armed:
             self._previous_position = None
             return

@@ -146,7 +146,10 @@ class Panel(Widget):
 
 
 class Monitor(App[None]):
-    """Shows a :class:`~aerokit.apps.monitor.model.MonitorModel`. Commands go to the vehicle named in the question."""
+    """Terminal application that shows a :class:`~aerokit.apps.monitor.model.MonitorModel` and commands its vehicles.
+
+    A command goes to the vehicle that is named in the question before it.
+    """
 
     CSS_PATH: ClassVar[str | PurePath | list[str | PurePath] | None] = "monitor.tcss"
     ENABLE_COMMAND_PALETTE: ClassVar[bool] = False

@@ -186,9 +186,9 @@ class VehicleText:
         return f"{silence}\n{reasons}" if silence else reasons
 
     def _reasons(self) -> list[str]:
-        """Return the reasons that prevent a flight: those against arming, then the others. Each group has a prefix.
+        """Return the reasons that prevent a flight: those against arming, then the others.
 
-        An active failsafe comes first.
+        While the vehicle is disarmed, each group has a prefix. While it is armed, an active failsafe comes first.
         """
         checks = readiness(self._vehicle)
         if self._vehicle.armed.latest:

@@ -118,7 +118,7 @@ class MqttLink(BaseLink):
         self._alive_topic = broker.key_space.root + "/alive"
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """Send a value, or buffer it until the broker accepts data."""
+        """Send a value, or buffer it until the broker accepts data. A closed link or a full buffer drops it."""
         name = str(peer)
         if self._receiver is None or (name not in self._unsent and len(self._unsent) >= MAX_WAITING):
             self._drop(1)

@@ -72,7 +72,7 @@ class Publishing:
         self._sent: dict[str, tuple[float, object]] = {}  # maps states to time and value of their last message
 
     def publish(self, now: float) -> None:
-        """Publish all states that have changed or were last published `REPEAT_INTERVAL_S` ago.
+        """Publish all states that have changed, or were not published for `REPEAT_INTERVAL_S`.
 
         ``now`` is the present time in seconds, on any clock.
         """

@@ -49,7 +49,7 @@ ENUMS: dict[str, type[Enum]] = {
 
 
 def document() -> dict[str, Any]:
-    """Return the schema (draft 2020-12), which is ``oneOf`` all messages. Their ``state`` distinguishes them."""
+    """Return the JSON schema (draft 2020-12): a ``oneOf`` with one message for each ``state``."""
     definitions: dict[str, dict[str, Any]] = {"Message": _MESSAGE}
     cell_types = typing.get_type_hints(States)
     states = {}
@@ -129,7 +129,7 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
 def _enum_schema(name: str) -> dict[str, Any] | None:
     """Return the schema of an integer that is published as a name, as a list of names (flags), or else as the number.
 
-    None if ``name`` is not in ``ENUMS``.
+    ``name`` is a state or ``Class.field``. Return None if it is not in ``ENUMS``.
     """
     enum = ENUMS.get(name)
     if enum is None:

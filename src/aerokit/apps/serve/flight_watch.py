@@ -55,8 +55,8 @@ class FlightWatch:
 
     ``crash`` is strict: a flying vehicle must not count as crashed, because the page offers to stop the motors of a
     crashed vehicle. A vehicle has crashed if ``ImpactDetector`` reports an impact, after which the vehicle does not
-    move. In addition, it must be disarmed, report that it is on the ground, or have stopped near the altitude of home
-    faster than motors can stop it.
+    move. In addition, one of these must be true: the vehicle is disarmed, it reports that it is on the ground, or it
+    stopped near the altitude of home faster than motors can stop it.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -102,10 +102,11 @@ class FlightWatch:
 
     @property
     def disarming(self) -> dict[str, Any] | None:
-        """The last disarming, if the vehicle was not in the air before it and no order of this server caused it.
+        """The last disarming without a flight before it that no order of this server caused; None if there was none.
 
         ``age_s`` is the time since then, ``armed_for_s`` how long the vehicle was armed. ``parameter`` and ``delay_s``
-        are the setting for automatic disarming. ``is_automatic`` is true if it was armed for about ``delay_s``.
+        are the autopilot's setting for automatic disarming. ``is_automatic`` is true if the vehicle was armed for about
+        ``delay_s``.
         """
         if self._disarming is None:
             return None
@@ -158,7 +159,7 @@ class FlightWatch:
         has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
         if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
             # The landed state of a crashed vehicle with running motors may change again and again, although it lies
-            # still. It counts as flying again once it has climbed.
+            # still. It counts as flying again once it has climbed or, if its height is unknown, at once.
             self._take_off_height_m = height_above_home(self._vehicle.telemetry)
             if self._take_off_height_m is None:
                 self._dismiss_impact()

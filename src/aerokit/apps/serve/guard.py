@@ -61,7 +61,10 @@ class AccessControl:
         return token is not None and hmac.compare_digest(token.encode("utf-8", "surrogateescape"), self._token)
 
     def check(self, headers: Headers, *, is_order: bool = False, needs_token: bool = False) -> None:
-        """Raise HttpProblem 401 or 403 if the request is not allowed."""
+        """Raise HttpProblem 401 or 403 if the request is not allowed.
+
+        Orders, and requests with ``needs_token``, need the token even if reading does not.
+        """
         if is_order and self.read_only:
             raise HttpProblem(403, "ReadOnly", "this server is read-only and accepts no orders; nothing was sent")
         token = _token_of(headers)
@@ -107,8 +110,8 @@ def content_policy(tiles: str | None) -> str:
 class SecurityMiddleware:
     """ASGI middleware that rejects foreign hosts and origins, and adds security headers to every response.
 
-    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``, which prevents DNS rebinding. If a
-    browser sends an Origin, it must be this server, so that pages of other sites cannot make requests.
+    The Host of a request must be an IP address, ``localhost`` or one of ``hosts``, which prevents DNS rebinding. An
+    Origin, if a browser sends one, must be this server, so that pages of other sites cannot make requests.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], tile_url: str | None) -> None:
@@ -174,9 +177,10 @@ RawHeaders = list[tuple[bytes, bytes]]
 
 
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
-    """Return the ``http`` class for `uvicorn.Config`, which limits anonymous connections.
+    """Return a class that limits anonymous connections, for the argument ``http`` of `uvicorn.Config`.
 
-    Connections with the token in a request are never closed, so that anonymous clients cannot exclude the owner.
+    A connection is anonymous until one of its requests has the token. Only anonymous connections are closed when there
+    are too many, so that their clients cannot exclude the owner.
     """
     anonymous: dict[_HttpConnection, None] = {}
 
@@ -243,10 +247,9 @@ class _HttpConnection(H11Protocol):
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
-    """The ``ws`` class for `uvicorn.Config`.
+    """Class for the argument ``ws`` of `uvicorn.Config`. It records that the response to a refused handshake ends it.
 
-    uvicorn 0.35 to 0.54 log a refused handshake as an error ("ASGI callable returned without completing handshake"),
-    because they do not record that the response to it completes the handshake.
+    uvicorn 0.35 to 0.54 do not, and log the error "ASGI callable returned without completing handshake".
     """
 
     async def send(self, message: Any) -> None:

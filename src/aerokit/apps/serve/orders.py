@@ -80,9 +80,12 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise InvalidArgument if an argument is unknown or missing, or if just one of its value and its type is bool.
+        """Check that no argument is unknown or missing, and that boolean arguments, and no others, are bools.
 
-        The called method checks other types, and ranges.
+        The method that the order calls checks all other types, and ranges.
+
+        Raises:
+            InvalidArgument: a check failed.
         """
         for name in values:
             if name not in self.arguments:
@@ -90,7 +93,7 @@ class OrderType:
                 raise InvalidArgument(f"{self.name}: unknown argument {name[:40]!r}; arguments: {names}")
         for name, argument in self.arguments.items():
             value = values.get(name)
-            # Python accepts bools as ints, but True is not the number of a mode. The library checks all other types.
+            # Python accepts bools as ints, but True is not the number of a mode.
             if value is not None and isinstance(value, bool) != (argument.type == "boolean"):
                 raise InvalidArgument(
                     f"{self.name}: {name} = {value!r:.40} is not allowed: its type must be {argument.type}"
@@ -165,10 +168,10 @@ async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 
 def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
-    """Return the name, text and plan of a request body, which has a .plan as JSON object, or a text in either format.
+    """Return the name, text and plan of a request body. Its ``plan`` is a .plan as JSON object, or the text of a file.
 
     Raises:
-        FileFormatError: the body has neither format; the text names the position of the error.
+        FileFormatError: ``plan`` is neither a .plan nor QGC WPL 110; the text names the position of the error.
         InvalidArgument: an item of the plan cannot be sent to a vehicle.
     """
     name = values.get("name")
@@ -305,7 +308,8 @@ class OrderRunner:
         """Start an order, or return the earlier order with this key. ``order_type.check`` has checked the arguments.
 
         Raises:
-            HttpProblem: the key is missing or was used for another order, or the client has only seen an old state.
+            HttpProblem: the key is missing or was used for another order, the client has only seen an old state, or
+                ``force`` is not allowed.
             FileFormatError, InvalidArgument: the arguments cannot be parsed.
             BusyError: too many orders are running.
             HeartbeatTimeout: the vehicle is silent.
@@ -383,7 +387,7 @@ class OrderRunner:
             )
 
     def _store(self, record: OrderRecord) -> None:
-        """Store an order. If there are too many, drop the oldest orders that have ended, except their keys."""
+        """Store an order. If there are too many, drop the oldest orders that have ended, but keep their keys."""
         self._records[record.key] = record
         ended_keys = [key for key, stored in self._records.items() if stored.state != "running"]
         for key in ended_keys:
@@ -423,10 +427,10 @@ class OrderRunner:
             return None
         newest_key = None
         is_later = False
-        for other in self._records.values():  # the oldest first
-            if is_later and other.system_id == record.system_id and other.order not in _NOT_MOTION:
-                newest_key = other.key
-            is_later = is_later or other is record
+        for stored in self._records.values():  # the oldest first
+            if is_later and stored.system_id == record.system_id and stored.order not in _NOT_MOTION:
+                newest_key = stored.key
+            is_later = is_later or stored is record
         return newest_key
 
     def _publish(self, record: OrderRecord) -> None:

@@ -46,7 +46,7 @@ BODY_TIMEOUT_S = 10.0
 
 
 class HttpProblem(Exception):
-    """A request failed. The response is a problem object, in which ``kind`` identifies the problem for programs."""
+    """A request failed. ``kind`` identifies the problem for programs, as ``error`` in the response."""
 
     def __init__(self, status: int, kind: str, text: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(text)
@@ -58,7 +58,7 @@ class HttpProblem(Exception):
 def problem_of(error: Exception) -> dict[str, Any]:
     """Return the problem object (RFC 9457) of an error.
 
-    It has ``error``, ``detail`` and, if the vehicle has given reasons, ``reasons``.
+    Besides the standard members, it has ``error`` and, if the vehicle has given reasons, ``reasons``.
     """
     if isinstance(error, HttpProblem):
         status, kind = error.status, error.kind

@@ -49,8 +49,8 @@ TRACK_GAP_S = 3.0
 class ServedVehicles:
     """Follows the vehicles of a source, and keeps their recent events, texts and tracks.
 
-    Requests nothing but the return altitude, once, and the reasons for not arming. These are requested when a disarmed
-    vehicle begins to report failing checks, and again when the failing sensors change.
+    Requests nothing but the return altitude, once, and the reasons for not arming. The reasons are requested when a
+    disarmed vehicle begins to report failing checks, and again when the failing sensors change.
 
     ``source`` is a connection (its vehicles are added as they appear), one vehicle, or a mapping from system id to
     vehicle, which may grow.
@@ -118,7 +118,7 @@ class ServedVehicles:
         return [(position.latitude_deg, position.longitude_deg, is_after_gap) for position, is_after_gap in points]
 
     def snapshot(self) -> str:
-        """Return the current state of all vehicles as JSON, which is the message ``state`` of the stream."""
+        """Return the message ``state`` of the stream as JSON: all vehicles, at most `SNAPSHOT_MAX_AGE_S` ago."""
         now = asyncio.get_running_loop().time()
         if now - self._snapshot_at > SNAPSHOT_MAX_AGE_S:
             vehicles = [self._state_of(vehicle) for vehicle in self.vehicles.values()]
@@ -187,7 +187,7 @@ class ServedVehicles:
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
     async def _record_tracks(self) -> None:
-        """Add the positions of all vehicles to their tracks, without end. Thin out a track that is full."""
+        """Add the positions of all vehicles to their tracks until cancelled. Thin out a track that is full."""
         silent: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
@@ -218,7 +218,7 @@ class ServedVehicles:
         """Return the overview of a vehicle, and further values that the page shows (docs/serve.md).
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
-        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if ``arm`` does not change the mode.
+        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if the vehicle can arm in its mode.
         """
         watch = self._watch(vehicle)
         missing = vehicle.missing_for_flight()

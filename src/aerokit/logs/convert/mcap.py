@@ -19,7 +19,7 @@ _POSE_STATES = frozenset(("position", "attitude"))
 
 
 class McapWriter:
-    """Writes a log as ``.mcap``, with one message for each record."""
+    """Writes a log as ``.mcap``, with a message for each record and for each state that it changes."""
 
     def __init__(self, path: Path, log: LogReader) -> None:
         self._log = log

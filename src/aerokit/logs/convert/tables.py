@@ -155,7 +155,7 @@ Table = CsvTable | ParquetTable
 
 
 class FlightTableWriter:
-    """Writes one table, with a row for each position of each vehicle. The row also has the newest other values."""
+    """Writes one table, with a row for each position of each vehicle. The other columns have the newest values."""
 
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._table = kind(path, (*_SENDER_COLUMNS[:2], *FLIGHT))

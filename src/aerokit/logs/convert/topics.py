@@ -105,7 +105,7 @@ class MapFrame:
     def east_north_up_m(self, position: Position) -> tuple[float, float, float]:
         """Convert a position to metres east, north and up of the origin.
 
-        The first position becomes the origin; its altitude is that of home, if known.
+        The first position becomes the origin. The origin's altitude is that of home, if known.
         """
         altitude, relative = position.altitude_amsl_m, position.altitude_relative_m
         if self._origin is None:

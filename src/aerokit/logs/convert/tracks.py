@@ -73,7 +73,7 @@ class _TrackWriter:
         self._path.write_text(self._text(), encoding="utf-8")
 
     def _add_item(self, record: LogRecord) -> None:
-        """Add a mission item that has a position to the vehicle that received or sent it."""
+        """Add a mission item that has a position to the track of the vehicle that received or sent it."""
         item: Any = record.message
         if item is None or item.mission_type != MavMissionType.MISSION or item.frame not in GLOBAL_FRAMES:
             return
@@ -101,9 +101,7 @@ _MISSION_ITEM_TABLES = frozenset(("MISSION_ITEM_INT", "MISSION_ITEM"))
 
 
 class GpxWriter(_TrackWriter):
-    """Writes ``.gpx``: for each vehicle a track with times and elevations above sea level, and the waypoints of
-    its mission.
-    """
+    """Writes ``.gpx``: for each vehicle a track with times, and its mission. Altitudes are above sea level."""
 
     def _text(self) -> str:
         gpx = import_module("gpxpy.gpx")

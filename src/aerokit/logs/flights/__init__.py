@@ -135,7 +135,7 @@ def _armed_at_end_note(flight: FlightLog) -> str:
 
 
 def _complete_altitudes(flight: FlightLog) -> None:
-    """Derive heights above home from altitudes above sea level.
+    """Derive missing heights above home from altitudes above sea level, and correct rows in which both are the same.
 
     While ArduPilot does not know one of the two altitudes, it logs the other one for both.
     """

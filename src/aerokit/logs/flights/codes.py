@@ -212,7 +212,7 @@ _ACTIONS: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
-    """Return the meaning of a failsafe parameter's value; empty if unknown. ``vehicle`` begins with the firmware."""
+    """Return the meaning of a failsafe parameter's value; empty if unknown. ``vehicle`` names the firmware."""
     firmware = next((firmware for firmware in _ACTIONS if firmware in vehicle), "")
     gcs_meanings = GCS_FAILSAFE_ACTIONS.get(firmware, {}).get(parameter)
     if gcs_meanings is not None:

@@ -174,6 +174,7 @@ def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -
     """Return True if evidence belongs to the same failsafe as an earlier group of evidence."""
     kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (kind, evidence.kind):
+        # PX4 announces "entering Hold for 5 seconds" before its reaction.
         is_reaction_delayed = kind == "gps" or "entering Hold" in group[-1].text
         return gap_s <= (_DELAYED_REACTION_GAP_S if is_reaction_delayed else _GENERAL_GAP_S)
     if (kind, evidence.kind) == ("gps", "estimator"):  # The estimator fails because the satellites are missing.
@@ -205,8 +206,8 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
     """Return a description of the reaction to a failsafe, and True if the reaction is the autopilot's.
 
-    The reaction is disarming, or the first mode change that was not commanded. If the log does not contain the cause of
-    the change, an immediate change is attributed to the autopilot; a later change may be the pilot's.
+    The reaction is the first mode change that was not commanded or, without one, disarming. If the log does not contain
+    the cause of the change, an immediate change is attributed to the autopilot; a later change may be the pilot's.
     """
     last_s = group[-1].time_s
     for change in flight.modes:

@@ -57,13 +57,14 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    A descent counts if the vehicle sank at more than 3 m/s, was stopped within 0.6 s, and one of these is true:
+    A descent counts if the vehicle sank 2 m or more at more than 3 m/s, was stopped within 0.6 s, and one of these is
+    true:
 
     - The vehicle stayed at that height until it was disarmed.
-    - The vehicle stayed armed and less than 3 m above home for 30 s.
+    - The vehicle stayed armed at that height for 30 s, less than 3 m above home.
     - The autopilot reported a crash.
 
-    A descent near the ground also counts if the log ends before its end.
+    A descent near the ground also counts if the log ends during the descent.
     """
     if not flight.armed:
         return []
@@ -75,7 +76,7 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
-    """Yield the start, end and last sink rate of each fast descent, and whether the descent was stopped."""
+    """Yield the start and end of each fast descent, its highest sink rate near the end, and whether it was stopped."""
     begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
     last_fast_s = -math.inf  # the last time at which it sank fast
     previous_s = -math.inf
@@ -125,7 +126,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle keeps this height until it is disarmed, or stays armed near the height of home."""
+    """Return True if the vehicle keeps this height until it is disarmed or, near the height of home, for 30 s."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log

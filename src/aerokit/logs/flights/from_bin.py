@@ -41,7 +41,7 @@ _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the row
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Read the file of a flight, and fill the flight with its content.
+    """Fill a flight with the content of the file ``flight.path``. ``system_id`` is ignored: a .bin does not have it.
 
     Raises:
         FileFormatError: the file is not an ArduPilot log, or was written before 2015.
@@ -189,9 +189,10 @@ class _Reader:
         flight.autopilot = "ArduPilot"
         flight.begins_at = tables.unix_at_0 + tables.began_us / 1e6
         steps = (
-            self._texts, self._modes, self._armed, self._parameters, self._mission, self._home,
-            self._track, self._velocity, self._attitude, self._targets, self._air, self._batteries,
-            self._gps, self._vibration, self._estimator, self._radio, self._errors,
+            self._read_texts, self._read_modes, self._read_armed, self._read_parameters, self._read_mission,
+            self._read_home, self._read_track, self._read_velocity, self._read_attitude, self._read_targets,
+            self._read_air, self._read_batteries, self._read_gps, self._read_vibration, self._read_estimator,
+            self._read_radio, self._read_errors,
         )  # fmt: skip
         for done, step in enumerate(steps, 1):
             step()
@@ -204,7 +205,7 @@ class _Reader:
         if not tables.unix_at_0:
             flight.notes.append("no GNSS time in the log: times count from power-on")
 
-    def _texts(self) -> None:
+    def _read_texts(self) -> None:
         flight = self._flight
         rows = self._tables.rows("MSG", "Message")
         flight.texts = [LoggedText(time, severity=None, text=clean_text(text)) for time, text in rows]
@@ -212,7 +213,7 @@ class _Reader:
         banner = next(banners, "")  # such as "ArduCopter V4.5.7 (2a3dc4b7)"
         flight.vehicle = " ".join(banner.split(" ")[:2]) or "ArduPilot"
 
-    def _modes(self) -> None:
+    def _read_modes(self) -> None:
         vehicle_type = _FIRMWARES.get(self._flight.vehicle.split(" ")[0], MavType.GENERIC)
         modes = ardupilot_for(vehicle_type).modes
         has_reason = self._tables.has("MODE", "ModeNum", "Rsn")
@@ -225,7 +226,7 @@ class _Reader:
                 text = f"mode {name}, reason: {reason} (MODE)"
                 self._flight.failsafe_evidence.append(FailsafeEvidence(time_s, failsafe, text, is_action=True))
 
-    def _armed(self) -> None:
+    def _read_armed(self) -> None:
         if self._tables.has("ARM", "ArmState"):
             for time, armed in self._tables.rows("ARM", "ArmState"):
                 self._flight.set_armed(time, bool(armed))
@@ -234,11 +235,11 @@ class _Reader:
             if event in (_ARMED, _DISARMED):
                 self._flight.set_armed(time, event == _ARMED)
 
-    def _parameters(self) -> None:
+    def _read_parameters(self) -> None:
         for time, name, value in self._tables.rows("PARM", "Name", "Value"):
             self._flight.set_parameter(time, name, value)
 
-    def _mission(self) -> None:
+    def _read_mission(self) -> None:
         items: dict[int, Waypoint] = {}
         for row in self._tables.rows("CMD", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
             _, number, command, latitude, longitude, altitude, frame = row
@@ -249,13 +250,13 @@ class _Reader:
             )
         self._flight.mission = [items[number] for number in sorted(items)]
 
-    def _home(self) -> None:
+    def _read_home(self) -> None:
         for row in self._tables.rows("ORGN", "Type", "Lat", "Lng", "Alt"):
             time, kind, latitude, longitude, altitude = row
             if kind == _HOME:
                 self._flight.set_home(time, latitude, longitude, altitude)
 
-    def _track(self) -> None:
+    def _read_track(self) -> None:
         track = self._flight.track
         for time, latitude, longitude, amsl, relative in self._tables.rows("POS", "Lat", "Lng", "Alt", "RelHomeAlt"):
             if abs(latitude) > _NULL_ISLAND_DEG or abs(longitude) > _NULL_ISLAND_DEG:
@@ -267,20 +268,20 @@ class _Reader:
             if status >= GpsFixType.TYPE_3D_FIX:
                 track.add(time, latitude, longitude, amsl, NAN)
 
-    def _velocity(self) -> None:
+    def _read_velocity(self) -> None:
         table = "XKF1" if self._tables.has("XKF1", "VN", "VE", "VD") else "NKF1"  # old logs have NKF1
         core_columns = ("C",) if self._tables.has(table, "C") else ()
         for time_s, north, east, down, *core in self._tables.rows(table, "VN", "VE", "VD", *core_columns):
             if not core or core == [0]:  # one estimator, or the first of several
                 self._flight.velocity.add(time_s, north, east, down)
 
-    def _attitude(self) -> None:
+    def _read_attitude(self) -> None:
         times, roll, pitch, yaw = self._tables.columns("ATT", "Roll", "Pitch", "Yaw")
         self._flight.attitude.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
         times, roll, pitch, yaw = self._tables.columns("ATT", "DesRoll", "DesPitch", "DesYaw")
         self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
 
-    def _targets(self) -> None:
+    def _read_targets(self) -> None:
         """Read the set-points of position and velocity. The log has them relative to the estimator's origin."""
         origin = self._origin()
         north_rows = list(self._tables.rows("PSCN", "TPN", "TVN"))
@@ -294,7 +295,7 @@ class _Reader:
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
     def _add_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
-        """Add height set-points to the position set-points, which are logged at the same rate."""
+        """Add height set-points to the position set-points, which are logged at the same rate, or else as new rows."""
         target = self._flight.position_target
         has_positions = len(target) > 0
         relative = target["altitude_relative_m"]
@@ -312,11 +313,11 @@ class _Reader:
                 return latitude, longitude
         return None
 
-    def _air(self) -> None:
+    def _read_air(self) -> None:
         for time, speed in self._tables.rows("ARSP", "Airspeed"):
             self._flight.air.add(time, speed, NAN)
 
-    def _batteries(self) -> None:
+    def _read_batteries(self) -> None:
         instance = "Inst" if self._tables.has("BAT", "Inst") else "Instance"
         has_percent = self._tables.has("BAT", "RemPct")
         columns = [instance, "Volt", "Curr", "CurrTot"]
@@ -326,7 +327,7 @@ class _Reader:
             is_known = has_percent and rest[0] != _NO_PERCENT
             self._flight.battery(number).add(time_s, voltage, current, used, rest[0] if is_known else NAN)
 
-    def _gps(self) -> None:
+    def _read_gps(self) -> None:
         # GPA has the accuracy for each row of GPS. Rows belong together if time and receiver are the same.
         accuracy: defaultdict[tuple[float, int], float] = defaultdict(lambda: NAN)
         for time, number, accuracy_m in self._tables.rows("GPA", "I", "HAcc"):
@@ -334,13 +335,13 @@ class _Reader:
         for time, number, status, satellites, hdop in self._tables.rows("GPS", "I", "Status", "NSats", "HDop"):
             self._flight.receiver(number).add(time, status, satellites, hdop, accuracy[time, number])
 
-    def _vibration(self) -> None:
+    def _read_vibration(self) -> None:
         columns = ("VibeX", "VibeY", "VibeZ", "Clip", "IMU")
         for time, x, y, z, clips, number in self._tables.rows("VIBE", *columns):
             if number == 0:  # the first of several IMUs
                 self._flight.vibration.add(time, x, y, z, clips)
 
-    def _estimator(self) -> None:
+    def _read_estimator(self) -> None:
         columns = ("SV", "SP", "SH", "SM", "SVT")
         table = "XKF4" if self._tables.has("XKF4", "SV") else "NKF4"
         if not self._tables.has("XKF4", "C", "PI"):
@@ -353,11 +354,11 @@ class _Reader:
             if core == max(primary, 0):
                 self._flight.estimator.add(time_s, *ratios)
 
-    def _radio(self) -> None:
+    def _read_radio(self) -> None:
         for row in self._tables.rows("RAD", "RSSI", "RemRSSI", "Noise", "RemNoise"):
             self._flight.radio.add(*row)
 
-    def _errors(self) -> None:
+    def _read_errors(self) -> None:
         for time, subsystem, code in self._tables.rows("ERR", "Subsys", "ECode"):
             kind, text = ERRORS.get(subsystem, ("general", f"subsystem {subsystem}"))
             if code:  # 0 means that the error is over

@@ -77,7 +77,7 @@ _BUFFER = 1 << 20
 
 
 def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Read the file of a flight, and fill the flight with its content.
+    """Fill a flight with the content of the file ``flight.path``. ``system_id`` is ignored: a .ulg has one vehicle.
 
     Raises:
         FileFormatError: the file is not a PX4 log.
@@ -172,9 +172,9 @@ class _Reader:
             if isinstance(value, (int, float)):
                 flight.set_parameter(self._time(time_us), str(name), float(value))
         self._read_status()
-        self._movement()
-        self._targets()
-        self._equipment()
+        self._read_movement()
+        self._read_targets()
+        self._read_equipment()
 
     def _time(self, time_us: int) -> float:
         """Return the seconds since the start of the log; 0 for earlier times."""
@@ -240,7 +240,7 @@ class _Reader:
                     FailsafeEvidence(time_s, "battery", f"battery {_BATTERY_WARNINGS[int(warning)]} (battery_warning)")
                 )
 
-    def _movement(self) -> None:
+    def _read_movement(self) -> None:
         """Read home, track, velocity, attitude and airspeed."""
         flight = self._flight
         home = self._topic("home_position")
@@ -256,18 +256,18 @@ class _Reader:
                 longitude[is_invalid] = NAN
             _extend(flight.track, position.times, latitude_deg=latitude, longitude_deg=longitude, altitude_amsl_m=amsl)
         else:
-            self._track_of_receiver()
+            self._read_receiver_track()
         local = self._topic("vehicle_local_position")
         if local is not None:
             north, east, down = local.array("vx"), local.array("vy"), local.array("vz")
             _extend(flight.velocity, local.times, north_m_s=north, east_m_s=east, down_m_s=down)
-        self._angles(flight.attitude, self._topic("vehicle_attitude"), "q")
+        self._add_angles(flight.attitude, self._topic("vehicle_attitude"), "q")
         air = self._topic("airspeed_validated")
         if air is not None:
             speed = air.array("calibrated_airspeed_m_s")
             _extend(flight.air, air.times, air_speed_m_s=speed)
 
-    def _track_of_receiver(self) -> None:
+    def _read_receiver_track(self) -> None:
         receiver = self._topic("vehicle_gps_position", "sensor_gps")
         if receiver is not None:
             has_integers = "lat" in receiver  # old versions of PX4 log 1e-7 degrees and millimetres
@@ -277,7 +277,7 @@ class _Reader:
                 if fix_type >= GpsFixType.TYPE_3D_FIX:
                     self._flight.track.add(time_s, latitude / per_degree, longitude / per_degree, amsl / per_metre, NAN)
 
-    def _angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:
+    def _add_angles(self, columns: TimeSeries, topic: _Topic | None, field: str) -> None:
         """Add the roll, pitch and yaw angles of the quaternions in a field."""
         if topic is None or f"{field}[0]" not in topic:
             return
@@ -289,10 +289,10 @@ class _Reader:
         angles = {"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
         _extend(columns, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
 
-    def _targets(self) -> None:
+    def _read_targets(self) -> None:
         """Read the set-points. PX4 logs positions in metres from the local origin."""
         flight = self._flight
-        self._angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
+        self._add_angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
         setpoint = self._topic("vehicle_local_position_setpoint")
         if setpoint is None:
             return
@@ -325,7 +325,7 @@ class _Reader:
                     origin = latitude, longitude, altitude
         return origin
 
-    def _equipment(self) -> None:
+    def _read_equipment(self) -> None:
         """Read batteries, GPS receivers, the estimator, vibration and links."""
         flight = self._flight
         for number, battery in self._topics("battery_status"):
@@ -368,9 +368,9 @@ class _Reader:
         if imu is not None:
             clips = sum(imu.array(f"accel_clipping[{axis}]") for axis in range(3))
             _extend(flight.vibration, imu.times, x_m_s2=imu.array("accel_vibration_metric"), clips=clips)
-        self._links()
+        self._read_links()
 
-    def _links(self) -> None:
+    def _read_links(self) -> None:
         """Read the loss of messages and the values of the telemetry radio."""
         # PX4 may have several links. The data of the link that received the most messages is used.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
@@ -402,7 +402,7 @@ def _version(log: Any) -> str:
 
 
 def utc_at_boot(log: Any) -> float:
-    """Return the UTC at which PX4 booted and its clock was 0; 0 if the log has no GNSS time."""
+    """Return the Unix time at which PX4 booted and its clock was 0; 0 if the log has no GNSS time."""
     for data in log.data_list:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():

@@ -47,7 +47,7 @@ class ClockComparison:
 
 
 class LinkCounter:
-    """Counts received and lost frames per second, by sequence numbers."""
+    """Counts the frames received and lost in each second. Gaps in the sequence numbers show the lost frames."""
 
     def __init__(self, flight: FlightLog) -> None:
         self._series, self._silences = flight.link, flight.silences
@@ -56,10 +56,11 @@ class LinkCounter:
         self._lost = 0
 
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
-        """Count received and lost frames. Called after a gap in the sequence and at the start of a second.
+        """Count received and lost frames, and return the start of the next second.
 
-        ``received`` frames arrived after the last call; the last of them has this time and sequence number. Return the
-        start of the next second. ``expected`` is the sequence number that would follow; negative for the first frame.
+        Called after a gap in the sequence numbers and at the start of a second. ``received`` frames have arrived since
+        the last call; the newest one has ``time_s`` and ``sequence``. ``expected`` is the sequence number that it would
+        have without a loss; negative for the first frame.
         """
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
@@ -90,7 +91,7 @@ class LinkCounter:
             self._series.add(ends_s, *_ALL_LOST)
 
     def _add_row(self, second: int) -> None:
-        """Add the row of the counted second, and count ``second`` from now on. No frames arrived between the two."""
+        """Add a row for the counted second, and start to count ``second``. No frames arrived in the seconds between."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
         if second - self._second > 1:  # the first and the last second without frames

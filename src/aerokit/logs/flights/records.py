@@ -138,7 +138,10 @@ class TlogReader(LogReader):
         return message
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
-        """Return a column for each field, in the standard's order and units. Arrays have a column for each element."""
+        """Return a column for each field, in the order and units of the message definition.
+
+        Arrays have a column for each element, except texts and arrays of bytes, which have one.
+        """
         assert entry.message is not None
         columns = []
         for field in entry.message.FIELDS:

@@ -65,7 +65,7 @@ class RecordedMission:
                 self._read_file()
 
     def _read_file(self) -> None:
-        """Replace the mission by the items of the file, as soon as the file is complete."""
+        """Once the file is complete, replace the mission by its items, or only some items (NO_CLEAR)."""
         if len(self._file) < HEADER.size:
             return
         try:

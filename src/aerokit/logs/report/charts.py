@@ -78,7 +78,7 @@ def series_colour(number: int) -> str:
 
 
 def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float], list[float | None]]:
-    """Return the times and values of a column to draw. The value None interrupts the line."""
+    """Return the times and values to draw for a column. The value None interrupts the line."""
     values, times = columns[name], columns.times
     rows = rows_to_draw(values)
     return (
@@ -213,14 +213,14 @@ def simplification_note(deviation_m: float) -> list[Part]:
 
 
 def drawn_track(
-    places: Sequence[tuple[float, float]], max_points: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
+    places: Sequence[tuple[float, float]], max_rows: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
     """Return the rows of a track to draw, including ``keep``, and the largest distance of any row from the line."""
     if len(places) <= MAX_POINTS:  # short lines are drawn completely
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
         rows = list(range(len(places))) if has_known else []
         return rows, 0.0
-    rows, deviation_m = simplify(places, max_points, _TRACK_TOLERANCE_M, keep)
+    rows, deviation_m = simplify(places, max_rows, _TRACK_TOLERANCE_M, keep)
     if deviation_m:
         deviation_m = math.ceil((deviation_m + _ROUNDING_M) * 100) / 100  # an upper bound, in whole centimetres
     return rows, deviation_m

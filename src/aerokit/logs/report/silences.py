@@ -41,7 +41,7 @@ def silence_sentences(flight: FlightLog) -> list[str]:
 
 
 def _pauses(pauses: list[Silence]) -> list[str]:
-    """Return a sentence about times without any message. In these times, the recording itself may have paused."""
+    """Return a list with one sentence about the times without any message; an empty list if there are none."""
     if not pauses:
         return []
     longest = max(pauses, key=lambda pause: pause.ends_s - pause.begins_s)

@@ -24,8 +24,8 @@ def simplify(
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. The
-            ends of gaps, the points of ``keep`` and about one point in a thousand are always selected.
+        max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. Only
+            the ends of gaps, the points of ``keep`` and about one point in a thousand are selected beyond it.
         tolerance: maximum distance of an omitted point from the line through the selected points.
         keep: indices that are always selected.
 

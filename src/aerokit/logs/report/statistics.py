@@ -126,7 +126,10 @@ def metres_from_home(flight: FlightLog) -> list[tuple[float, float]]:
 
 
 def time_in_modes(flight: FlightLog) -> dict[str, float]:
-    """Return how many seconds the vehicle was armed in each mode, in the order of first use."""
+    """Return how many seconds the vehicle was armed in each mode, in the order of first use.
+
+    If it was never armed, the times in the whole log are returned.
+    """
     seconds_by_mode: dict[str, float] = {}
     for change, end in flight.mode_spans():
         for armed_from, armed_to in flight.armed or [(0.0, flight.duration_s)]:
@@ -178,7 +181,7 @@ def _max(values: list[float]) -> float | None:
 
 
 def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> float:
-    """Return the length in metres of the track's parts in these rows, without steps that are noise."""
+    """Return the length in metres of the track's parts in these rows. Steps below `_MIN_STEP_M` are noise."""
     length_m = 0.0
     counted: tuple[float, float] | None = None  # the end of the last step that `length_m` includes
     previous_row = None
@@ -328,7 +331,7 @@ def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float)
 
 
 def fall_text(fall: Fall) -> str:
-    """Describe a fall: ``Fall: from 28.7 m, 16.9 m/s at the ground, at 0:24.9; disarmed in the air``."""
+    """Describe a fall: ``Fall: from 28.7 m, 16.9 m/s at the ground, at 0:24.9 (descent since 0:21.3); REASON``."""
     end = "at the ground" if fall.has_impact else "when the log ends"
     text = (
         f"{fall.title}: from {fall.height_m:.1f} m, {fall.sink_m_s:.1f} m/s {end}, at {clock(fall.time_s)}"

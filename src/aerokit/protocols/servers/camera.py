@@ -67,7 +67,7 @@ def _information(camera: CameraDevice) -> m.CameraInformation:
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
-    """Return the images that a request selects, or the last image for a stream.
+    """Return the images that a request selects, or the last image if ``command`` is None (periodic messages).
 
     Param 2 is the first index (-1: all images), param 3 the last index (0: only the first image, -1: to the end).
     """

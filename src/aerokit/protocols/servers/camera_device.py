@@ -157,7 +157,7 @@ class CameraDevice:
 
 
 class Captures:
-    """Series of images, videos, and the image log.
+    """Takes single images and series, records videos, and keeps the image log.
 
     The next image begins when the device has finished the previous image.
     """

@@ -194,7 +194,7 @@ class FileTree:
         self._root: _Folder = {}
 
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
-        """Create or replace a file and its folders. A function as content is called when the file is first read."""
+        """Create or replace a file, and create its folders. A function as content is called at the first access."""
         folder = self._root
         *parents, name = _parts(path)
         for parent in parents:
@@ -273,7 +273,7 @@ class FileTree:
         del folder[name]
 
     def rename(self, path: str, to: str) -> None:
-        """Move a file or folder; replaces an existing file."""
+        """Move a file or folder. A file replaces an existing file, a folder an empty folder."""
         node = self._find(path)
         folder, name = self._parent(to)
         existing = folder.get(name)

@@ -252,7 +252,10 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
-        """Apply the angles; if one of them is NaN, apply the rates. Return False if a rate is NaN, too."""
+        """Retract the gimbal if ``flags`` say so. Otherwise apply the angles or, if one of them is NaN, the rates.
+
+        Return False if a rate is NaN, too.
+        """
         gimbal = self._gimbal
         locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
         if flags & (Flags.RETRACT | Flags.NEUTRAL):

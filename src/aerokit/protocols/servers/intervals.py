@@ -47,7 +47,7 @@ class MessageStreams:
         self._streams.clear()
 
     def stream(self, message_id: int, interval_s: float, channel: Channel = None) -> bool:
-        """Stream messages with this id on one channel (None: on all channels). An interval of 0 stops the stream.
+        """Stream messages with this id on one channel (None: on all channels). An interval of 0 or less stops that.
 
         Return False if there are too many streams already.
         """

@@ -337,7 +337,7 @@ class MissionServer:
             self._finish(upload)
 
     def _finish(self, upload: ListUpload) -> None:
-        """Handle the arrival of the last item."""
+        """Validate the complete list, store it if it is accepted, and end the upload."""
         upload.is_being_validated = True
 
         def answer(result: int) -> None:
@@ -352,7 +352,7 @@ class MissionServer:
             answer(_Result.INVALID)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End the client's own upload. At the end of a download there is nothing to do."""
+        """Drop an upload that its client cancels. The ACCEPTED at the end of a download is ignored."""
         upload = self._uploads.get(self._key(ack.mission_type))
         if (
             upload is not None

@@ -27,7 +27,7 @@ class NamedList(Protocol):
 
 
 class ParameterLists:
-    """Sends lists of ``list_rate_hz`` parameters per second, in groups of ``burst``. A new request restarts a list."""
+    """Sends lists of parameters: ``list_rate_hz`` a second, in groups of ``burst``. A new request restarts a list."""
 
     burst: int = 5
     starts_at_once: bool = False
