@@ -104,7 +104,7 @@ class _Signing(Signing):
 class ReceivedCorrections:
     """Assembles the fragments of RTCM messages as ArduPilot does (AP_GPS.cpp, handle_gps_rtcm_fragment).
 
-    ``messages`` contains the last 1000 assembled messages. ``is_recent`` is True if the latest one is recent.
+    ``messages`` contains the last 1000 assembled messages. ``is_recent`` is True if the latest is less than 5 s old.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:

@@ -379,7 +379,7 @@ class Motion:
         self.pitch_rate = pitch_step / dt
 
     def _turn(self, dt: float, *, powered: bool) -> None:
-        """Turn by ``dt`` seconds to the wanted heading, or with the wanted turn rate."""
+        """Turn for ``dt`` seconds, towards the wanted heading or at the wanted turn rate."""
         rate = 0.0
         if powered and not self.is_on_ground:
             rate = self._wanted_yaw_rate

@@ -208,7 +208,7 @@ class Px4ParameterServer(ParameterServer):
             self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
 
     def _error_for(self, name: str, type_: int) -> int | None:
-        """Return the MAV_PARAM_ERROR of a wrong PARAM_SET; None if it is right."""
+        """Return the MAV_PARAM_ERROR of an invalid PARAM_SET; None if it is valid."""
         if name == HASH_NAME:
             return MavParamError.READ_ONLY
         if name not in self._parameters:

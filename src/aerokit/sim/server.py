@@ -203,7 +203,7 @@ class SimulatorServer:
         self._schedule()
 
     def _step(self, now: float) -> None:
-        """Advance the vehicles that have an event until ``now``."""
+        """Advance the vehicles whose next event is due to the time ``now``."""
         dues = self._dues
         for number, due in enumerate(dues):
             if due <= now:

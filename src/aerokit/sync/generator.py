@@ -406,7 +406,7 @@ def _by_kind(name: str) -> tuple[bool, bool, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m aerokit.sync.generator")
-    parser.add_argument("--check", action="store_true", help="compare with the committed file, write nothing")
+    parser.add_argument("--check", action="store_true", help="compare with the committed files, write nothing")
     is_check = parser.parse_args(arguments).check
     exit_code = 0
     for name, file in FILES.items():

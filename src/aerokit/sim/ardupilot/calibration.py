@@ -60,8 +60,8 @@ class AccelerometerCalibration:
         """Continue after a position was measured: request the next one, or end the calibration."""
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
-        has_earlier_position = position != AccelcalVehiclePos.LEVEL  # LEVEL is the first position.
-        if self.is_held_wrong and has_earlier_position:
+        is_first_position = position == AccelcalVehiclePos.LEVEL
+        if self.is_held_wrong and not is_first_position:  # A wrong pose is only noticed from the second position on.
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
@@ -73,7 +73,7 @@ class AccelerometerCalibration:
         self._request(self._run_number, result)
 
     def _request(self, run_number: int, position: int) -> None:
-        """Request a position every second, until the client confirms the position or another calibration starts."""
+        """Request a position every second, until the client confirms it, or the calibration is reset or restarted."""
         self._requested = position
 
         def request_until_confirmed() -> None:
@@ -103,7 +103,7 @@ class CompassCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turning_time_s: float = 30.0
-        self._compass_mask = 0  # bit for each compass whose calibration was started and is not over; 0 if none
+        self._compass_mask = 0  # one bit for each compass in the calibration, until its result is accepted or cancelled
         self._started_at = math.inf  # infinite before the start
         self._saves_at_once = False  # True if the result needs no DO_ACCEPT_MAG_CAL
         self._progress_compass = 0  # compass of the last progress message
@@ -177,7 +177,7 @@ class CompassCalibration:
         )  # fmt: skip
 
     def report(self) -> m.MagCalReport | None:
-        """Return the results of the compasses in turn, after a calibration, until they are accepted or cancelled."""
+        """Return the result of one compass, each compass in turn; None if no result waits to be accepted."""
         if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
@@ -250,7 +250,10 @@ class Calibrations:
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
-        """Calibrate the accelerometers, or accept the present values, as parameter 5 (``command.x``) says."""
+        """Calibrate the accelerometers as param 5 (``command.x``) selects.
+
+        Param 5 or 2 can instead accept the present calibration of the accelerometers or the compasses.
+        """
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")

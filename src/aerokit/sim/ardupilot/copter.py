@@ -167,7 +167,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 class SimulatedCopter(CopterHost):
     """ArduCopter, as far as a client can observe it. `Motion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters. MNT1_TYPE 1 fits a gimbal with three axes.
+    Takes the arguments of `ArduPilotVehicle`. The copter has 1,349 parameters. MNT1_TYPE 1 fits a 3-axis gimbal.
 
     Not simulated: braking before a fence, the terrain failsafe.
     """
@@ -231,7 +231,7 @@ class SimulatedCopter(CopterHost):
         return flags
 
     def move(self, dt: float) -> None:
-        """Move by ``dt`` seconds, and detect the landing."""
+        """Move for ``dt`` seconds, and detect the landing."""
         motion = self.motion
         was_on_ground = motion.is_on_ground
         motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)

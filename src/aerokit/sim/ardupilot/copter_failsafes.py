@@ -16,7 +16,7 @@ _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """ArduCopter's arming checks. Only modes that use a position require it; the throttle must be low or centred."""
+    """ArduCopter's arming checks. Only modes that use a position require one; the throttle must be low or centred."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
@@ -123,7 +123,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self.vehicle.fence.update()
 
     def _check_radio(self) -> None:
-        """Detect a radio whose pulses are missing for RC_FS_TIMEOUT, or whose throttle is below FS_THR_VALUE."""
+        """Detect the loss of the radio (no pulses for RC_FS_TIMEOUT, or throttle below FS_THR_VALUE) and its return."""
         copter, parameters = self.vehicle, self.vehicle.parameters
         is_receiving = copter.rc.is_receiving
         if is_receiving:
@@ -185,7 +185,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         """Report the loss of the link ``name`` and return the action to execute.
 
         This is ``action``, unless the copter disarms on the ground, continues a landing, or one of ``options`` lets
-        the present mode continue.
+        the present mode continue. Each option is (names of modes, bit of FS_OPTIONS, status text).
         """
         mode = self.vehicle.mode
         if self._disarm_if_landed(name):
@@ -314,7 +314,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION in the air, or disarm on the ground."""
+        """Execute FENCE_ACTION in the air. On the ground, disarm, unless FENCE_ACTION only reports."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if vehicle.is_landed:

@@ -233,7 +233,7 @@ class ArduPilotFence(Generic[HostT]):
             self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
-        """Enable or disable the fence when its parameters have changed."""
+        """Enable or disable the fence if its parameters have changed. Clear breaches of kinds no longer configured."""
         enable = int(self.vehicle.parameters["FENCE_ENABLE"])
         auto_enable = int(self._value("FENCE_AUTOENABLE"))
         if (enable, auto_enable) != self._enabling_parameters:

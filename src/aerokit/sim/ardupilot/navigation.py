@@ -47,8 +47,8 @@ class ArduPilotNavigation:
         """Schedule the events of the boot timeline."""
         timeline, call_later = self._vehicle.timeline, self._vehicle.call_later
         # The estimator reports its flags as uninitialised for the second half of its start.
-        unaligned_at = timeline.ready + 0.5 * (timeline.estimator_active - timeline.ready)
-        call_later(unaligned_at, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
+        uninitialized_at = timeline.ready + 0.5 * (timeline.estimator_active - timeline.ready)
+        call_later(uninitialized_at, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
         call_later(timeline.estimator_active, self._activate)
         call_later(timeline.tilt_aligned, lambda: self._report_cores("tilt alignment complete"))
         call_later(timeline.yaw_aligned, self._align)
@@ -203,7 +203,7 @@ class ArduPilotNavigation:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
-        """React to a lost GPS, and use a returned one again."""
+        """Detect the loss of GPS, and use GPS again after its return."""
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:

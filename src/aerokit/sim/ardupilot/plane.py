@@ -160,7 +160,7 @@ class SimulatedPlane(PlaneHost):
         return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
 
     def move(self, dt: float) -> None:
-        """Move by ``dt`` seconds. A plane that rests for a while counts as landed."""
+        """Move for ``dt`` seconds. A plane that rests for a while counts as landed."""
         wing = self.wing
         was_on_ground = wing.is_on_ground
         wing.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)

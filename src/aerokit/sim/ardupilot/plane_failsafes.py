@@ -222,7 +222,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.warn(text, MavSeverity.INFO)
 
     def _land_by_mission(self) -> bool:
-        """Start the landing sequence of the mission. Return False if the mission has no DO_LAND_START."""
+        """Start the landing sequence of the mission. Return False without a DO_LAND_START, or if AUTO is refused."""
         plane = self.vehicle
         items = enumerate(plane.missions.commands.items())
         land_start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)

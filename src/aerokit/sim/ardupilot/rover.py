@@ -25,7 +25,7 @@ _NEEDS_LOCATION = 1
 
 
 class RoverArming(ArduPilotArming[RoverHost]):
-    """ArduRover's arming checks. Only modes that use a position require it, unless ARMING_NEED_LOC is set."""
+    """ArduRover's arming checks. Only modes that use a position require one, unless ARMING_NEED_LOC is set."""
 
     def ahrs_reasons(self) -> Sequence[str]:
         return ()  # `position_reasons` includes these checks, because ArduRover runs them after the GPS checks.
@@ -289,9 +289,9 @@ _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
 class SimulatedRover(RoverHost):
     """ArduRover, as far as a client can observe it. `GroundMotion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It has 1,235 parameters. Simulated modes: MANUAL, ACRO, STEERING and
-    SIMPLE (driven by the sticks), HOLD, LOITER and CIRCLE (which only stop), AUTO, GUIDED, RTL and SMART_RTL. Commands
-    to take off and land are UNSUPPORTED.
+    Takes the arguments of `ArduPilotVehicle`. The rover has 1,235 parameters. Simulated modes: MANUAL, ACRO, STEERING
+    and SIMPLE (driven by the sticks), HOLD, LOITER and CIRCLE (which only stop), AUTO, GUIDED, RTL and SMART_RTL.
+    Commands to take off and land are UNSUPPORTED.
 
     Not simulated: boats, driving in circles, braking before a fence.
     """

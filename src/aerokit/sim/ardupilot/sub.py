@@ -248,11 +248,12 @@ _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavMod
 class SimulatedSub(SubHost):
     """ArduSub, as far as a client can observe it. `UnderwaterMotion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. ``home`` is at the surface, so altitudes above home are negative. It has
-    1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the sticks), GUIDED,
-    AUTO and SURFACE. A mode that needs no position can be armed without a position. Take-off is UNSUPPORTED.
+    Takes the arguments of `ArduPilotVehicle`. ``home`` is at the surface, so altitudes above home are negative. The
+    vehicle has 1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the
+    sticks), GUIDED, AUTO and SURFACE. A mode that needs no position can be armed without a position. Take-off is
+    UNSUPPORTED.
 
-    Not simulated: currents, CIRCLE, SURFTRAK and MOTORDETECT. These modes behave like ALT_HOLD. A reboot moves the
+    Not simulated: currents, and CIRCLE, SURFTRAK and MOTORDETECT, which behave like ALT_HOLD. A reboot moves the
     vehicle to the surface.
     """
 

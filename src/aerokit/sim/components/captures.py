@@ -102,7 +102,7 @@ class Axis:
 
 
 class Lens:
-    """Zoom (up to ten times) and focus of a camera. Automatic focus sets the focus to 50 percent."""
+    """Zoom (up to 10x) and focus of a camera. Automatic focus sets the focus to 50 percent."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self.zoom: Axis = Axis(now)

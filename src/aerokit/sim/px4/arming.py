@@ -63,8 +63,9 @@ class Px4Calibration:
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
+            # PX4 refuses other requests without cancelling (calibration_routines.cpp, calibrate_cancel_check).
             self._cancel()
-            is_cancellation = sensor == ""  # A command without a sensor cancels the calibration.
+            is_cancellation = sensor == ""
             return MavResult.ACCEPTED if is_cancellation else MavResult.TEMPORARILY_REJECTED
         if sensor in _AUTOMATIC_CALIBRATIONS:
             self._start(sensor)

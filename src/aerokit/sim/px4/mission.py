@@ -168,7 +168,7 @@ class Px4Mission:
 
     @property
     def state(self) -> int:
-        """MISSION_STATE. While the mission is not flown, the state does not change until an item was reached."""
+        """MISSION_STATE. Outside mission mode, it is kept if no item was reached and ``current`` is above 0."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -274,7 +274,7 @@ class Px4Mission:
             self._px4.info("Returning to launch")
 
     def _index_after_jump(self, item: MissionItem) -> int:
-        """Return the index of the item after a DO_JUMP. PX4 counts its jumps, and sends the item to the last client."""
+        """Return the index of the item after a DO_JUMP. PX4 counts the jumps, and sends the item to the last client."""
         index = self.current
         jumps_done = self._jumps.get(index, 0)
         if jumps_done >= item.param2:

@@ -236,7 +236,7 @@ class Px4MissionServer(MissionServer):
             self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End a download, or cancel an upload. UNSUPPORTED changes the kind of the requests of an upload."""
+        """End a download, or cancel an upload. On UNSUPPORTED, an upload goes on with the other request message."""
         link = self._link(channel)
         if sender_of(ack) != link.client:
             self._warn("REJ. WP CMD: partner id mismatch")

@@ -59,7 +59,7 @@ class Px4Gimbal:
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:
-        """Called at power-on. Centre the gimbal and release its control."""
+        """Centre the gimbal and release control of it. Called at power-on."""
         parameters = self._px4.parameters
         self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
         self.rest()
@@ -107,7 +107,7 @@ class Px4Gimbal:
         return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Turn to angles (NaN keeps the present ones), and then at rates. The flag RETRACT has no effect."""
+        """Set the angles (NaN keeps the present ones) and the rates at which they change. RETRACT changes nothing."""
         if flags & Flags.RETRACT:
             return
         current = self.angles()
@@ -244,7 +244,7 @@ _GEOTAG_DELAY_S = 0.02
 
 
 class Px4CameraTrigger:
-    """Camera trigger. Each image sends CAMERA_TRIGGER and, with ``sends_image_captured``, CAMERA_IMAGE_CAPTURED.
+    """Camera trigger. Sends CAMERA_TRIGGER for each image, and CAMERA_IMAGE_CAPTURED if ``sends_image_captured``.
 
     As on the real vehicle, commands to a disabled trigger are not answered.
     """
