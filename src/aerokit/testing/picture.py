@@ -19,7 +19,7 @@ from aerokit.testing.track_points import TrackFailure, TrackPoint, metres_from
 
 __all__ = ["check_picture", "draw_svg", "save_picture"]
 
-_COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
+_PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
 _GREY = "#dddddd"
 # Sizes and distances are in pixels.
 _WIDTH = 800
@@ -333,7 +333,7 @@ def _legend(tracks: Sequence[Drawable]) -> list[_Shape]:
 
 
 def _colours(count: int) -> list[str]:
-    return [_COLOURS[number % len(_COLOURS)] for number in range(count)]
+    return [_PALETTE[number % len(_PALETTE)] for number in range(count)]
 
 
 def _with_margin(values: Sequence[float]) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from aerokit.mavlink.enums import (
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, to_int
 
-_SAMPLE_S, _REPEAT_INTERVAL_S = 1.3, 1.0
+_MEASUREMENT_TIME_S, _REPEAT_INTERVAL_S = 1.3, 1.0
 _LAST = AccelcalVehiclePos.BACK
 
 
@@ -53,7 +53,7 @@ class AccelerometerCalibration:
             return MavResult.FAILED
         self._requested = None
         run_number, position = self._run_number, to_int(command.param1)
-        self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run_number, position))
+        self._vehicle.call_later(_MEASUREMENT_TIME_S, lambda: self._on_sample(run_number, position))
         return MavResult.ACCEPTED
 
     def _on_sample(self, run_number: int, position: int) -> None:
@@ -88,7 +88,7 @@ class AccelerometerCalibration:
 
 
 _COMPASSES, _ALL_COMPASSES = 3, 0b111
-_SETTLING_S = 1.0
+_SETTLING_TIME_S = 1.0
 _FITNESS = 5.0
 
 
@@ -122,7 +122,7 @@ class CompassCalibration:
     def percent(self) -> int:
         if not self._compass_mask:
             return 0
-        seconds = self._vehicle.now - self._started_at - _SETTLING_S
+        seconds = self._vehicle.now - self._started_at - _SETTLING_TIME_S
         return max(0, min(100, int(100.0 * seconds / self.turning_time_s)))
 
     @property
@@ -191,12 +191,12 @@ class CompassCalibration:
         )
 
     def _next_compass(self, compass: int) -> int:
-        """Return the next compass after this one that is being calibrated. After the last compass follows the first."""
+        """Return the compass that follows ``compass`` in the calibration. The first compass follows the last."""
         candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
         return next(number for number in candidates if self._compass_mask & 1 << number)
 
 
-_GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
+_GYRO_CALIBRATION_S, _TRIM_CALIBRATION_S, _ACCELEROMETER_CALIBRATION_S = 0.5, 1.0, 1.0
 _MIN_ACCELEROMETERS_INTERVAL_S = 5.0
 # A param with this value accepts the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
 _ACCEPTS_PRESENT_CALIBRATION = 76
@@ -242,7 +242,9 @@ class Calibrations:
         is_barometer_requested = command.param3 == 1.0
         if is_gyro_requested:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress(percents=(), interval_s=_GYROS_S)  # Without percentages, only the result is sent.
+            return CommandProgress(
+                percents=(), interval_s=_GYRO_CALIBRATION_S
+            )  # Without percentages, only the result is sent.
         if is_barometer_requested:
             vehicle.info("Updating barometer calibration")
             vehicle.info("Barometer calibration complete")
@@ -258,17 +260,17 @@ class Calibrations:
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
             # The gyros are calibrated first. Then the vehicle requests the first of the six positions.
-            return CommandProgress(percents=(), interval_s=_GYROS_S, finish=self.accelerometers.start)
+            return CommandProgress(percents=(), interval_s=_GYRO_CALIBRATION_S, finish=self.accelerometers.start)
         if command.x == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
-            return CommandProgress(percents=(), interval_s=_TRIM_S, finish=lambda: vehicle.info(text))
+            return CommandProgress(percents=(), interval_s=_TRIM_CALIBRATION_S, finish=lambda: vehicle.info(text))
         if command.x == _Accelerometers.SIMPLE:
             if vehicle.now - self._simple_calibration_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED
             self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress(percents=(), interval_s=_ACCELEROMETERS_S)
+            return CommandProgress(percents=(), interval_s=_ACCELEROMETER_CALIBRATION_S)
         keeps_accelerometers = command.x == _ACCEPTS_PRESENT_CALIBRATION
         keeps_compasses = command.param2 == _ACCEPTS_PRESENT_CALIBRATION
         return MavResult.ACCEPTED if keeps_accelerometers or keeps_compasses else MavResult.UNSUPPORTED

@@ -10,7 +10,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import ReceivedCommand, to_int
 
-_PERIOD_S, _SHUTTER_S = 0.02, 0.1
+_PERIOD_S, _DEFAULT_SHUTTER_S = 0.02, 0.1
 _IDLE, _INTERVAL_SET = 0, 2
 _UNLIMITED = -1
 
@@ -46,7 +46,7 @@ class ArduPilotCamera:
 
     @property
     def _shutter_s(self) -> float:
-        return self._vehicle.parameters.get("CAM1_DURATION", _SHUTTER_S)
+        return self._vehicle.parameters.get("CAM1_DURATION", _DEFAULT_SHUTTER_S)
 
     def take(self) -> bool:
         """Take an image and return True. Return False if there is no camera or its shutter is still open."""

@@ -73,11 +73,11 @@ _MODES: dict[int, tuple[int, ...]] = {
     _LOITER_OR_HOLD: (RoverMode.LOITER, RoverMode.HOLD),
 }
 _RADIO, _GCS = "Radio", "GCS"
-_SILENT_S = 0.5
+_RADIO_TIMEOUT_S = 0.5
 _CONTINUE_MISSION = 2
 _ACTIVE_IN_HOLD = 1
 _EKF_REPORT_ONLY = 2
-_ESTIMATOR_TIMEOUT_S, _STUCK_S, _STUCK_M_S = 1.0, 2.0, 0.08
+_ESTIMATOR_TIMEOUT_S, _STUCK_TIMEOUT_S, _MAX_STUCK_SPEED_M_S = 1.0, 2.0, 0.08
 _HOLD_AND_DISARM = 2
 _DRIVES_ITSELF = frozenset(
     {RoverMode.AUTO, RoverMode.GUIDED, RoverMode.RTL, RoverMode.SMART_RTL, RoverMode.LOITER, RoverMode.CIRCLE}
@@ -124,7 +124,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.is_radio_lost = False
             return
         is_throttle_low = rover.rc[RC_THROTTLE] < parameters["FS_THR_VALUE"]
-        self.is_radio_lost: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
+        self.is_radio_lost: bool = is_throttle_low or rover.now - self.radio_received_at > _RADIO_TIMEOUT_S
         self._update_link(_RADIO, is_lost=self.is_radio_lost)
 
     def _check_ground_station(self) -> None:
@@ -195,8 +195,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
         # The simulation has no obstacles: only a failed motor keeps the rover from driving.
         is_blocked = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
-        is_stuck = bool(action) and is_blocked and rover.motion.ground_speed_m_s < _STUCK_M_S
-        if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_S:
+        is_stuck = bool(action) and is_blocked and rover.motion.ground_speed_m_s < _MAX_STUCK_SPEED_M_S
+        if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_TIMEOUT_S:
             self._stuck.reset()
             self.warn("Crash: Going to HOLD", MavSeverity.EMERGENCY)
             rover.set_mode(RoverMode.HOLD)

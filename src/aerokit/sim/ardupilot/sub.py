@@ -62,7 +62,7 @@ _BATTERY_DISARM, _BATTERY_SURFACE = 2, 3
 _PILOT_DISARM, _LEAK_SURFACE, _RADIO_SURFACE = 2, 2, 2
 _GCS_REPORT_INTERVAL_S, _LEAK_REPORT_INTERVAL_S, _HULL_REPORT_INTERVAL_S = 30.0, 20.0, 30.0
 _HULL_TIMEOUT_S = 2.0
-_SILENT_S = 1.0
+_RADIO_TIMEOUT_S = 1.0
 _STICKS, _STICK_MIDDLE = 6, 1500
 
 
@@ -102,10 +102,10 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         if is_receiving:
             self.radio_received_at: float = sub.now
         is_throttle_low = is_receiving and sub.rc[RC_THROTTLE] < sub.parameters["FS_THR_VALUE"]
-        is_lost = is_throttle_low or sub.now - self.radio_received_at >= _SILENT_S
+        is_lost = is_throttle_low or sub.now - self.radio_received_at >= _RADIO_TIMEOUT_S
         if not enabled:
             is_lost = False
-        elif not is_receiving and not is_lost:  # A silence below `_SILENT_S` changes nothing.
+        elif not is_receiving and not is_lost:  # A silence below `_RADIO_TIMEOUT_S` changes nothing.
             return
         if is_lost == self.is_radio_lost:
             return

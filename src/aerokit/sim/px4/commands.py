@@ -41,7 +41,7 @@ _UNANSWERED = (
 
 _GRIP_DURATION_S = 1.3
 _TUNING_STEP_S, _TUNING_PROGRESS = 2.0, (0, 20, 40, 60, 80, 95)
-_TRANSITION_S = 4.0
+_TRANSITION_DURATION_S = 4.0
 _NO_TRANSITION = frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
@@ -322,7 +322,7 @@ class _Flight:
         is_forward = requested_state == MavVtolState.FW
         if px4.vtol_state != requested_state:
             px4.vtol_state = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
-            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", requested_state))
+            px4.call_later(_TRANSITION_DURATION_S, lambda: setattr(px4, "vtol_state", requested_state))
         return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:

@@ -87,6 +87,7 @@ class Px4Gimbal:
         """Return roll, pitch and yaw (radians) to which the gimbal is set at present."""
         if self._place is not None:
             return self._angles_to(self._place)
+        # The gimbal turns at only `_RATE_FACTOR` of the commanded rates, for at most `_RATE_TIMEOUT_S`.
         seconds = min(self._px4.now - self._target_at, _RATE_TIMEOUT_S) * _RATE_FACTOR
         angles = [angle + rate * seconds for angle, rate in zip(self._target, self._rates, strict=True)]
         roll, pitch, yaw = (
