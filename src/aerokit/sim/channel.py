@@ -126,7 +126,7 @@ class Streams:
         self._group_count = 0
 
     def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
-        """Stream a message every ``interval_s`` seconds from now on. 0 stops the stream."""
+        """Stream a message every ``interval_s`` seconds from the time ``now`` on. 0 stops the stream."""
         previous = self._groups.pop(message_id, None)
         if previous is not None:
             previous.ids.remove(message_id)
@@ -136,7 +136,7 @@ class Streams:
         self._update_next_due()
 
     def _group_starting_now(self, interval_s: float, now: float) -> _StreamGroup:
-        """Return the group of streams that start now with this interval. Create it if it does not exist yet."""
+        """Return the group of streams that start at ``now`` with this interval. Create it if it does not exist yet."""
         for group in self._groups.values():
             if group.start == now and group.interval_s == interval_s and group.count == 0:
                 return group

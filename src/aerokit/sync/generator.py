@@ -269,7 +269,7 @@ class Page:
     def _render_context_manager(
         self, node: ast.FunctionDef | ast.AsyncFunctionDef, member: ClassMember, arguments: Sequence[str]
     ) -> str:
-        """Return the source for a method that is a generator in a ``contextmanager`` decorator."""
+        """Return the source of the twin of a method that ``contextmanager`` decorates."""
         self.for_types.add(("contextlib", "AbstractContextManager"))
         yielded = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
         returns = ast.Subscript(ast.Name("AbstractContextManager"), yielded)

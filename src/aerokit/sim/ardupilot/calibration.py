@@ -242,9 +242,8 @@ class Calibrations:
         is_barometer_requested = command.param3 == 1.0
         if is_gyro_requested:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress(
-                percents=(), interval_s=_GYRO_CALIBRATION_S
-            )  # Without percentages, only the result is sent.
+            # Without percentages, only the result is sent.
+            return CommandProgress(percents=(), interval_s=_GYRO_CALIBRATION_S)
         if is_barometer_requested:
             vehicle.info("Updating barometer calibration")
             vehicle.info("Barometer calibration complete")

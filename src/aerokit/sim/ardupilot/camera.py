@@ -61,7 +61,7 @@ class ArduPilotCamera:
         return True
 
     def take_series(self, interval_s: float, count: int) -> bool:
-        """Take ``count`` images (-1: until `stop`) at an interval, the first at once. Return False without a camera."""
+        """Take ``count`` images (-1: until `stop`), the first one at once. Return False without a camera."""
         if not self.is_fitted:
             return False
         self.interval_s = interval_s

@@ -256,16 +256,16 @@ class CopterAuto(MissionMode):
         return True
 
     def on_mission_started(self) -> None:
-        self._check_upcoming()  # records the commands that the next call compares
+        self._update_upcoming()  # records the commands that the next call compares
 
     def update(self, dt: float) -> None:
         """Continue the mission, and fly the leg of the current command for ``dt`` seconds."""
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
+            if self._update_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
                 self._restart_command()
             self.vehicle.mission.update()
-            self._check_upcoming()  # `mission.update` may have started the next command
+            self._update_upcoming()  # `mission.update` may have started the next command
         if self.vehicle.mode is not self:  # The mission has changed the mode.
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)  # A take-off or landing cannot be paused.
@@ -276,7 +276,7 @@ class CopterAuto(MissionMode):
         if not is_stopped:
             self.vehicle.yaw.update()
 
-    def _check_upcoming(self) -> bool:
+    def _update_upcoming(self) -> bool:
         """Record the current and the next commands. Return True if an upload, not the progress, has changed them."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0].seq == run.nav_index
@@ -417,7 +417,7 @@ class CopterAuto(MissionMode):
         self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
 
     def _land(self, item: MissionItem) -> None:
-        """Start a landing, at the place of the command or at the present one."""
+        """Start a landing at the place of the command or, if its coordinates are 0, at the present place."""
         self.vehicle.yaw.hold()
         if (item.x, item.y) == (0, 0):
             self._leg = _DescendLeg(self.vehicle)

@@ -113,11 +113,11 @@ class ArduPilotGimbal:
             roll, pitch, yaw = (self.setting(f"MNT1_{mode_name}_{axis}") for axis in "XYZ")
             return MountTarget(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
-            return self._angles_to(self._region)
+            return self._update_target_for(self._region)
         if self.mode == MavMountMode.SYSID_TARGET:
-            return self._angles_to(self._followed_place)
+            return self._update_target_for(self._followed_place)
         if self.mode == MavMountMode.HOME_LOCATION:
-            return self._angles_to(self._vehicle.navigation.home)
+            return self._update_target_for(self._vehicle.navigation.home)
         return self._moved_by_rates(self._target)
 
     def _moved_by_rates(self, target: MountTarget) -> MountTarget:
@@ -132,7 +132,7 @@ class ArduPilotGimbal:
         yaw = math.remainder(yaw, 360.0) if target.is_from_north else self._limited("YAW", yaw)
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
-    def _angles_to(self, place: Ned | None) -> MountTarget:
+    def _update_target_for(self, place: Ned | None) -> MountTarget:
         """Set the target to the angles to a place, if this place and the vehicle's are known. Return the target."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:

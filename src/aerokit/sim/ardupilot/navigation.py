@@ -318,7 +318,7 @@ class SmartPath:
         self._cleaned_count = len(self._points)
 
     def update(self) -> None:
-        """Record the current position if it is far enough from the last point."""
+        """Start the path or add the current position to it. Deactivate the path after 15 s in which this fails."""
         vehicle = self._vehicle
         if not self.is_active:
             if not self._is_started and vehicle.navigation.has_position:

@@ -31,7 +31,7 @@ class RoverArming(ArduPilotArming[RoverHost]):
         return ()  # `position_reasons` includes these checks, because ArduRover runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
-        """Return the failures of the checks of GPS, then of the estimator and its position."""
+        """Return the failures of the GPS checks or, if there are none, those of the estimator checks."""
         rover = self.vehicle
         if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
             return ()
@@ -112,7 +112,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         self._check_radio()
         self._check_ground_station()
         self._check_estimator()
-        self._check_wheels()
+        self._check_crash()
         super().update()
 
     def _check_radio(self) -> None:
@@ -190,8 +190,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
                 rover.set_mode(RoverMode.HOLD)
             self.warn("EKF failsafe", MavSeverity.CRITICAL)
 
-    def _check_wheels(self) -> None:
-        """Detect that the rover does not move although its mode drives (FS_CRASH_CHECK)."""
+    def _check_crash(self) -> None:
+        """Apply FS_CRASH_CHECK if the rover does not move although its mode drives."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
         # The simulation has no obstacles: only a failed motor keeps the rover from driving.
         is_blocked = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed

@@ -281,7 +281,7 @@ class RoverSubAuto(MissionMode):
         return True
 
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
-        """Return True if the vehicle has reached a waypoint and has waited there for param 1 seconds."""
+        """Return True if the vehicle has reached a waypoint and has waited there for the seconds in param 1."""
         if self._place is None:
             return False
         now = self.vehicle.now

@@ -28,7 +28,7 @@ class CameraParameters(ExtendedParameters):
         super().__init__(camera, camera.definition)
 
     def refresh(self) -> None:
-        """Update the values that commands or the automatic exposure have changed."""
+        """Update the mode, the values of the automatic exposure, and the ISO, which is limited in video mode."""
         values, camera = self.values, self._camera
         if MODE in values:
             values[MODE] = int(camera.mode)

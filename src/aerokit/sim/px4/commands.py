@@ -182,7 +182,7 @@ class _Flight:
         self._tuning_since = math.nan  # start of the autotuning; NaN while it does not run
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
-        """Handle COMPONENT_ARM_DISARM."""
+        """Handle COMPONENT_ARM_DISARM. A param 1 other than 0 and 1 is not acknowledged."""
         force = command.param2 == _FORCE_MAGIC
         arm = round(command.param1) if math.isfinite(command.param1) else None
         if arm == 1:
@@ -233,7 +233,7 @@ class _Flight:
         return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Handle MISSION_START: select the first item, enter MISSION, and arm."""
+        """Handle MISSION_START: select the item in param 1 (-1: no change), enter MISSION, and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
@@ -298,7 +298,7 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
-        """Start the autotuning, or report its progress. At the end, it waits for disarming (MC_AT_APPLY 1)."""
+        """Start the autotuning, or report its progress. The last step waits for disarming (MC_AT_APPLY 1)."""
         px4 = self._px4
         if command.param1 != 1.0 or command.param2 != 0.0:
             return MavResult.DENIED

@@ -355,8 +355,8 @@ class Px4Failsafes:
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
         """Update the active failures.
 
-        A new failure starts the delay of its action, and ends an override by the user. An action more severe than
-        WARN stays active until the user changes the mode.
+        A new or more severe action starts the delay, and a new one also ends an override by the user. An action more
+        severe than WARN stays active until the user changes the mode.
         """
         for cause, action in failing.items():
             if cause not in self._active and action >= Action.HOLD:

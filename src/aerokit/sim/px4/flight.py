@@ -242,7 +242,7 @@ class Px4Flight:
         return slow + (fast - slow) * share
 
     def _plan_return(self) -> None:
-        """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT to a near landing point."""
+        """Plan a return at RTL_RETURN_ALT above the landing point or, within RTL_MIN_DIST of it, at RTL_DESCEND_ALT."""
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.place

@@ -81,7 +81,7 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about a wrong sequence of DO_LAND_START, landing and return; None if it is right."""
+    """Return PX4's text about an invalid order of DO_LAND_START, landing and return; None if it is valid."""
     # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):

@@ -295,7 +295,7 @@ class Px4CameraTrigger:
         return MavResult.ACCEPTED
 
     def _enable_or_pause(self, command: ReceivedCommand) -> int | None:
-        """Handle DO_TRIGGER_CONTROL. Param 1 enables (1) or disables (0) the trigger, and param 3 pauses it.
+        """Handle DO_TRIGGER_CONTROL. Param 1 enables (1) or disables (0) triggering, param 3 pauses (1) or resumes (0).
 
         Param 2 is 1 to reset the sequence number of the images. A param of -1 changes nothing.
         """

@@ -172,13 +172,13 @@ class Px4PlaneFlight(Px4Flight):
         sink = self._plane.parameters["FW_T_SINK_MIN"]
         north, east, _ = self.target
         self.target = (north, east, self._motion.down + sink * _SINK_TARGET_LEAD_S)
-        self._touch_down(self.circle)
+        self._land(self.circle)
 
     def descend(self) -> None:
         """Follow the glide path (FW_LND_ANG) to the target on the ground."""
-        self._touch_down(self._glide)
+        self._land(self._glide)
 
-    def _touch_down(self, approach: Callable[[], None]) -> None:
+    def _land(self, approach: Callable[[], None]) -> None:
         """Land: call ``approach`` until the flare, then touch down and roll out."""
         motion = self._motion
         height = motion.ground_down - motion.down
