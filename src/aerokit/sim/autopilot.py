@@ -104,7 +104,7 @@ class _Signing(Signing):
 class ReceivedCorrections:
     """Assembles the fragments of RTCM messages as ArduPilot does (AP_GPS.cpp, handle_gps_rtcm_fragment).
 
-    ``messages`` contains the last 1000 assembled messages. ``is_recent`` is True if the latest one is recent.
+    ``messages`` contains the last 1000 assembled messages. ``is_recent`` is True if the latest is less than 5 s old.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
@@ -236,12 +236,11 @@ class SimulatedAutopilot(SimulatedVehicle):
             self.send(m.Timesync(int(self.uptime * 1e9), request.ts1), channel)
 
 
-_RESTING_CELL_VOLTS = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
+_DISCHARGE_CURVE = ((0.0, 3.0), (5.0, 3.3), (20.0, 3.6), (50.0, 3.75), (75.0, 3.95), (100.0, 4.2))
 # The lines between neighbouring points, from full to empty. Each tuple has the percent and the volts at the lower end,
 # and the slope in volts per percent.
-_RESTING_CELL_SLOPES = tuple(
-    (low, volts, (high_volts - volts) / (high - low))
-    for (low, volts), (high, high_volts) in pairwise(_RESTING_CELL_VOLTS)
+_DISCHARGE_SEGMENTS = tuple(
+    (low, volts, (high_volts - volts) / (high - low)) for (low, volts), (high, high_volts) in pairwise(_DISCHARGE_CURVE)
 )[::-1]
 
 
@@ -286,8 +285,8 @@ class SimulatedBattery:
 
     def _resting_cell_volts(self) -> float:
         percent = 100.0 * self._charge_mah / self.capacity_mah
-        for low_percent, low_volts, volts_per_percent in _RESTING_CELL_SLOPES:
+        for low_percent, low_volts, volts_per_percent in _DISCHARGE_SEGMENTS:
             if percent >= low_percent:
                 return low_volts + (min(percent, 100.0) - low_percent) * volts_per_percent
-        _, empty_volts = _RESTING_CELL_VOLTS[0]
+        _, empty_volts = _DISCHARGE_CURVE[0]
         return empty_volts

@@ -126,17 +126,17 @@ class Streams:
         self._group_count = 0
 
     def set_interval(self, message_id: int, interval_s: float, now: float) -> None:
-        """Stream a message every ``interval_s`` seconds from now on. 0 stops the stream."""
+        """Stream a message every ``interval_s`` seconds from the time ``now`` on. 0 stops the stream."""
         previous = self._groups.pop(message_id, None)
         if previous is not None:
             previous.ids.remove(message_id)
         if interval_s > 0.0:
-            self._groups[message_id] = group = self._new_group(interval_s, now)
+            self._groups[message_id] = group = self._group_starting_now(interval_s, now)
             group.ids.append(message_id)
         self._update_next_due()
 
-    def _new_group(self, interval_s: float, now: float) -> _StreamGroup:
-        """Return the group of streams that start now with this interval, which may exist already."""
+    def _group_starting_now(self, interval_s: float, now: float) -> _StreamGroup:
+        """Return the group of streams that start at ``now`` with this interval. Create it if it does not exist yet."""
         for group in self._groups.values():
             if group.start == now and group.interval_s == interval_s and group.count == 0:
                 return group

@@ -100,7 +100,7 @@ class Faults:
         self.lost_messages[message_type.ID] = times
 
     def drops_outgoing(self, message: Message, rng: random.Random) -> bool:
-        """Return True if this outgoing message is lost, and decrement the counter of the fault."""
+        """Return True if a fault loses this outgoing message. Decrement the counter of the fault, if it has one."""
         if self.silent or (self.heartbeats_stopped and message.ID == Heartbeat.ID):
             return True
         remaining = self.lost_messages.get(message.ID, 0)
@@ -113,7 +113,7 @@ class Faults:
         return self.loss > 0.0 and rng.random() < self.loss
 
     def drops_incoming(self, rng: random.Random) -> bool:
-        """Return True if the next incoming message is lost, and decrement the counter of the fault."""
+        """Return True if a fault loses the next incoming message. Decrement the counter of the fault, if it has one."""
         if self.drop_incoming > 0:
             self.drop_incoming -= 1
             return True

@@ -31,7 +31,7 @@ def kind_names() -> tuple[str, ...]:
 
 
 def kind_class(name: str) -> type[SimulatedVehicle]:
-    """Return the vehicle class of a kind name.
+    """Return the class that simulates vehicles of a kind, such as "copter".
 
     Raises InvalidArgument, with the list of kinds, for an unknown name.
     """

@@ -38,7 +38,7 @@ class SimulatedLog:
     """Seed of the pseudo-random content. If None, the content depends on size and time."""
 
     def make(self) -> bytes:
-        """Return the content. Of two logs with the same seed, the longer one starts with the shorter one."""
+        """Return the content. Of two logs with the same seed, the longer begins with the content of the shorter."""
         words = math.ceil(self.size / 4)  # A word has 32 bits.
         return (SAMPLE_LOG + random.Random(self._content_seed).randbytes(4 * words))[: self.size]
 

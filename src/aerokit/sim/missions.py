@@ -106,7 +106,7 @@ class _Writer(UploadedFile):
         return 0
 
     def close(self) -> None:
-        """Decode the file and replace the list. FileFault if the file or an item is invalid."""
+        """Decode the file and replace the list. Raises FileFault if the file or an item is invalid."""
         self.is_closed = True
         try:
             header = read_header(bytes(self.content))

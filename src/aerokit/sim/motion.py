@@ -91,7 +91,7 @@ _APPROACH_PER_S, _MAX_APPROACH_M_S = 0.8, 1.5
 # time and speed of a touchdown need short steps.
 _STEADY_JERK_M_S3 = 4.0
 _STEADY_LEAN_RATE_RAD_S = 0.6
-_STEADY_ABOVE_GROUND_S = 0.3
+_MIN_TIME_TO_GROUND_S = 0.3
 
 
 def wrap_pi(angle: float) -> float:
@@ -253,7 +253,7 @@ class Motion:
             self._jerk_m_s3 < _STEADY_JERK_M_S3
             and not self.wind.gusts_m_s
             and abs(self.roll_rate) + abs(self.pitch_rate) < _STEADY_LEAN_RATE_RAD_S
-            and height_m > max(0.0, self.velocity_down * _STEADY_ABOVE_GROUND_S)
+            and height_m > max(0.0, self.velocity_down * _MIN_TIME_TO_GROUND_S)
         )
 
     @property
@@ -379,7 +379,7 @@ class Motion:
         self.pitch_rate = pitch_step / dt
 
     def _turn(self, dt: float, *, powered: bool) -> None:
-        """Turn by ``dt`` seconds to the wanted heading, or with the wanted turn rate."""
+        """Turn for ``dt`` seconds, towards the wanted heading or at the wanted turn rate."""
         rate = 0.0
         if powered and not self.is_on_ground:
             rate = self._wanted_yaw_rate

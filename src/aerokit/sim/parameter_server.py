@@ -140,7 +140,7 @@ def rounded(value: float, type_: int) -> float:
     return float(math.trunc(struct.unpack("<f", struct.pack("<f", shifted))[0]))
 
 
-_SECOND_ECHO_S = 0.02
+_BROADCAST_DELAY_S = 0.02
 # PX4 does not set the index field of PARAM_ERROR. The field was observed to contain this value.
 _UNUSED_INDEX = 24400
 
@@ -205,10 +205,10 @@ class Px4ParameterServer(ParameterServer):
         is_changed = parameters[name] != previous and not math.isnan(value)  # NaN differs even from itself.
         if is_changed:
             # PX4 also broadcasts every changed parameter (mavlink_parameters.cpp).
-            self._vehicle.call_later(_SECOND_ECHO_S, lambda: self.send(name, parameters.index(name), None))
+            self._vehicle.call_later(_BROADCAST_DELAY_S, lambda: self.send(name, parameters.index(name), None))
 
     def _error_for(self, name: str, type_: int) -> int | None:
-        """Return the MAV_PARAM_ERROR of a wrong PARAM_SET; None if it is right."""
+        """Return the MAV_PARAM_ERROR of an invalid PARAM_SET; None if it is valid."""
         if name == HASH_NAME:
             return MavParamError.READ_ONLY
         if name not in self._parameters:

@@ -68,9 +68,10 @@ class SimParameters:
 
     @classmethod
     def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> SimParameters:
-        """Parse lines of ``name,type,value[,default[,switch]]``. The switch ``v`` marks a volatile parameter.
+        """Parse lines of ``name,type,value[,default[,switch]]``.
 
-        ``count`` limits the number of parameters. Those in ``used`` are always included.
+        The switch is the name of the parameter that enables this one, or ``v`` for a volatile parameter. ``count``
+        limits the number of parameters. Those in ``used`` are always included.
         """
         parameters = cls(())
         lines, switches = _lines_and_switches(text, frozenset(used), count)
@@ -194,7 +195,7 @@ def _lines_and_switches(
 
 
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return up to ``count`` lines, with all parameters in ``used`` and the first others that are always enabled."""
+    """Return all lines in ``used``, filled up to ``count`` with the first others that need no switch."""
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))
     selected: list[str] = []

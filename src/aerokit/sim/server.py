@@ -19,7 +19,7 @@ from aerokit.transport import Link, MemoryLink, Peer, TcpListen, create_link, me
 
 # Minimum delay of a timer in loop time with many vehicles, or if the simulation is faster than real time. One callback
 # then runs several ticks.
-_MIN_WAIT_S = 0.001
+_MIN_BATCH_WAIT_S = 0.001
 _BATCH_THRESHOLD = 10
 # With more than `_BATCH_THRESHOLD` vehicles, the output of `_BATCH_INTERVAL_S` simulated seconds is sent together.
 _BATCH_INTERVAL_S = TICK_S
@@ -69,10 +69,10 @@ class SimulatorServer:
         # Index of each vehicle in `vehicles` and `_dues`, by `id`.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
         runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
-        self._min_wait_s = _MIN_WAIT_S if runs_several_ticks else 0.0
+        self._min_wait_s = _MIN_BATCH_WAIT_S if runs_several_ticks else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None  # None before the `async with` block
         # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
-        self._end_source: Callable[[], None] | None = None
+        self._remove_source: Callable[[], None] | None = None
         self._started_at = 0.0  # loop time at the start
         self._now_at_start = max((vehicle.now for vehicle in self.vehicles), default=0.0)  # simulated time at the start
         self._ports: list[_Port] = []
@@ -108,13 +108,13 @@ class SimulatorServer:
         self._owner = asyncio.current_task()
         add_source = getattr(self._loop, "add_event_source", None)  # None unless the loop is a `VirtualClockLoop`
         if add_source is None and len(self.vehicles) > _BATCH_THRESHOLD:
-            self._min_wait_s = max(_MIN_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
+            self._min_wait_s = max(_MIN_BATCH_WAIT_S, _BATCH_INTERVAL_S / self._speedup)
         self._started_at = self._loop.time()
         try:
             async with AsyncExitStack() as opening:
                 await self._open_links(opening)
                 if add_source is not None:
-                    self._end_source = add_source(self._next_loop_time, self._on_due)
+                    self._remove_source = add_source(self._next_loop_time, self._on_due)
                 self._run(self.now)
                 self._exit = opening.pop_all()  # From now on, `__aexit__` closes the links instead of this block.
         except BaseException as error:
@@ -191,8 +191,8 @@ class SimulatorServer:
     def _stop(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        if self._end_source is not None:
-            self._end_source()
+        if self._remove_source is not None:
+            self._remove_source()
         self._timer = self._loop = None
         self._ports.clear()
 
@@ -203,7 +203,7 @@ class SimulatorServer:
         self._schedule()
 
     def _step(self, now: float) -> None:
-        """Advance the vehicles that have an event until ``now``."""
+        """Advance the vehicles whose next event is due to the time ``now``."""
         dues = self._dues
         for number, due in enumerate(dues):
             if due <= now:
@@ -233,16 +233,16 @@ class SimulatorServer:
     def _flush(self) -> None:
         """Write the datagrams of all vehicles to their links."""
         for port in self._ports:
-            for datagram in port.take_datagrams(together=self._end_source is None):
+            for datagram in port.take_datagrams(together=self._remove_source is None):
                 port.link.write(datagram)
                 if self.on_datagram is not None:
                     self.on_datagram(self.now, datagram, True)
-            port.hang_up()
+            port.disconnect_clients()
 
     def _schedule(self) -> None:
         """Set the timer for the next event of any vehicle, unless it is set already."""
         loop = self._loop
-        if loop is None or self._end_source is not None:  # An event source needs no timer.
+        if loop is None or self._remove_source is not None:  # An event source needs no timer.
             return
         due = min(self._dues, default=math.inf)
         if due == math.inf:
@@ -259,8 +259,8 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """If the timer is more than ``_MAX_CATCH_UP_S`` late, skip the rest. In real time, skip nothing."""
-        has_nothing_scheduled = self._timer is None and self._end_source is None
+        """Skip the lateness of the timer beyond ``_MAX_CATCH_UP_S`` simulated seconds. In real time, skip nothing."""
+        has_nothing_scheduled = self._timer is None and self._remove_source is None
         if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return
         due_at = self._next_loop_time() if self._timer is None else self._timer_at
@@ -299,7 +299,7 @@ class _Port:
             return datagrams(piece for channel in active for piece in channel.take_pieces())
         return [datagram for channel in active for datagram in channel.take_datagrams()]
 
-    def hang_up(self) -> None:
+    def disconnect_clients(self) -> None:
         """Disconnect the clients of a TCP port whose only vehicle reboots."""
         if len(self.channels) != 1:
             return

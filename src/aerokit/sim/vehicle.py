@@ -82,7 +82,7 @@ class ExtraComponent:
     system_status: int = MavState.ACTIVE
 
     def join(self, vehicle: SimulatedVehicle) -> None:
-        """Send heartbeats from the next power-on."""
+        """Send heartbeats from the next power-on onwards."""
         heartbeat = Heartbeat(
             self.type, self.autopilot, self.base_mode, self.custom_mode, self.system_status, mavlink_version=3
         )

@@ -149,7 +149,7 @@ class FixedWing(Motion):
         self._advance(dt)
 
     def _fly(self, dt: float, *, powered: bool) -> None:
-        """Move a flying plane by ``dt`` seconds. Without power, it glides at a fixed airspeed."""
+        """Move a flying plane for ``dt`` seconds. Without power, it glides at a fixed airspeed."""
         wing = self.wing_limits
         wanted_climb = self._wanted_climb if powered else -wing.glide_sink_m_s
         wanted_speed = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))

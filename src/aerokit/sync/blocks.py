@@ -246,7 +246,7 @@ class GimbalsTwin(TwinOf["Gimbals"], Generic[T]):
 
 
 class CalibrationTwin(IteratorTwin["Calibration", "CalibrationStep"]):
-    """Iterator over the steps of a calibration. Leaving the loop cancels it on the vehicle."""
+    """Iterator over the steps of a calibration. Leaving the ``for`` loop cancels the calibration on the vehicle."""
 
 
 class PhotoIntervalTwin(BlockTwin["PhotoInterval"], IteratorTwin["PhotoInterval", "Capture"]):

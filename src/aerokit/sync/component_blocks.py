@@ -47,7 +47,7 @@ class ComponentTwin(OpenedTwin["OnboardComponent"]):
 
         Args:
             message_type: the message.
-            hz: rate at which it is sent to all from the start, 0 to 200; 0: only on request.
+            hz: rate (0 to 200) at which it is sent to all programs from the start; 0 sends it only when asked.
 
         Raises:
             InvalidArgument: ``hz`` is out of range, or the message already has a function.

@@ -269,7 +269,7 @@ class Page:
     def _render_context_manager(
         self, node: ast.FunctionDef | ast.AsyncFunctionDef, member: ClassMember, arguments: Sequence[str]
     ) -> str:
-        """Return the source for a method that is a generator in a ``contextmanager`` decorator."""
+        """Return the source of the twin of a method that ``contextmanager`` decorates."""
         self.for_types.add(("contextlib", "AbstractContextManager"))
         yielded = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
         returns = ast.Subscript(ast.Name("AbstractContextManager"), yielded)
@@ -406,7 +406,7 @@ def _by_kind(name: str) -> tuple[bool, bool, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m aerokit.sync.generator")
-    parser.add_argument("--check", action="store_true", help="compare with the committed file, write nothing")
+    parser.add_argument("--check", action="store_true", help="compare with the committed files, write nothing")
     is_check = parser.parse_args(arguments).check
     exit_code = 0
     for name, file in FILES.items():

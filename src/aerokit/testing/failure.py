@@ -29,8 +29,8 @@ def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], tes
     for flight in flights:
         lines += _describe(flight)
     if directory is not None:
-        lines.append(_picture(flights, test, Path(directory)))
-        lines += _recordings(flights, test, Path(directory))
+        lines.append(_write_picture(flights, test, Path(directory)))
+        lines += _write_recordings(flights, test, Path(directory))
     return "\n".join(lines)
 
 
@@ -68,7 +68,7 @@ def _path(test: str, directory: Path, ending: str) -> Path:
     return directory / (re.sub(r"[^\w.-]+", "-", test).strip("-") + ending)
 
 
-def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> str:
+def _write_picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> str:
     path = _path(test, directory, ".svg")
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -78,7 +78,7 @@ def _picture(flights: Sequence[Flight | ServedFlight], test: str, directory: Pat
     return f"track in {path}"
 
 
-def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
+def _write_recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
     """Save a recording of each link and a report on each vehicle. Return the lines about these files."""
     # The vehicles of a fleet share one recording.
     by_recording: dict[int, list[Flight | ServedFlight]] = {}
@@ -94,13 +94,13 @@ def _recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: 
         try:
             path.write_bytes(recording.to_bytes())
             lines.append(f"recording in {path}")
-            lines += [_report(path, flight, shares_recording=len(group) > 1) for flight in group]
+            lines += [_write_report(path, flight, shares_recording=len(group) > 1) for flight in group]
         except Exception as error:  # For example, the recording is empty or the disk is full.
             lines.append(f"no report: {error}")
     return lines
 
 
-def _report(path: Path, flight: Flight | ServedFlight, *, shares_recording: bool) -> str:
+def _write_report(path: Path, flight: Flight | ServedFlight, *, shares_recording: bool) -> str:
     """Write the report on one vehicle of a recording, and return the line about it."""
     from aerokit.logs.report import write_report
 

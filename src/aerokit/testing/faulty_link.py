@@ -291,10 +291,11 @@ class FaultyLink(Link):
         was_stalled = stalled_at is not None
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
             return
-        self._stalled_at = now if is_stalled else None
-        if stalled_at is None:  # The stall begins now.
+        if stalled_at is None:
+            self._stalled_at = now
             self._incoming_path.link_stalled(self.unsent_bytes)
         else:
+            self._stalled_at = None
             self._incoming_path.link_drained(now - stalled_at)
 
     def _discard_in_transit(self) -> None:

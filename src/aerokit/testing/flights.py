@@ -102,7 +102,7 @@ class SimulatedFleet(Sequence[Flight]):
         **options: Any,
     ) -> None:
         options.setdefault("boot_time_s", _BOOT_TIME_S)
-        self._vehicles = _side_by_side(kinds, spacing_m, **options)
+        self._vehicles = _create_vehicles(kinds, spacing_m, **options)
         self._scheduler = FlightScheduler(self._vehicles)
         self._connect = connect
         self._latency_s = latency_s
@@ -231,7 +231,7 @@ class SimulatedFleet(Sequence[Flight]):
             self._server.wake()
 
 
-def _side_by_side(
+def _create_vehicles(
     kinds: Sequence[str], spacing_m: float, *, system_id: int = 1, seed: int = 0, **options: Any
 ) -> list[SimulatedVehicle]:
     """Create a vehicle of each kind. The first is at its home, the others stand in a row to the east of it."""

@@ -19,7 +19,7 @@ from aerokit.testing.track_points import TrackFailure, TrackPoint, metres_from
 
 __all__ = ["check_picture", "draw_svg", "save_picture"]
 
-_COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
+_PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")
 _GREY = "#dddddd"
 # Sizes and distances are in pixels.
 _WIDTH = 800
@@ -168,14 +168,16 @@ _LOW_CHART = 200  # A chart of up to this many pixels is low.
 class _Axes:
     """Maps the values of two axes to positions in a rectangle of the picture, with a margin."""
 
-    def __init__(self, xs: Sequence[float], ys: Sequence[float], top: float, height: float, *, square: bool) -> None:
+    def __init__(
+        self, xs: Sequence[float], ys: Sequence[float], top: float, height: float, *, same_scale: bool
+    ) -> None:
         self.left = _MARGIN
         self.top = top
         self.width = _WIDTH - 2 * _MARGIN
         self.height = height
         self.x_range = _with_margin(xs)
         self.y_range = _with_margin(ys)
-        if square:
+        if same_scale:
             scale = max(_span(self.x_range) / self.width, _span(self.y_range) / self.height)
             self.x_range = _widened(self.x_range, scale * self.width)
             self.y_range = _widened(self.y_range, scale * self.height)
@@ -217,7 +219,7 @@ def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
         paths.append([(east, north) for north, east, _ in track.local(origin)])
         outlines += _outlines(track, origin)
     easts, norths = zip(*chain(*paths, *outlines), strict=True)
-    axes = _Axes(easts, norths, top=30, height=_MAP_HEIGHT - 60, square=True)
+    axes = _Axes(easts, norths, top=30, height=_MAP_HEIGHT - 60, same_scale=True)
     shapes = axes.grid("m", "m")
     shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, is_dashed=True) for outline in outlines]
     labels = _Labels()
@@ -306,7 +308,7 @@ def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
     limit = next((altitude for altitude in limits if altitude is not None), None)
     times, heights = zip(*chain(*paths), strict=True)
     shown_heights = heights if limit is None else (*heights, limit)  # The chart also shows the line of the limit.
-    axes = _Axes(times, shown_heights, top=_MAP_HEIGHT, height=_PROFILE_HEIGHT - 40, square=False)
+    axes = _Axes(times, shown_heights, top=_MAP_HEIGHT, height=_PROFILE_HEIGHT - 40, same_scale=False)
     shapes = axes.grid("s", "m up")
     if limit is not None:
         limit_line = [axes.place(min(times), limit), axes.place(max(times), limit)]
@@ -331,7 +333,7 @@ def _legend(tracks: Sequence[Drawable]) -> list[_Shape]:
 
 
 def _colours(count: int) -> list[str]:
-    return [_COLOURS[number % len(_COLOURS)] for number in range(count)]
+    return [_PALETTE[number % len(_PALETTE)] for number in range(count)]
 
 
 def _with_margin(values: Sequence[float]) -> tuple[float, float]:

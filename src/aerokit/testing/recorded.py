@@ -62,7 +62,7 @@ class RecordedParameters(ParameterProtocolServer):
         self._has_hash = is_complete and HASH_NAME in without_index
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
-        """Return the latest PARAM_VALUE that was written or played or, before that, the first recorded one."""
+        """Return PARAM_VALUE with the value that was written, else the latest one played, else the first recorded."""
         recorded = self._recorded[name]
         _, latest = recorded[0]
         for time, value in recorded:
@@ -92,7 +92,7 @@ class RecordedParameters(ParameterProtocolServer):
         if name not in self.names:
             self._refuse(request, index=-1, channel=channel)  # -1 because the request has no index
             return
-        # If the recording has no successful write of the parameter, the vehicle keeps and answers the present value.
+        # If the recording has no successful write of the parameter, the vehicle keeps and sends the present value.
         if name in self._vehicle.recording.settable:
             self._written[name] = request.param_value
         self.send(name, self.names.index(name), None)
@@ -121,7 +121,8 @@ class RecordedMissions(MissionServer):
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
         """Return the items of the plan that the vehicle has at present.
 
-        Before the first recorded plan, return that plan. Return None if the recording contains no plan of this type.
+        This is the first recorded plan even before its time. Return None if the recording contains no plan of this
+        type.
         """
         if mission_type in self._written:
             return self._written[mission_type]

@@ -16,7 +16,7 @@ from aerokit.mavlink.enums import (
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import CommandHandler, CommandProgress, ReceivedCommand, to_int
 
-_SAMPLE_S, _REPEAT_INTERVAL_S = 1.3, 1.0
+_MEASUREMENT_TIME_S, _REPEAT_INTERVAL_S = 1.3, 1.0
 _LAST = AccelcalVehiclePos.BACK
 
 
@@ -53,15 +53,15 @@ class AccelerometerCalibration:
             return MavResult.FAILED
         self._requested = None
         run_number, position = self._run_number, to_int(command.param1)
-        self._vehicle.call_later(_SAMPLE_S, lambda: self._on_sample(run_number, position))
+        self._vehicle.call_later(_MEASUREMENT_TIME_S, lambda: self._on_sample(run_number, position))
         return MavResult.ACCEPTED
 
     def _on_sample(self, run_number: int, position: int) -> None:
         """Continue after a position was measured: request the next one, or end the calibration."""
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
-        has_earlier_position = position != AccelcalVehiclePos.LEVEL  # LEVEL is the first position.
-        if self.is_held_wrong and has_earlier_position:
+        is_first_position = position == AccelcalVehiclePos.LEVEL
+        if self.is_held_wrong and not is_first_position:  # A wrong pose is only noticed from the second position on.
             self._end("Calibration FAILED", AccelcalVehiclePos.FAILED)
         elif position == _LAST:
             self._end("Calibration successful", AccelcalVehiclePos.SUCCESS)
@@ -73,7 +73,7 @@ class AccelerometerCalibration:
         self._request(self._run_number, result)
 
     def _request(self, run_number: int, position: int) -> None:
-        """Request a position every second, until the client confirms the position or another calibration starts."""
+        """Request a position every second, until the client confirms it, or the calibration is reset or restarted."""
         self._requested = position
 
         def request_until_confirmed() -> None:
@@ -88,7 +88,7 @@ class AccelerometerCalibration:
 
 
 _COMPASSES, _ALL_COMPASSES = 3, 0b111
-_SETTLING_S = 1.0
+_SETTLING_TIME_S = 1.0
 _FITNESS = 5.0
 
 
@@ -103,7 +103,7 @@ class CompassCalibration:
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
         self.turning_time_s: float = 30.0
-        self._compass_mask = 0  # bit for each compass whose calibration was started and is not over; 0 if none
+        self._compass_mask = 0  # one bit for each compass in the calibration, until its result is accepted or cancelled
         self._started_at = math.inf  # infinite before the start
         self._saves_at_once = False  # True if the result needs no DO_ACCEPT_MAG_CAL
         self._progress_compass = 0  # compass of the last progress message
@@ -122,7 +122,7 @@ class CompassCalibration:
     def percent(self) -> int:
         if not self._compass_mask:
             return 0
-        seconds = self._vehicle.now - self._started_at - _SETTLING_S
+        seconds = self._vehicle.now - self._started_at - _SETTLING_TIME_S
         return max(0, min(100, int(100.0 * seconds / self.turning_time_s)))
 
     @property
@@ -177,7 +177,7 @@ class CompassCalibration:
         )  # fmt: skip
 
     def report(self) -> m.MagCalReport | None:
-        """Return the results of the compasses in turn, after a calibration, until they are accepted or cancelled."""
+        """Return the result of one compass, each compass in turn; None if no result waits to be accepted."""
         if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
@@ -191,12 +191,12 @@ class CompassCalibration:
         )
 
     def _next_compass(self, compass: int) -> int:
-        """Return the next compass after this one that is being calibrated. After the last compass follows the first."""
+        """Return the compass that follows ``compass`` in the calibration. The first compass follows the last."""
         candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
         return next(number for number in candidates if self._compass_mask & 1 << number)
 
 
-_GYROS_S, _TRIM_S, _ACCELEROMETERS_S = 0.5, 1.0, 1.0
+_GYRO_CALIBRATION_S, _TRIM_CALIBRATION_S, _ACCELEROMETER_CALIBRATION_S = 0.5, 1.0, 1.0
 _MIN_ACCELEROMETERS_INTERVAL_S = 5.0
 # A param with this value accepts the present calibration (GCS_Common.cpp, _handle_command_preflight_calibration).
 _ACCEPTS_PRESENT_CALIBRATION = 76
@@ -242,7 +242,8 @@ class Calibrations:
         is_barometer_requested = command.param3 == 1.0
         if is_gyro_requested:
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress(percents=(), interval_s=_GYROS_S)  # Without percentages, only the result is sent.
+            # Without percentages, only the result is sent.
+            return CommandProgress(percents=(), interval_s=_GYRO_CALIBRATION_S)
         if is_barometer_requested:
             vehicle.info("Updating barometer calibration")
             vehicle.info("Barometer calibration complete")
@@ -250,22 +251,25 @@ class Calibrations:
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
-        """Calibrate the accelerometers, or accept the present values, as parameter 5 (``command.x``) says."""
+        """Calibrate the accelerometers as param 5 (``command.x``) selects.
+
+        Param 5 or 2 can instead accept the present calibration of the accelerometers or the compasses.
+        """
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")
             # The gyros are calibrated first. Then the vehicle requests the first of the six positions.
-            return CommandProgress(percents=(), interval_s=_GYROS_S, finish=self.accelerometers.start)
+            return CommandProgress(percents=(), interval_s=_GYRO_CALIBRATION_S, finish=self.accelerometers.start)
         if command.x == _Accelerometers.TRIM:
             vehicle.info("Initialising ArduPilot")
             text = "Trim OK: roll=0.00 pitch=0.00 yaw=0.00"
-            return CommandProgress(percents=(), interval_s=_TRIM_S, finish=lambda: vehicle.info(text))
+            return CommandProgress(percents=(), interval_s=_TRIM_CALIBRATION_S, finish=lambda: vehicle.info(text))
         if command.x == _Accelerometers.SIMPLE:
             if vehicle.now - self._simple_calibration_at < _MIN_ACCELEROMETERS_INTERVAL_S:
                 return MavResult.TEMPORARILY_REJECTED
             self._simple_calibration_at = vehicle.now
             vehicle.info("Initialising ArduPilot")
-            return CommandProgress(percents=(), interval_s=_ACCELEROMETERS_S)
+            return CommandProgress(percents=(), interval_s=_ACCELEROMETER_CALIBRATION_S)
         keeps_accelerometers = command.x == _ACCEPTS_PRESENT_CALIBRATION
         keeps_compasses = command.param2 == _ACCEPTS_PRESENT_CALIBRATION
         return MavResult.ACCEPTED if keeps_accelerometers or keeps_compasses else MavResult.UNSUPPORTED

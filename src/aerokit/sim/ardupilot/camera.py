@@ -10,7 +10,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.host import ArduPilotHost
 from aerokit.sim.commands import ReceivedCommand, to_int
 
-_PERIOD_S, _SHUTTER_S = 0.02, 0.1
+_PERIOD_S, _DEFAULT_SHUTTER_S = 0.02, 0.1
 _IDLE, _INTERVAL_SET = 0, 2
 _UNLIMITED = -1
 
@@ -46,7 +46,7 @@ class ArduPilotCamera:
 
     @property
     def _shutter_s(self) -> float:
-        return self._vehicle.parameters.get("CAM1_DURATION", _SHUTTER_S)
+        return self._vehicle.parameters.get("CAM1_DURATION", _DEFAULT_SHUTTER_S)
 
     def take(self) -> bool:
         """Take an image and return True. Return False if there is no camera or its shutter is still open."""
@@ -61,7 +61,7 @@ class ArduPilotCamera:
         return True
 
     def take_series(self, interval_s: float, count: int) -> bool:
-        """Take ``count`` images (-1: until `stop`), one every ``interval_s`` seconds, the first one at once."""
+        """Take ``count`` images (-1: until `stop`), the first one at once. Return False without a camera."""
         if not self.is_fitted:
             return False
         self.interval_s = interval_s
@@ -86,7 +86,7 @@ class ArduPilotCamera:
             self._vehicle.call_later(_PERIOD_S, self._update)
 
     def _update(self) -> None:
-        """Take the images that are due in a series or by distance. Called repeatedly while one is active."""
+        """Take an image if one is due, in a series or by distance. Called repeatedly while either is active."""
         self._is_update_scheduled = False
         if self.remaining:
             is_due = self._vehicle.now - self._taken_at > self.interval_s
@@ -163,8 +163,8 @@ class ArduPilotCamera:
         """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
         kind = to_int(command.param1)
         # The firmware denies these types even without a camera (AP_Camera.cpp).
-        is_unsupported = kind in (SetFocusType.STEP, SetFocusType.METERS)
-        if is_unsupported or kind not in list(SetFocusType):
+        is_denied = kind in (SetFocusType.STEP, SetFocusType.METERS)
+        if is_denied or kind not in list(SetFocusType):
             return MavResult.DENIED
         if not self.is_fitted:
             return MavResult.FAILED

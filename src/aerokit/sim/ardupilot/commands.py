@@ -94,7 +94,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
 
 
 def commanded_heading(command: ReceivedCommand, yaw: float) -> float | None:
-    """Return the heading that CONDITION_YAW commands, in radians; None if its params are invalid.
+    """Return the heading in radians that CONDITION_YAW commands; None if its params are invalid.
 
     ``yaw`` is the vehicle's present heading, to which a relative angle is added.
     """
@@ -225,7 +225,7 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """Set the region of interest, also without a gimbal. Zeros, and DO_SET_ROI_NONE, clear the region."""
+        """Set the region of interest, also without a gimbal. A position of zeros clears it, like DO_SET_ROI_NONE."""
         point = None
         if command.command != Cmd.DO_SET_ROI_NONE:
             point = self._vehicle.world_point(*command.place(), command.z, command.altitude_frame)

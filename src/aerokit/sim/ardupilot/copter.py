@@ -32,7 +32,7 @@ from aerokit.sim.ardupilot.telemetry import BUILDERS_OF_KIND, Builders
 from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
 from aerokit.sim.motion import Ned
 
-_MAX_S = 600.0
+_MAX_MOTOR_TIME_S = 600.0
 # The pause between the tests of two motors, divided by the test time of one motor.
 _PAUSE_SHARE = 0.5
 _MIN_PWM, _MAX_PWM = 800, 2200
@@ -77,7 +77,7 @@ class MotorTest:
             is_valid = throttle_type in in_percent and throttle <= 100.0
         if not is_valid:
             return 0.0
-        seconds_per_motor = max(0.0, min(command.param4, _MAX_S))
+        seconds_per_motor = max(0.0, min(command.param4, _MAX_MOTOR_TIME_S))
         motor_count = max(1, to_int(command.x))
         return seconds_per_motor * (motor_count + (motor_count - 1) * _PAUSE_SHARE)
 
@@ -167,7 +167,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 class SimulatedCopter(CopterHost):
     """ArduCopter, as far as a client can observe it. `Motion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It has 1,349 parameters. MNT1_TYPE 1 fits a gimbal with three axes.
+    Takes the arguments of `ArduPilotVehicle`. The copter has 1,349 parameters. MNT1_TYPE 1 fits a 3-axis gimbal.
 
     Not simulated: braking before a fence, the terrain failsafe.
     """
@@ -231,7 +231,7 @@ class SimulatedCopter(CopterHost):
         return flags
 
     def move(self, dt: float) -> None:
-        """Move by ``dt`` seconds, and detect the landing."""
+        """Move for ``dt`` seconds, and detect the landing."""
         motion = self.motion
         was_on_ground = motion.is_on_ground
         motion.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)

@@ -77,7 +77,7 @@ class _CircleLeg:
         return self._approach is None and self._turned_rad / math.tau >= self._turns
 
     def update(self, dt: float) -> None:
-        """Fly by ``dt`` seconds: first to the circle, then around it."""
+        """Fly for ``dt`` seconds: first to the circle, then around it."""
         if self._approach is not None:
             self._approach.update(dt)
             if self._approach.is_complete:
@@ -239,7 +239,7 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Enter AUTO, which requires a mission. On the ground, its first navigation command must be a take-off."""
+        """Enter AUTO, which requires a mission; while armed on the ground, one that begins with a take-off."""
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
             return True  # Arming enters the current mode again, which must not restart the mission.
@@ -256,16 +256,16 @@ class CopterAuto(MissionMode):
         return True
 
     def on_mission_started(self) -> None:
-        self._check_upcoming()  # records the commands that the next call compares
+        self._update_upcoming()  # records the commands that the next call compares
 
     def update(self, dt: float) -> None:
         """Continue the mission, and fly the leg of the current command for ``dt`` seconds."""
         self.start_if_waiting()
         if not self.is_waiting:
-            if self._check_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
+            if self._update_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
                 self._restart_command()
             self.vehicle.mission.update()
-            self._check_upcoming()  # `mission.update` may have started the next command
+            self._update_upcoming()  # `mission.update` may have started the next command
         if self.vehicle.mode is not self:  # The mission has changed the mode.
             return
         is_stopped = self.is_paused and isinstance(self._leg, _FlyLeg)  # A take-off or landing cannot be paused.
@@ -276,7 +276,7 @@ class CopterAuto(MissionMode):
         if not is_stopped:
             self.vehicle.yaw.update()
 
-    def _check_upcoming(self) -> bool:
+    def _update_upcoming(self) -> bool:
         """Record the current and the next commands. Return True if an upload, not the progress, has changed them."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0].seq == run.nav_index
@@ -326,7 +326,7 @@ class CopterAuto(MissionMode):
         if command in _UNTIL_LEG_ENDS:
             return self._is_leg_complete
         if command in _LANDINGS:
-            return self._continues_after_landing(index)
+            return self._land_or_continue(index)
         if command == Cmd.NAV_LOITER_UNLIM:
             return False
         if command == Cmd.NAV_GUIDED_ENABLE:
@@ -343,7 +343,7 @@ class CopterAuto(MissionMode):
         return True
 
     def _has_stayed(self, index: int, seconds: float) -> bool:
-        """Return True if the copter has reached a waypoint and has waited there for ``seconds``."""
+        """Return True, and report it, if the copter has reached a waypoint and has waited there for ``seconds``."""
         if not self._is_leg_complete:
             return False
         if self._reached_at is None:
@@ -354,7 +354,7 @@ class CopterAuto(MissionMode):
         self.vehicle.info(f"Reached command #{index}")
         return True
 
-    def _continues_after_landing(self, index: int) -> bool:
+    def _land_or_continue(self, index: int) -> bool:
         """Land, and disarm the copter. Return True if it continues with a take-off instead (MIS_OPTIONS)."""
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
@@ -392,7 +392,7 @@ class CopterAuto(MissionMode):
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
-        """Start a leg to a waypoint, at which the copter stops unless the mission continues from there."""
+        """Start a leg to a waypoint. The copter stops there if it has to wait or if no further waypoint follows."""
         run = self.vehicle.mission
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
@@ -417,7 +417,7 @@ class CopterAuto(MissionMode):
         self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
 
     def _land(self, item: MissionItem) -> None:
-        """Start a landing, at the place of the command or at the present one."""
+        """Start a landing at the place of the command or, if its coordinates are 0, at the present place."""
         self.vehicle.yaw.hold()
         if (item.x, item.y) == (0, 0):
             self._leg = _DescendLeg(self.vehicle)

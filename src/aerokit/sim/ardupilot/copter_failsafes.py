@@ -16,7 +16,7 @@ _STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """ArduCopter's arming checks. Only modes that use a position require it; the throttle must be low or centred."""
+    """ArduCopter's arming checks. Only modes that use a position require one; the throttle must be low or centred."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
@@ -83,7 +83,7 @@ _FALLBACK_TEXTS = {
 }
 # Bits of FS_OPTIONS that let a flight continue in spite of a failsafe. The rows of the tables have the modes in which
 # the bit applies, the bit, and the status text.
-_IF_LANDING = 8
+_CONTINUES_LANDING = 8
 _RADIO_OPTIONS = (
     (frozenset({"AUTO"}), 1, "Continuing Auto"),
     (frozenset({"GUIDED"}), 4, "Continuing Guided Mode"),
@@ -92,7 +92,7 @@ _GCS_OPTIONS = (
     (frozenset({"AUTO"}), 2, "Continuing Auto Mode"),
     (frozenset({"STABILIZE", "ALT_HOLD", "LOITER", "POSHOLD"}), 16, "Continuing Pilot Control"),
 )
-_MIN_PULSES_S = 0.2
+_MIN_GOOD_S = 0.2
 _ESTIMATOR_TIMEOUT_S = 1.0
 
 
@@ -123,7 +123,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self.vehicle.fence.update()
 
     def _check_radio(self) -> None:
-        """Detect a radio whose pulses are missing for RC_FS_TIMEOUT, or whose throttle is below FS_THR_VALUE."""
+        """Detect the loss of the radio (no pulses for RC_FS_TIMEOUT, or throttle below FS_THR_VALUE) and its return."""
         copter, parameters = self.vehicle, self.vehicle.parameters
         is_receiving = copter.rc.is_receiving
         if is_receiving:
@@ -135,7 +135,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         if is_receiving and not is_throttle_low:
             if math.isnan(self._radio_good_at):
                 self._radio_good_at = copter.now
-            if copter.now - self._radio_good_at >= _MIN_PULSES_S:
+            if copter.now - self._radio_good_at >= _MIN_GOOD_S:
                 self._set_radio_lost(is_lost=False)
             return
         if math.isnan(self.radio_received_at):  # A transmitter that was never received cannot be lost.
@@ -185,7 +185,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         """Report the loss of the link ``name`` and return the action to execute.
 
         This is ``action``, unless the copter disarms on the ground, continues a landing, or one of ``options`` lets
-        the present mode continue.
+        the present mode continue. Each option is (names of modes, bit of FS_OPTIONS, status text).
         """
         mode = self.vehicle.mode
         if self._disarm_if_landed(name):
@@ -195,7 +195,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             is_landing_for_battery = self.battery.priority <= self.BATTERY_PRIORITIES.index(_LAND)
             if self.battery_is_low and is_landing_for_battery:
                 return self._report_continuation(f"{name} + Battery", "Continuing Landing", _LAND)
-            if self._has_option(_IF_LANDING):
+            if self._has_option(_CONTINUES_LANDING):
                 return self._report_continuation(name, "Continuing Landing", _LAND)
         for modes, bit, text in options:
             if mode.name in modes and self._has_option(bit):
@@ -207,7 +207,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         """Execute the action in the air, or disarm on the ground. With FS_OPTIONS bit 3 a landing continues."""
         if self._disarm_if_landed("Battery"):
             return
-        continues_landing = self.vehicle.mode.is_landing and self._has_option(_IF_LANDING)
+        continues_landing = self.vehicle.mode.is_landing and self._has_option(_CONTINUES_LANDING)
         if continues_landing and action != _NONE:
             action = self._report_continuation("Battery", "Continuing Landing", _LAND)
         else:
@@ -230,9 +230,9 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             return
         lost_for_s = self._position_lost.seconds(condition=True, now=copter.now)
         if lost_for_s >= _ESTIMATOR_TIMEOUT_S:
-            self._lose_estimator()
+            self._start_estimator_failsafe()
 
-    def _lose_estimator(self) -> None:
+    def _start_estimator_failsafe(self) -> None:
         """Start the failsafe of the estimator: an armed copter lands, unless its mode needs no position."""
         copter = self.vehicle
         self.warn("EKF variance", MavSeverity.CRITICAL)
@@ -314,7 +314,7 @@ class CopterFence(ArduPilotFence[CopterHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION in the air, or disarm on the ground."""
+        """Execute FENCE_ACTION in the air. On the ground, disarm, unless FENCE_ACTION only reports."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if vehicle.is_landed:

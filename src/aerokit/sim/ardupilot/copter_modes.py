@@ -73,7 +73,7 @@ class AutoYaw:
         self._control = self._turn
 
     def set_region_of_interest(self, point: Ned | None) -> None:
-        """Face a place until the next target, or face none again. A fitted gimbal turns instead of the copter."""
+        """Face a place until the next target; None ends this. A fitted gimbal turns instead of the copter."""
         gimbal = self._copter.gimbal
         gimbal.look_at(point)
         if point is None:
@@ -288,7 +288,7 @@ class CopterStabilize(CopterPilotedMode):
 
 
 class CopterLoiter(CopterPilotedMode):
-    """LOITER and similar modes: sticks set velocities, centred sticks hold the position. A low throttle stick lands."""
+    """LOITER and similar modes: sticks set velocities, centred sticks hold the position. Low throttle: landing."""
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
         velocity = (-pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S, -climb)

@@ -12,8 +12,8 @@ from aerokit.sim.commands import ReceivedCommand, to_int
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.host import ArduPilotHost
 
-_GRIP_S = 0.7
-_WINCH_RATE_M_S, _WINCH_STEP_S = 1.0, 0.1
+_GRIP_DURATION_S = 0.7
+_WINCH_RATE_M_S, _WINCH_INTERVAL_S = 1.0, 0.1
 _MIN_CHUTE_ALTITUDE_M = 10.0
 
 
@@ -45,7 +45,7 @@ class ArduPilotDevices:
         def finish() -> None:
             self._vehicle.info(f"Gripper load {'grabbed' if is_grab else 'released'}")
 
-        self._vehicle.call_later(_GRIP_S if has_to_move else 0.0, finish)
+        self._vehicle.call_later(_GRIP_DURATION_S if has_to_move else 0.0, finish)
         self.is_gripped = is_grab
         return Result.ACCEPTED
 
@@ -90,16 +90,16 @@ class ArduPilotDevices:
             self._goal_m = self.line_m + length_m
             self.line_rate_m_s = _WINCH_RATE_M_S if length_m > 0 else -_WINCH_RATE_M_S
         if not was_moving and self.line_rate_m_s:  # A winch that moves already has a scheduled step.
-            self._vehicle.call_later(_WINCH_STEP_S, self._run)
+            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
         return Result.ACCEPTED
 
     def _run(self) -> None:
-        self.line_m += self.line_rate_m_s * _WINCH_STEP_S
+        self.line_m += self.line_rate_m_s * _WINCH_INTERVAL_S
         # Once the line has passed the goal, the remaining length and the rate have opposite signs.
         if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:
             self.line_rate_m_s = 0.0
         if self.line_rate_m_s:
-            self._vehicle.call_later(_WINCH_STEP_S, self._run)
+            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
 
     def winch_status(self) -> m.WinchStatus | None:
         """Return WINCH_STATUS, or None if the vehicle has no winch."""

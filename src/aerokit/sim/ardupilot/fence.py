@@ -118,7 +118,7 @@ _NAMES = {_MAX_ALT: "Max Alt", _CIRCLE: "Circle", _POLYGON: "Polygon", _MIN_ALT:
 _ALL = _MAX_ALT | _CIRCLE | _POLYGON | _MIN_ALT
 # A breach counts as a new breach once the vehicle has moved this many metres farther outside.
 _BACKUP_M = 20.0
-_RECOVERY_S = 10.0
+_RECOVERY_DURATION_S = 10.0
 _STATUS_INTERVAL_S = 1.0
 _LOWEST_ALT_MIN_M = -100.0
 _UNION, _NO_MODE_CHANGE = 2, 1
@@ -233,7 +233,7 @@ class ArduPilotFence(Generic[HostT]):
             self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
-        """Enable or disable the fence when its parameters have changed."""
+        """Enable or disable the fence if its parameters have changed. Clear breaches of kinds no longer configured."""
         enable = int(self.vehicle.parameters["FENCE_ENABLE"])
         auto_enable = int(self._value("FENCE_AUTOENABLE"))
         if (enable, auto_enable) != self._enabling_parameters:
@@ -256,7 +256,7 @@ class ArduPilotFence(Generic[HostT]):
         new_breaches = self._check() if vehicle.navigation.home is not None else 0
         if breached_before and not self.breached:
             self.on_cleared()
-        is_recovering = vehicle.now - self._recovering_since < _RECOVERY_S
+        is_recovering = vehicle.now - self._recovering_since < _RECOVERY_DURATION_S
         if new_breaches and vehicle.is_armed and not is_recovering:
             self.act(new_breaches)
 

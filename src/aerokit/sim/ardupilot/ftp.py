@@ -97,7 +97,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Do nothing. The firmware closes an idle session only when another client needs the session."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        """Refuse a request while another session has an open file. If that session is idle, close it instead."""
+        """Answer a request, or refuse it while another session has an open file. An idle session is closed first."""
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
         if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():
@@ -162,7 +162,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._terminate(peer, request)
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Open a file. Refused while another file is open, unless nothing was sent for a while."""
+        """Open a file. Refused while another file is open. To read a file, an idle session is closed first."""
         is_reading = request.opcode == Op.OPENFILERO
         is_idle = self._host.now - self._sent_at > _SESSION_TIMEOUT_S
         if is_reading and is_idle:  # The client may have missed the reply to its previous request to open a file.

@@ -28,6 +28,7 @@ from aerokit.sim.vehicle import sender_of
 _DEVICE_ID = 1
 # Values of the system id in DO_GIMBAL_MANAGER_CONFIGURE with a special meaning.
 _KEEP_CONTROL, _TAKE_CONTROL, _RELEASE_CONTROL = -1, -2, -3
+_MIN_ID = _RELEASE_CONTROL
 _Can = GimbalManagerCapFlags
 _CAPABILITIES = (
     _Can.HAS_RETRACT | _Can.HAS_NEUTRAL | _Can.HAS_RC_INPUTS
@@ -112,15 +113,15 @@ class ArduPilotGimbal:
             roll, pitch, yaw = (self.setting(f"MNT1_{mode_name}_{axis}") for axis in "XYZ")
             return MountTarget(roll, pitch, yaw)
         if self.mode == MavMountMode.GPS_POINT:
-            return self._angles_to(self._region)
+            return self._update_target_for(self._region)
         if self.mode == MavMountMode.SYSID_TARGET:
-            return self._angles_to(self._followed_place)
+            return self._update_target_for(self._followed_place)
         if self.mode == MavMountMode.HOME_LOCATION:
-            return self._angles_to(self._vehicle.navigation.home)
-        return self._stabilized(self._target)
+            return self._update_target_for(self._vehicle.navigation.home)
+        return self._moved_by_rates(self._target)
 
-    def _stabilized(self, target: MountTarget) -> MountTarget:
-        """Return the target as its rates have moved it until now. Angles relative to the vehicle are limited."""
+    def _moved_by_rates(self, target: MountTarget) -> MountTarget:
+        """Return the target as its rates have moved it until now. All angles but a yaw from north are limited."""
         if not any(target.rates):
             return target
         seconds = self._vehicle.now - target.set_at
@@ -131,8 +132,8 @@ class ArduPilotGimbal:
         yaw = math.remainder(yaw, 360.0) if target.is_from_north else self._limited("YAW", yaw)
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
-    def _angles_to(self, place: Ned | None) -> MountTarget:
-        """Return the angles to a place. If the place or the vehicle's position is unknown, keep the last target."""
+    def _update_target_for(self, place: Ned | None) -> MountTarget:
+        """Set the target to the angles to a place, if this place and the vehicle's are known. Return the target."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             place_north, place_east, place_down = place
@@ -202,7 +203,7 @@ class ArduPilotGimbal:
 
     def set_control(self, sender: tuple[int, int], system: int, component: int) -> bool:
         """Handle MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. Return False for invalid ids."""
-        are_ids_valid = all(_RELEASE_CONTROL <= number <= 255 for number in (system, component))
+        are_ids_valid = all(_MIN_ID <= number <= 255 for number in (system, component))
         if not are_ids_valid:
             return False
         previous = self.in_control

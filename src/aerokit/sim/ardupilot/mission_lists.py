@@ -21,7 +21,7 @@ _HOME_SEQ = 0
 
 
 class ItemList:
-    """Base of the three lists of items. Results are MAV_MISSION_RESULTs."""
+    """Base of the lists of mission, fence and rally items. Integer results are MAV_MISSION_RESULTs."""
 
     name: ClassVar[str]
     """Name of the list in status texts."""
@@ -266,7 +266,7 @@ class FenceList(ItemList):
         return True
 
     def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
-        """Store a fence if it is valid and fits into the storage. Otherwise send texts about the problem."""
+        """Store a fence, or ``warn`` if it is invalid or too large. Return the MAV_MISSION_RESULT."""
         problem = _fence_problem(items)
         if problem is not None:
             warn(problem)

@@ -249,7 +249,7 @@ class MissionRun:
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Resume a stopped mission at the next navigation command from ``index`` on; return False without one."""
+        """Let a stopped mission resume at the next navigation command from ``index`` on. Return False without one."""
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:

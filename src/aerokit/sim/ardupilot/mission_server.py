@@ -91,7 +91,7 @@ class ArduPilotMissionServer(MissionServer):
         return Result.ACCEPTED
 
     def _home(self) -> MissionItem:
-        """Return item 0 of a download. Zeros if home is unknown."""
+        """Return home as item 0 of a download; zeros if home is unknown."""
         home = self._vehicle.navigation.home
         if home is None:
             return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)

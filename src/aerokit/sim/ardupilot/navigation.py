@@ -47,13 +47,13 @@ class ArduPilotNavigation:
         """Schedule the events of the boot timeline."""
         timeline, call_later = self._vehicle.timeline, self._vehicle.call_later
         # The estimator reports its flags as uninitialised for the second half of its start.
-        unaligned_at = timeline.ready + 0.5 * (timeline.estimator_active - timeline.ready)
-        call_later(unaligned_at, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
+        uninitialized_at = timeline.ready + 0.5 * (timeline.estimator_active - timeline.ready)
+        call_later(uninitialized_at, lambda: self._set_flags(int(Ekf.UNINITIALIZED)))
         call_later(timeline.estimator_active, self._activate)
         call_later(timeline.tilt_aligned, lambda: self._report_cores("tilt alignment complete"))
         call_later(timeline.yaw_aligned, self._align)
         call_later(timeline.gps_detected, self._detect_gps)
-        call_later(timeline.gps_fix, self._get_fix)
+        call_later(timeline.gps_fix, self._acquire_fix)
         call_later(timeline.origin_set, self._set_origin_when_possible)
         call_later(timeline.healthy, self._become_healthy)
         call_later(timeline.position_good, self._use_gps_when_possible)
@@ -167,7 +167,7 @@ class ArduPilotNavigation:
         self._vehicle.info("GPS 1: probing for u-blox at 230400 baud")
         self._vehicle.info("GPS 1: detected u-blox")
 
-    def _get_fix(self) -> None:
+    def _acquire_fix(self) -> None:
         """Get the first fix, unless GPS is missing, and watch GPS from now on."""
         if self.is_gps_detected and not self.gps_is_lost:
             self.fix_type = GpsFixType.RTK_FIXED
@@ -203,7 +203,7 @@ class ArduPilotNavigation:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
-        """React to a lost GPS, and use a returned one again."""
+        """Detect the loss of GPS, and use GPS again after its return."""
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
@@ -258,9 +258,9 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
 _PERIOD_S, _FAILURE_TIMEOUT_S, _LOW_SPACE_REPORT_INTERVAL_S = 1.0 / 3.0, 15.0, 10.0
 _CLEAN_UP_AFTER_POINTS = 50
 _LOW_SPACE_POINTS = 9
-# Tolerances as multiples of SRTL_ACCURACY. Points that bend the path by less than `_BEND` are removed. Segments that
-# come closer to each other than `_LOOP` are joined.
-_BEND, _LOOP = 0.5, 0.99
+# Multiples of SRTL_ACCURACY. Points that bend the path by less than the bend tolerance are removed. Segments that come
+# closer to each other than the loop tolerance are joined.
+_BEND_TOLERANCE, _LOOP_TOLERANCE = 0.5, 0.99
 
 
 class SmartPath:
@@ -307,7 +307,7 @@ class SmartPath:
     def take_way_back(self) -> list[Ned]:
         """Return the simplified path, starting with its last point, and clear the recorded path."""
         accuracy = self._vehicle.parameters["SRTL_ACCURACY"]
-        path = prune(simplify(self._points, _BEND * accuracy), _LOOP * accuracy)
+        path = prune(simplify(self._points, _BEND_TOLERANCE * accuracy), _LOOP_TOLERANCE * accuracy)
         self._points.clear()
         self._cleaned_count = 0
         return path[::-1]
@@ -318,7 +318,7 @@ class SmartPath:
         self._cleaned_count = len(self._points)
 
     def update(self) -> None:
-        """Record the current position if it is far enough from the last point."""
+        """Start the path or add the current position to it. Deactivate the path after 15 s in which this fails."""
         vehicle = self._vehicle
         if not self.is_active:
             if not self._is_started and vehicle.navigation.has_position:
@@ -344,9 +344,9 @@ class SmartPath:
             return True
         new_count = len(self._points) - self._cleaned_count
         if new_count >= _CLEAN_UP_AFTER_POINTS or len(self._points) >= maximum:
-            self._points = simplify(self._points, _BEND * accuracy)
+            self._points = simplify(self._points, _BEND_TOLERANCE * accuracy)
             if len(self._points) >= maximum - _LOW_SPACE_POINTS:
-                self._points = prune(self._points, _LOOP * accuracy)
+                self._points = prune(self._points, _LOOP_TOLERANCE * accuracy)
             self._cleaned_count = len(self._points)
         is_space_low = len(self._points) >= maximum - _LOW_SPACE_POINTS
         if is_space_low and self._vehicle.now - self._warned_at > _LOW_SPACE_REPORT_INTERVAL_S:

@@ -69,7 +69,7 @@ class PlaneEngine(ArduPilotMotors):
         self.spool: float = self.throttle
 
 
-_REST_S = 1.0
+_MIN_REST_S = 1.0
 _LIFTING_MODES = range(PlaneMode.QSTABILIZE, PlaneMode.QACRO + 1)
 
 # Modes in the order of AVAILABLE_MODES. Modes for lifting rotors do not exist, as in the firmware with Q_ENABLE 0.
@@ -160,7 +160,7 @@ class SimulatedPlane(PlaneHost):
         return flags | MavModeFlag.MANUAL_INPUT_ENABLED | MavModeFlag.CUSTOM_MODE_ENABLED | armed
 
     def move(self, dt: float) -> None:
-        """Move by ``dt`` seconds. A plane that rests for a while counts as landed."""
+        """Move for ``dt`` seconds. A plane that rests for a while counts as landed."""
         wing = self.wing
         was_on_ground = wing.is_on_ground
         wing.step(dt, powered=self.motors.is_armed and not self.faults.motor_failed)
@@ -168,7 +168,7 @@ class SimulatedPlane(PlaneHost):
             self.info(f"SIM Hit ground at {wing.impact_speed_m_s:f} m/s")
         is_resting = wing.is_at_rest and wing.throttle <= 0
         rested_for_s = self.rest_timer.seconds(is_resting, self.now)
-        if rested_for_s >= _REST_S:
+        if rested_for_s >= _MIN_REST_S:
             self.is_landed: bool = True
             wing.settle()  # stops the motion model
 

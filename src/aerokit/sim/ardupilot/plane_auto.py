@@ -45,9 +45,9 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.handlers: dict[int, Callable[[MissionItem], None]] = {
             Cmd.NAV_TAKEOFF: lambda item: self._go(item, _CLIMB),
             **dict.fromkeys((Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT), lambda item: self._go(item, _FLY)),
-            **dict.fromkeys((Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME), self._loiter),
-            **dict.fromkeys((Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT), self._loiter),
-            Cmd.NAV_LAND: self._land,
+            **dict.fromkeys((Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME), self._start_loiter),
+            **dict.fromkeys((Cmd.NAV_LOITER_TURNS, Cmd.NAV_LOITER_TO_ALT), self._start_loiter),
+            Cmd.NAV_LAND: self._start_landing,
             Cmd.NAV_RETURN_TO_LAUNCH: self._return,
             Cmd.CONDITION_DELAY: self._wait,
             Cmd.DO_CHANGE_SPEED: self._change_speed,
@@ -170,7 +170,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return is_complete
 
     def _has_passed(self, index: int) -> bool:
-        """Return True if the plane is within WP_RADIUS of the waypoint or has passed the waypoint."""
+        """Return True, and report it, if the plane is within WP_RADIUS of the waypoint or has passed the waypoint."""
         assert self._place is not None
         wing = self.vehicle.wing
         north, east, _ = self._place
@@ -197,11 +197,11 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._on_circle_since = math.nan
         self._turned_rad = self.radius = 0.0
 
-    def _loiter(self, item: MissionItem) -> None:
+    def _start_loiter(self, item: MissionItem) -> None:
         self._go(item, _LOITER)
         self.radius: float = item.param2 if item.command == Cmd.NAV_LOITER_TO_ALT else item.param3
 
-    def _land(self, item: MissionItem) -> None:
+    def _start_landing(self, item: MissionItem) -> None:
         """Start a landing at the position of the command."""
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle

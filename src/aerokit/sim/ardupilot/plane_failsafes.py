@@ -14,8 +14,8 @@ from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.motion import Ned
 
 _NONE, _SHORT, _LONG, _GCS = range(4)
-# The throttle failsafe starts after `_SILENT_S` without pulses, or after the throttle was low for `_COUNT_S`.
-_SILENT_S, _COUNT_S = 1.0, 0.2
+# The throttle failsafe starts after `_RADIO_TIMEOUT_S` without pulses, or after the throttle was low for `_MIN_BAD_S`.
+_RADIO_TIMEOUT_S, _MIN_BAD_S = 1.0, 0.2
 # Values of FS_SHORT_ACTN, FS_LONG_ACTN and FS_GCS_ENABL, and of the battery actions.
 _SHORT_BEST_GUESS, _SHORT_FBWA, _SHORT_DISABLED, _SHORT_FBWB = 0, 2, 3, 4
 _LONG_RTL, _LONG_GLIDE, _LONG_PARACHUTE, _LONG_AUTO, _LONG_AUTOLAND = range(1, 6)
@@ -77,7 +77,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         plane = self.vehicle
         checks_throttle = plane.parameters["THR_FAILSAFE"] != 0
         is_throttle_low = checks_throttle and plane.rc[RC_THROTTLE] <= plane.parameters["THR_FS_VALUE"]
-        return is_throttle_low or plane.now - self.radio_received_at > _SILENT_S
+        return is_throttle_low or plane.now - self.radio_received_at > _RADIO_TIMEOUT_S
 
     def _check_radio(self) -> None:
         """Detect the loss of the radio, which must last for a while."""
@@ -88,7 +88,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         bad_for = self._radio_bad.seconds(is_bad, plane.now)
         if not is_bad:
             self._set_radio_lost(is_lost=False)
-        elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _COUNT_S - 1e-6:  # tolerates rounding errors
+        elif plane.parameters["THR_FAILSAFE"] == 1 and bad_for >= _MIN_BAD_S - 1e-6:  # tolerates rounding errors
             self._set_radio_lost(is_lost=True)
 
     def _set_radio_lost(self, *, is_lost: bool) -> None:
@@ -222,7 +222,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.warn(text, MavSeverity.INFO)
 
     def _land_by_mission(self) -> bool:
-        """Start the landing sequence of the mission. Return False if the mission has no DO_LAND_START."""
+        """Start the landing sequence of the mission. Return False without a DO_LAND_START, or if AUTO is refused."""
         plane = self.vehicle
         items = enumerate(plane.missions.commands.items())
         land_start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)

@@ -269,7 +269,7 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """LOITER, and base of the modes that fly to a place (by default, that of the mode change) and circle there."""
+    """LOITER, and base of the modes that fly to a place (by default, where they were entered) and circle there."""
 
     flags: int = _NAVIGATES
 
@@ -332,7 +332,7 @@ class PlaneTakeOff(PlaneNavigatingMode):
         return self._is_climbing
 
     def update(self, dt: float) -> None:
-        """Climb out, then circle at the take-off position."""
+        """Climb out, then circle at the place that `_start` has set."""
         plane = self.vehicle
         if self._place is None:
             self._start()

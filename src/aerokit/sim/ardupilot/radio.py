@@ -121,7 +121,7 @@ _CENTRE, _SUB_MIN_PWM, _SUB_MAX_PWM, _SUB_SCALE = 1500, 1100, 1900, 0.4
 
 
 class ArduPilotJoystick:
-    """MANUAL_CONTROL of Copter and Plane: x is pitch, y roll, z throttle (0 to 1000), r yaw (-1000 to 1000).
+    """MANUAL_CONTROL of Copter and Plane: x is pitch, y roll, r yaw (each -1000 to 1000), z throttle (0 to 1000).
 
     Only messages from the ground station MAV_GCS_SYSID to this vehicle are used. They also count as heartbeats of that
     station. An axis overrides its channel like RC_CHANNELS_OVERRIDE. An axis without a value releases its channel.

@@ -25,13 +25,13 @@ _NEEDS_LOCATION = 1
 
 
 class RoverArming(ArduPilotArming[RoverHost]):
-    """ArduRover's arming checks. Only modes that use a position require it, unless ARMING_NEED_LOC is set."""
+    """ArduRover's arming checks. Only modes that use a position require one, unless ARMING_NEED_LOC is set."""
 
     def ahrs_reasons(self) -> Sequence[str]:
         return ()  # `position_reasons` includes these checks, because ArduRover runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
-        """Return the failures of the checks of GPS, then of the estimator and its position."""
+        """Return the failures of the GPS checks or, if there are none, those of the estimator checks."""
         rover = self.vehicle
         if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
             return ()
@@ -73,11 +73,11 @@ _MODES: dict[int, tuple[int, ...]] = {
     _LOITER_OR_HOLD: (RoverMode.LOITER, RoverMode.HOLD),
 }
 _RADIO, _GCS = "Radio", "GCS"
-_SILENT_S = 0.5
+_RADIO_TIMEOUT_S = 0.5
 _CONTINUE_MISSION = 2
 _ACTIVE_IN_HOLD = 1
 _EKF_REPORT_ONLY = 2
-_ESTIMATOR_TIMEOUT_S, _STUCK_S, _STUCK_M_S = 1.0, 2.0, 0.08
+_ESTIMATOR_TIMEOUT_S, _STUCK_TIMEOUT_S, _MAX_STUCK_SPEED_M_S = 1.0, 2.0, 0.08
 _HOLD_AND_DISARM = 2
 _DRIVES_ITSELF = frozenset(
     {RoverMode.AUTO, RoverMode.GUIDED, RoverMode.RTL, RoverMode.SMART_RTL, RoverMode.LOITER, RoverMode.CIRCLE}
@@ -112,7 +112,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         self._check_radio()
         self._check_ground_station()
         self._check_estimator()
-        self._check_wheels()
+        self._check_crash()
         super().update()
 
     def _check_radio(self) -> None:
@@ -124,7 +124,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.is_radio_lost = False
             return
         is_throttle_low = rover.rc[RC_THROTTLE] < parameters["FS_THR_VALUE"]
-        self.is_radio_lost: bool = is_throttle_low or rover.now - self.radio_received_at > _SILENT_S
+        self.is_radio_lost: bool = is_throttle_low or rover.now - self.radio_received_at > _RADIO_TIMEOUT_S
         self._update_link(_RADIO, is_lost=self.is_radio_lost)
 
     def _check_ground_station(self) -> None:
@@ -190,13 +190,13 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
                 rover.set_mode(RoverMode.HOLD)
             self.warn("EKF failsafe", MavSeverity.CRITICAL)
 
-    def _check_wheels(self) -> None:
-        """Detect that the rover does not move although its mode drives (FS_CRASH_CHECK)."""
+    def _check_crash(self) -> None:
+        """Apply FS_CRASH_CHECK if the rover does not move although its mode drives."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
         # The simulation has no obstacles: only a failed motor keeps the rover from driving.
         is_blocked = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
-        is_stuck = bool(action) and is_blocked and rover.motion.ground_speed_m_s < _STUCK_M_S
-        if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_S:
+        is_stuck = bool(action) and is_blocked and rover.motion.ground_speed_m_s < _MAX_STUCK_SPEED_M_S
+        if self._stuck.seconds(is_stuck, rover.now) >= _STUCK_TIMEOUT_S:
             self._stuck.reset()
             self.warn("Crash: Going to HOLD", MavSeverity.EMERGENCY)
             rover.set_mode(RoverMode.HOLD)
@@ -289,9 +289,9 @@ _MANUAL_INPUT = frozenset({"MANU", "ACRO", "STER"})
 class SimulatedRover(RoverHost):
     """ArduRover, as far as a client can observe it. `GroundMotion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. It has 1,235 parameters. Simulated modes: MANUAL, ACRO, STEERING and
-    SIMPLE (driven by the sticks), HOLD, LOITER and CIRCLE (which only stop), AUTO, GUIDED, RTL and SMART_RTL. Commands
-    to take off and land are UNSUPPORTED.
+    Takes the arguments of `ArduPilotVehicle`. The rover has 1,235 parameters. Simulated modes: MANUAL, ACRO, STEERING
+    and SIMPLE (driven by the sticks), HOLD, LOITER and CIRCLE (which only stop), AUTO, GUIDED, RTL and SMART_RTL.
+    Commands to take off and land are UNSUPPORTED.
 
     Not simulated: boats, driving in circles, braking before a fence.
     """

@@ -281,7 +281,7 @@ class RoverSubAuto(MissionMode):
         return True
 
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
-        """Return True if the vehicle has reached a waypoint and has waited there for param 1 seconds."""
+        """Return True if the vehicle has reached a waypoint and has waited there for the seconds in param 1."""
         if self._place is None:
             return False
         now = self.vehicle.now
@@ -294,7 +294,7 @@ class RoverSubAuto(MissionMode):
         return now - self._reached_at >= delay_s
 
     def _go(self, item: MissionItem) -> None:
-        """Travel to the position of a command. The vehicle stops there unless another waypoint follows."""
+        """Travel to the position of a command. The vehicle stops there to wait, or if no further waypoint follows."""
         vehicle = self.vehicle
         current: Ned = self._place or vehicle.motion.place
         self._reached_at = None

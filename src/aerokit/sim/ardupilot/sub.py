@@ -62,7 +62,7 @@ _BATTERY_DISARM, _BATTERY_SURFACE = 2, 3
 _PILOT_DISARM, _LEAK_SURFACE, _RADIO_SURFACE = 2, 2, 2
 _GCS_REPORT_INTERVAL_S, _LEAK_REPORT_INTERVAL_S, _HULL_REPORT_INTERVAL_S = 30.0, 20.0, 30.0
 _HULL_TIMEOUT_S = 2.0
-_SILENT_S = 1.0
+_RADIO_TIMEOUT_S = 1.0
 _STICKS, _STICK_MIDDLE = 6, 1500
 
 
@@ -102,10 +102,10 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         if is_receiving:
             self.radio_received_at: float = sub.now
         is_throttle_low = is_receiving and sub.rc[RC_THROTTLE] < sub.parameters["FS_THR_VALUE"]
-        is_lost = is_throttle_low or sub.now - self.radio_received_at >= _SILENT_S
+        is_lost = is_throttle_low or sub.now - self.radio_received_at >= _RADIO_TIMEOUT_S
         if not enabled:
             is_lost = False
-        elif not is_receiving and not is_lost:  # A silence below `_SILENT_S` changes nothing.
+        elif not is_receiving and not is_lost:  # A silence below `_RADIO_TIMEOUT_S` changes nothing.
             return
         if is_lost == self.is_radio_lost:
             return
@@ -248,11 +248,12 @@ _BASE = MavModeFlag.CUSTOM_MODE_ENABLED | MavModeFlag.STABILIZE_ENABLED | MavMod
 class SimulatedSub(SubHost):
     """ArduSub, as far as a client can observe it. `UnderwaterMotion` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. ``home`` is at the surface, so altitudes above home are negative. It has
-    1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the sticks), GUIDED,
-    AUTO and SURFACE. A mode that needs no position can be armed without a position. Take-off is UNSUPPORTED.
+    Takes the arguments of `ArduPilotVehicle`. ``home`` is at the surface, so altitudes above home are negative. The
+    vehicle has 1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the
+    sticks), GUIDED, AUTO and SURFACE. A mode that needs no position can be armed without a position. Take-off is
+    UNSUPPORTED.
 
-    Not simulated: currents, CIRCLE, SURFTRAK and MOTORDETECT. These modes behave like ALT_HOLD. A reboot moves the
+    Not simulated: currents, and CIRCLE, SURFTRAK and MOTORDETECT, which behave like ALT_HOLD. A reboot moves the
     vehicle to the surface.
     """
 

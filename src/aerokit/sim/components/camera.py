@@ -28,7 +28,7 @@ class CameraParameters(ExtendedParameters):
         super().__init__(camera, camera.definition)
 
     def refresh(self) -> None:
-        """Update the values that commands or the automatic exposure have changed."""
+        """Update the mode, the values of the automatic exposure, and the ISO, which is limited in video mode."""
         values, camera = self.values, self._camera
         if MODE in values:
             values[MODE] = int(camera.mode)
@@ -50,7 +50,7 @@ class CameraParameters(ExtendedParameters):
             self._camera.send(camera_settings(self._camera))
 
 
-_FORMAT_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
+_FORMAT_INTERVAL_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
 
 
 def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgress:
@@ -69,10 +69,10 @@ def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgre
         if command.param3 == 1.0:
             captures.clear()
 
-    return CommandProgress(_FORMAT_PERCENTS, _FORMAT_S, finish=finish)
+    return CommandProgress(_FORMAT_PERCENTS, _FORMAT_INTERVAL_S, finish=finish)
 
 
-def _at_once(handler: AsyncHandler) -> CommandHandler:
+def _synchronous(handler: AsyncHandler) -> CommandHandler:
     """Return a synchronous version of an ``async`` handler, which works because the handler never has to wait."""
 
     def execute(command: ReceivedCommand) -> int:
@@ -123,7 +123,7 @@ class SimulatedCamera(CameraBody):
 
     def commands(self) -> dict[int, CommandHandler]:
         return {
-            **{command: _at_once(handler) for command, handler in camera_commands(self).items()},
+            **{command: _synchronous(handler) for command, handler in camera_commands(self).items()},
             MavCmd.STORAGE_FORMAT: lambda command: _format(self, command),
             **legacy_requests(self._streams),
         }

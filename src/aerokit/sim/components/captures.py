@@ -67,7 +67,7 @@ class MemoryCard:
 FOCAL_LENGTH_MM = 4.5
 """Focal length without zoom."""
 _ZOOM_FACTOR = 10.0
-_STEP_PERCENT, _PERCENT_S = 10.0, 20.0
+_STEP_PERCENT, _MAX_SPEED_PERCENT_S = 10.0, 20.0
 _HALF_RANGE_FOCUS_M = 10.0
 _SHARP_PERCENT = 50.0
 _AUTO = (SetFocusType.AUTO, SetFocusType.AUTO_SINGLE, SetFocusType.AUTO_CONTINUOUS)
@@ -94,7 +94,7 @@ class Axis:
         """Move at this speed, from -1 to 1. 0 stops the movement."""
         self._start_percent = self.percent
         self._start_at = self._now()
-        self._speed = max(-1.0, min(1.0, speed)) * _PERCENT_S
+        self._speed = max(-1.0, min(1.0, speed)) * _MAX_SPEED_PERCENT_S
 
     def step(self, steps: float) -> None:
         """Move by ``steps`` tenths of the range."""
@@ -102,7 +102,7 @@ class Axis:
 
 
 class Lens:
-    """Zoom (up to ten times) and focus of a camera. Automatic focus sets the focus to 50 percent."""
+    """Zoom (up to 10x) and focus of a camera. Automatic focus sets the focus to 50 percent."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self.zoom: Axis = Axis(now)

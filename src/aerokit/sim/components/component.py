@@ -69,7 +69,7 @@ class SimulatedComponent:
     addressed to the component, and ignored if it is a broadcast. The component's `faults` apply in addition to those of
     the vehicle.
 
-    A component belongs to one vehicle. Adding it to a second vehicle raises InvalidArgument.
+    A component belongs to one vehicle. Adding it again raises InvalidArgument.
     """
 
     TYPE: ClassVar[int]
@@ -125,7 +125,7 @@ class SimulatedComponent:
     def join(self, vehicle: SimulatedVehicle) -> None:
         """Add the component to a vehicle. The vehicle calls this method."""
         if self._vehicle is not None:
-            raise InvalidArgument("the component is already on another vehicle; create a component for each vehicle")
+            raise InvalidArgument("the component already belongs to a vehicle; create a component for each vehicle")
         self._vehicle = vehicle
         self._streams.builders = self.builders()
         self._commands = {**self._streams.commands(), **self.commands()}

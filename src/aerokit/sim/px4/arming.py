@@ -27,7 +27,7 @@ _PERCENT_PER_SIDE = 17
 
 
 def _side_texts(sensor: str, sides_done: int) -> list[str]:
-    """Return the texts before the measurement of a side, after ``sides_done`` sides (calibration_routines.cpp)."""
+    """Return the texts that PX4 sends before it measures a side, once ``sides_done`` are done."""
     side = _SIDES[-1 - sides_done]  # The simulated user rotates the vehicle to the last side first.
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",
@@ -63,8 +63,10 @@ class Px4Calibration:
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
+            # PX4 only refuses a request for another calibration (calibration_routines.cpp, calibrate_cancel_check). The
+            # simulation also cancels.
             self._cancel()
-            is_cancellation = sensor == ""  # A command without a sensor cancels the calibration.
+            is_cancellation = sensor == ""
             return MavResult.ACCEPTED if is_cancellation else MavResult.TEMPORARILY_REJECTED
         if sensor in _AUTOMATIC_CALIBRATIONS:
             self._start(sensor)
@@ -200,9 +202,9 @@ class Px4Arming:
         px4 = self._px4
         if px4.is_armed:
             return True
-        is_booting = not px4.is_ready and not px4.faults.prearm_failures
-        if is_booting:
-            return False  # PX4 refuses without a text.
+        has_simulated_failures = bool(px4.faults.prearm_failures)
+        if not px4.is_ready and not has_simulated_failures:
+            return False  # During the boot, PX4 refuses without a text.
         if self._calibration.is_running:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: calibrating")
             return False

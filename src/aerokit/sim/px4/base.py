@@ -161,7 +161,7 @@ class Px4Vehicle(Px4Host):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
-        """Create the parts that receive messages. They exist once, also after a reboot."""
+        """Create the parts that receive messages. A reboot does not replace them."""
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
         self.external: Px4External = Px4External(self)
@@ -277,7 +277,7 @@ class Px4Vehicle(Px4Host):
         self.switch_to(modes.TERMINATION)
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request. An armed vehicle refuses a mode that cannot run, except LAND (returns False)."""
+        """Handle a mode request. Return False if the vehicle is armed and the mode, other than LAND, cannot run."""
         if self.is_armed and mode != modes.LAND and not self.can_run(mode):
             return False
         if mode not in _MODES_ENDED_BY_LANDING:

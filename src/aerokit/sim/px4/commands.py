@@ -41,7 +41,7 @@ _UNANSWERED = (
 
 _GRIP_DURATION_S = 1.3
 _TUNING_STEP_S, _TUNING_PROGRESS = 2.0, (0, 20, 40, 60, 80, 95)
-_TRANSITION_S = 4.0
+_TRANSITION_DURATION_S = 4.0
 _NO_TRANSITION = frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
@@ -49,7 +49,7 @@ _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    """Return the handlers of the commands that have no object of their own."""
+    """Return handlers of commands with a fixed answer, and of failures, log stream, gripper, actuators and storage."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None sends no acknowledgement.
     handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
@@ -182,7 +182,7 @@ class _Flight:
         self._tuning_since = math.nan  # start of the autotuning; NaN while it does not run
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
-        """Handle COMPONENT_ARM_DISARM."""
+        """Handle COMPONENT_ARM_DISARM. A param 1 other than 0 and 1 is not acknowledged."""
         force = command.param2 == _FORCE_MAGIC
         arm = round(command.param1) if math.isfinite(command.param1) else None
         if arm == 1:
@@ -233,7 +233,7 @@ class _Flight:
         return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Handle MISSION_START: select the first item, enter MISSION, and arm."""
+        """Handle MISSION_START: select the item in param 1 (-1: no change), enter MISSION, and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
@@ -298,7 +298,7 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
-        """Start the autotuning, or report its progress. At the end, it waits for disarming (MC_AT_APPLY 1)."""
+        """Start the autotuning, or report its progress. The last step waits for disarming (MC_AT_APPLY 1)."""
         px4 = self._px4
         if command.param1 != 1.0 or command.param2 != 0.0:
             return MavResult.DENIED
@@ -322,7 +322,7 @@ class _Flight:
         is_forward = requested_state == MavVtolState.FW
         if px4.vtol_state != requested_state:
             px4.vtol_state = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
-            px4.call_later(_TRANSITION_S, lambda: setattr(px4, "vtol_state", requested_state))
+            px4.call_later(_TRANSITION_DURATION_S, lambda: setattr(px4, "vtol_state", requested_state))
         return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:

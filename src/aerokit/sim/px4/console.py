@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 # Sizes of the fields `data` of SERIAL_CONTROL and LOGGING_DATA.
 _SERIAL_BYTES, _LOGGING_BYTES = 70, 249
-_STEP_S, _MAX_TRIES = 0.05, 50
+_BLOCK_INTERVAL_S, _MAX_TRIES = 0.05, 50
 _DEFINITION_BLOCKS = 2
 _HEADER = b"ULog\x01\x12\x35\x01" + bytes(8)
 
@@ -82,7 +82,7 @@ class Px4LogStream:
         self._station = command.sender
         self._channel = command.channel
         self._sequence = self._tries = self._acknowledged = 0
-        self._px4.call_later(_STEP_S, self._run)
+        self._px4.call_later(_BLOCK_INTERVAL_S, self._run)
         return MavResult.ACCEPTED
 
     def stop(self, _: ReceivedCommand) -> int:
@@ -118,7 +118,7 @@ class Px4LogStream:
         self._px4.send(block, self._channel)
         if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.
             self._sequence += 1
-        self._px4.call_later(_STEP_S, self._run)
+        self._px4.call_later(_BLOCK_INTERVAL_S, self._run)
 
 
 def _ulog_message(number: int) -> bytes:

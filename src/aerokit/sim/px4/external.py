@@ -106,7 +106,7 @@ class PrecisionLanding:
         self._search_count = 0
 
     def update(self) -> None:
-        """Approach the target, and descend while the vehicle is above it. Search it if it is lost."""
+        """Approach the target, and descend while the vehicle is above it. Search for it if it is lost."""
         px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
         if target is None or self._search_count > parameters["PLD_MAX_SRCH"]:

@@ -282,7 +282,7 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), Action.NONE)
 
     def _sticks_action(self) -> FailsafeAction:
-        """Return the action for lost sticks, or NONE if sticks were never received since arming."""
+        """Return the action for the loss of stick input; NONE if no stick input was received since arming."""
         sticks = self._px4.sticks
         self._had_manual_control = self._had_manual_control or sticks.are_fresh
         is_lost = self._had_manual_control and not sticks.are_fresh
@@ -291,7 +291,7 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), Action.NONE)
 
     def _position_action(self) -> FailsafeAction:
-        """Return LAND, which descends without a position, if a mode that needs a position was without for 5 s."""
+        """Return LAND, which descends without a position, if a mode that needs a position had none for 5 s."""
         px4 = self._px4
         if px4.has_position:
             self._position_at = px4.now
@@ -355,8 +355,8 @@ class Px4Failsafes:
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
         """Update the active failures.
 
-        A new failure starts the delay of its action, and ends an override by the user. An action stays active until
-        the user changes the mode.
+        A new or more severe action starts the delay, and a new one also ends an override by the user. An action more
+        severe than WARN stays active until the user changes the mode.
         """
         for cause, action in failing.items():
             if cause not in self._active and action >= Action.HOLD:
@@ -393,7 +393,8 @@ class Px4Failsafes:
         """Start an action that differs from the present one, or end the failsafe (`Action.NONE`)."""
         if action == self.action:
             return
-        px4, previous, self.action = self._px4, self.action, action
+        px4, previous = self._px4, self.action
+        self.action = action
         px4.is_in_failsafe = action > Action.WARN
         is_escalation = action > max(previous, Action.WARN)
         if is_escalation and action < Action.TERMINATE:  # `terminate` sends its own texts.

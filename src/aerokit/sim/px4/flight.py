@@ -96,7 +96,7 @@ def _place(px4: Px4Host, item: MissionItem) -> Ned:
 
 _SPOOL_UP_S = 1.8
 _ARRIVED_M = 0.5
-_YAW_FROM_M_S = 0.5
+_MIN_SPEED_TO_TURN_M_S = 0.5
 
 
 class Px4Flight:
@@ -226,7 +226,7 @@ class Px4Flight:
         motion = self._vehicle.motion
         if self.heading is not None:
             motion.face(self.heading)
-        elif motion.ground_speed_m_s > _YAW_FROM_M_S:
+        elif motion.ground_speed_m_s > _MIN_SPEED_TO_TURN_M_S:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def descend(self) -> None:
@@ -242,7 +242,7 @@ class Px4Flight:
         return slow + (fast - slow) * share
 
     def _plan_return(self) -> None:
-        """Plan a return at RTL_RETURN_ALT above the landing point, or at RTL_DESCEND_ALT to a near landing point."""
+        """Plan a return at RTL_RETURN_ALT above the landing point or, within RTL_MIN_DIST of it, at RTL_DESCEND_ALT."""
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.place

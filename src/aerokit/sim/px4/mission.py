@@ -81,7 +81,7 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about a wrong sequence of DO_LAND_START, landing and return; None if it is right."""
+    """Return PX4's text about an invalid order of DO_LAND_START, landing and return; None if it is valid."""
     # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):
@@ -168,7 +168,7 @@ class Px4Mission:
 
     @property
     def state(self) -> int:
-        """MISSION_STATE. While the mission is not flown, the state does not change until an item was reached."""
+        """MISSION_STATE. Outside mission mode, it is kept if no item was reached and ``current`` is above 0."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -250,13 +250,13 @@ class Px4Mission:
                 self._finish()
                 return
             if item.command in _WITH_PLACE or item.command == Cmd.NAV_DELAY:
-                self._aim(item)
+                self._set_target_for(item)
                 return
             if item.command == Cmd.DO_JUMP:
                 self.current = self._index_after_jump(item)
                 continue
             self._execute(item)
-            self._reach()
+            self._mark_reached()
             if not self._advance():
                 return
 
@@ -274,7 +274,7 @@ class Px4Mission:
             self._px4.info("Returning to launch")
 
     def _index_after_jump(self, item: MissionItem) -> int:
-        """Return the index of the item after a DO_JUMP. PX4 counts its jumps, and sends the item to the last client."""
+        """Return the index of the item after a DO_JUMP. PX4 counts the jumps, and sends the item to the last client."""
         index = self.current
         jumps_done = self._jumps.get(index, 0)
         if jumps_done >= item.param2:
@@ -285,7 +285,7 @@ class Px4Mission:
         is_target_valid = 0 <= item.param1 < self.count
         return int(item.param1) if is_target_valid else index + 1
 
-    def _aim(self, item: MissionItem) -> None:
+    def _set_target_for(self, item: MissionItem) -> None:
         """Set the flight's target for an item that begins."""
         px4, motion = self._px4, self._px4.motion
         self._phase = "go"
@@ -347,9 +347,9 @@ class Px4Mission:
             self._arrived_at = self._px4.now
         if item.command in _LANDINGS:
             self._phase = "land"
-            self._reach()
+            self._mark_reached()
         elif self._is_done(item):
-            self._reach()
+            self._mark_reached()
             if item.autocontinue and self._advance():
                 self._begin_item()
 
@@ -377,7 +377,7 @@ class Px4Mission:
     def on_landed(self) -> None:
         """Handle a landing, which completes a landing item."""
         if self._px4.mode == MISSION and self._phase == "land" and not self.is_finished:
-            self._reach()
+            self._mark_reached()
             if self._advance():
                 self._begin_item()
 
@@ -405,7 +405,7 @@ class Px4Mission:
         if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
             self._px4.change_mode(HOLD)
 
-    def _reach(self) -> None:
+    def _mark_reached(self) -> None:
         """Report the current item as reached. Of several items in the same tick, only the last is reported."""
         if self.reached == self.current:
             return

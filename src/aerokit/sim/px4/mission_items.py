@@ -19,9 +19,9 @@ _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
 assert _DATA is not None
 _ROWS = list(csv.DictReader(_DATA.decode().splitlines()))
 # Storage types (see `_CONVERSIONS`) of params 1 to 4 of each command that is allowed in a global frame.
-_PLACES = {int(Cmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
+_COMMANDS_WITH_PLACE = {int(Cmd[row["command"]]): row["with_place"] for row in _ROWS if row["with_place"]}
 # Commands that are allowed in MAV_FRAME_MISSION. All their seven params are stored.
-_WITHOUT_PLACE = frozenset(int(Cmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
+_COMMANDS_WITHOUT_PLACE = frozenset(int(Cmd[row["command"]]) for row in _ROWS if row["without_place"] == "1")
 
 _ROI_COMMANDS = (Cmd.NAV_ROI, Cmd.DO_SET_ROI)
 _ROI_WITH_PLACE = (MavRoi.NONE, MavRoi.LOCATION)
@@ -95,7 +95,7 @@ def _as_fence_point(item: MissionItem) -> MissionItem:
 
 def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
     """Return an item of a global frame as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
-    layout = _PLACES.get(item.command)
+    layout = _COMMANDS_WITH_PLACE.get(item.command)
     if layout is None:
         return MavMissionResult.UNSUPPORTED
     command = item.command
@@ -110,7 +110,7 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
 
 def _without_place(item: MissionItem) -> MissionItem | int:
     """Return an item of MAV_FRAME_MISSION as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
-    if item.command not in _WITHOUT_PLACE:
+    if item.command not in _COMMANDS_WITHOUT_PLACE:
         return MavMissionResult.UNSUPPORTED
     p1, p2, command = item.param1, item.param2, item.command
     if command == Cmd.DO_JUMP:  # PX4 stores the target as int16 and the number of repetitions as uint16.

@@ -97,7 +97,7 @@ class Px4MissionServer(MissionServer):
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
             stored_items.append(stored_item)
-        self._store(mission_type, stored_items, checksum(items))
+        self._store_if_changed(mission_type, stored_items, checksum(items))
         return Result.ACCEPTED
 
     def capacity(self, mission_type: int) -> int:
@@ -113,7 +113,7 @@ class Px4MissionServer(MissionServer):
         """The mission."""
         return self.lists[MavMissionType.MISSION]
 
-    def _store(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
+    def _store_if_changed(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
         """Store a list, unless a list with the same opaque id is stored already."""
         if mission_type not in self.lists or (items and opaque_id == self.id(mission_type)):
             return
@@ -236,7 +236,7 @@ class Px4MissionServer(MissionServer):
             self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End a download, or cancel an upload. UNSUPPORTED changes the kind of the requests of an upload."""
+        """End a download, or cancel an upload. On UNSUPPORTED, an upload goes on with the other request message."""
         link = self._link(channel)
         if sender_of(ack) != link.client:
             self._warn("REJ. WP CMD: partner id mismatch")
@@ -278,7 +278,7 @@ class Px4MissionServer(MissionServer):
         if count.count > self.capacity(link.mission_type):
             self._answer(link, Result.NO_SPACE)
         elif count.count == 0:
-            self._store(link.mission_type, [], opaque_id=0, current=0)
+            self._store_if_changed(link.mission_type, [], opaque_id=0, current=0)
             self._answer(link, Result.ACCEPTED)
         else:
             link.items = []
@@ -331,7 +331,7 @@ class Px4MissionServer(MissionServer):
 
     def _finish(self, upload: ListUpload) -> None:
         link = self._link(upload.channel)
-        self._store(link.mission_type, link.items, link.opaque_id, link.current)
+        self._store_if_changed(link.mission_type, link.items, link.opaque_id, link.current)
         self._end(link, Result.ACCEPTED)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
@@ -343,7 +343,7 @@ class Px4MissionServer(MissionServer):
         link.mission_type = request.mission_type
         for kind in _CAPACITIES:
             if request.mission_type in (kind, MavMissionType.ALL):
-                self._store(kind, [], opaque_id=0, current=0)
+                self._store_if_changed(kind, [], opaque_id=0, current=0)
         self._answer(link, Result.ACCEPTED, sender_of(request))
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:

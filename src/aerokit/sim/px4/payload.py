@@ -59,7 +59,7 @@ class Px4Gimbal:
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:
-        """Called at power-on. Centre the gimbal and release its control."""
+        """Centre the gimbal and release control of it. Called at power-on."""
         parameters = self._px4.parameters
         self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
         self.rest()
@@ -87,6 +87,7 @@ class Px4Gimbal:
         """Return roll, pitch and yaw (radians) to which the gimbal is set at present."""
         if self._place is not None:
             return self._angles_to(self._place)
+        # The gimbal turns at only `_RATE_FACTOR` of the commanded rates, for at most `_RATE_TIMEOUT_S`.
         seconds = min(self._px4.now - self._target_at, _RATE_TIMEOUT_S) * _RATE_FACTOR
         angles = [angle + rate * seconds for angle, rate in zip(self._target, self._rates, strict=True)]
         roll, pitch, yaw = (
@@ -107,7 +108,7 @@ class Px4Gimbal:
         return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Turn to angles (NaN keeps the present ones), and then at rates. The flag RETRACT has no effect."""
+        """Set the angles (NaN keeps the present ones) and the rates at which they change. RETRACT changes nothing."""
         if flags & Flags.RETRACT:
             return
         current = self.angles()
@@ -244,7 +245,7 @@ _GEOTAG_DELAY_S = 0.02
 
 
 class Px4CameraTrigger:
-    """Camera trigger. Each image sends CAMERA_TRIGGER and, with ``sends_image_captured``, CAMERA_IMAGE_CAPTURED.
+    """Camera trigger. Sends CAMERA_TRIGGER for each image, and CAMERA_IMAGE_CAPTURED if ``sends_image_captured``.
 
     As on the real vehicle, commands to a disabled trigger are not answered.
     """
@@ -294,7 +295,7 @@ class Px4CameraTrigger:
         return MavResult.ACCEPTED
 
     def _enable_or_pause(self, command: ReceivedCommand) -> int | None:
-        """Handle DO_TRIGGER_CONTROL. Param 1 enables (1) or disables (0) the trigger, and param 3 pauses it.
+        """Handle DO_TRIGGER_CONTROL. Param 1 enables (1) or disables (0) triggering, param 3 pauses (1) or resumes (0).
 
         Param 2 is 1 to reset the sequence number of the images. A param of -1 changes nothing.
         """

@@ -117,10 +117,10 @@ class _Writer(FileHandle):
                 raise self._rejection()
             self._announced = (count, size)
             self._pending = self._pending[HEADER.size :]
-        while self._parse_row():
+        while self._apply_next_entry():
             pass
 
-    def _parse_row(self) -> bool:
+    def _apply_next_entry(self) -> bool:
         """Apply the next entry. Return False if not all of its bytes were received yet."""
         pending = self._pending = self._pending.lstrip(b"\0")  # Zero bytes between two entries are padding.
         try:

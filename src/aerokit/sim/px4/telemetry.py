@@ -46,7 +46,7 @@ _MODE_PROPERTIES: dict[modes.Px4Mode, int] = {
     modes.TERMINATION: MavModeProperty.ADVANCED | MavModeProperty.NOT_USER_SELECTABLE,
 }
 
-_ALL_BUT_STILL = (
+_FLIGHT_FLAGS = (
     Ekf.ATTITUDE | Ekf.VELOCITY_HORIZ | Ekf.VELOCITY_VERT | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | Ekf.POS_VERT_ABS
 ) | (Ekf.POS_VERT_AGL | Ekf.PRED_POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_ABS)
 _BOOT_FLAGS = Ekf.ATTITUDE | Ekf.VELOCITY_VERT | Ekf.POS_VERT_ABS | Ekf.POS_VERT_AGL | Ekf.CONST_POS_MODE
@@ -105,7 +105,7 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
     """Build ESTIMATOR_STATUS."""
-    flags = _ALL_BUT_STILL
+    flags = _FLIGHT_FLAGS
     if not px4.is_armed:
         flags |= Ekf.CONST_POS_MODE
     if not px4.has_position:

@@ -75,7 +75,7 @@ _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
 # In a descent, the target altitude is below the plane by this time multiplied by the wanted sink rate. For such a
 # target, `FixedWing.climb_to` returns the wanted sink rate.
-_SINK_TARGET_S = 2.5
+_SINK_TARGET_LEAD_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
 
@@ -171,14 +171,14 @@ class Px4PlaneFlight(Px4Flight):
     def circle_down(self) -> None:
         sink = self._plane.parameters["FW_T_SINK_MIN"]
         north, east, _ = self.target
-        self.target = (north, east, self._motion.down + sink * _SINK_TARGET_S)
-        self._touch_down(self.circle)
+        self.target = (north, east, self._motion.down + sink * _SINK_TARGET_LEAD_S)
+        self._land(self.circle)
 
     def descend(self) -> None:
         """Follow the glide path (FW_LND_ANG) to the target on the ground."""
-        self._touch_down(self._glide)
+        self._land(self._glide)
 
-    def _touch_down(self, approach: Callable[[], None]) -> None:
+    def _land(self, approach: Callable[[], None]) -> None:
         """Land: call ``approach`` until the flare, then touch down and roll out."""
         motion = self._motion
         height = motion.ground_down - motion.down
@@ -232,7 +232,7 @@ class Px4PlaneFlight(Px4Flight):
 _TAKE_OFFS = (Cmd.NAV_TAKEOFF, Cmd.NAV_VTOL_TAKEOFF)
 _LANDINGS = (Cmd.NAV_LAND, Cmd.NAV_VTOL_LAND)
 _CIRCLES = (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_LOITER_TO_ALT)
-_TURN_S = 2.0
+_TURN_LEAD_S = 2.0
 
 
 class Px4PlaneMission(Px4Mission):
@@ -246,9 +246,9 @@ class Px4PlaneMission(Px4Mission):
         super()._climb(down)
         self._plane.flight.course = self._plane.motion.yaw
 
-    def _aim(self, item: MissionItem) -> None:
+    def _set_target_for(self, item: MissionItem) -> None:
         """Set the flight's target and the radius of its circle for an item that begins."""
-        super()._aim(item)
+        super()._set_target_for(item)
         flight = self._plane.flight
         radius = 0.0
         if item.command in (Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME):
@@ -298,7 +298,7 @@ class Px4PlaneMission(Px4Mission):
             self._complete_item(item)
 
     def _complete_item(self, item: MissionItem) -> None:
-        self._reach()
+        self._mark_reached()
         if item.autocontinue and self._advance():
             self._begin_item()
 
@@ -309,7 +309,7 @@ class Px4PlaneMission(Px4Mission):
         plane, motion = self._plane, self._plane.motion
         north, east, down = plane.flight.target
         # A fast plane must turn earlier.
-        radius = max(plane.parameters["NAV_ACC_RAD"], _TURN_S * motion.airspeed_m_s)
+        radius = max(plane.parameters["NAV_ACC_RAD"], _TURN_LEAD_S * motion.airspeed_m_s)
         if item.command == Cmd.NAV_WAYPOINT:
             radius = max(radius, item.param2)
         elif item.command in _CIRCLES:
