@@ -166,6 +166,9 @@ def test_manual_calibration_runs_until_cancelled() -> None:
     assert client.last(m.Heartbeat).system_status == MavState.CALIBRATING
     assert client.command(ARM, 1) == MavResult.TEMPORARILY_REJECTED
     assert client.texts[-1] == "Arming denied: calibrating\t"
+    assert client.command(MavCmd.PREFLIGHT_CALIBRATION, 1) == MavResult.TEMPORARILY_REJECTED
+    assert client.texts[-1] == "command denied during calibration: 241\t"
+    assert client.last(m.Heartbeat).system_status == MavState.CALIBRATING
     assert client.command(MavCmd.PREFLIGHT_CALIBRATION) == MavResult.ACCEPTED
     assert client.texts[-1] == "[cal] calibration cancelled"
     assert client.command(ARM, 1) == MavResult.ACCEPTED

@@ -63,11 +63,11 @@ class Px4Calibration:
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
-            # PX4 only refuses a request for another calibration (calibration_routines.cpp, calibrate_cancel_check). The
-            # simulation also cancels.
+            if sensor:  # calibration_routines.cpp, calibrate_cancel_check
+                self._px4.send_text(MavSeverity.CRITICAL, f"command denied during calibration: {command.command}\t")
+                return MavResult.TEMPORARILY_REJECTED
             self._cancel()
-            is_cancellation = sensor == ""
-            return MavResult.ACCEPTED if is_cancellation else MavResult.TEMPORARILY_REJECTED
+            return MavResult.ACCEPTED
         if sensor in _AUTOMATIC_CALIBRATIONS:
             self._start(sensor)
             self._measure(*_AUTOMATIC_CALIBRATIONS[sensor])
