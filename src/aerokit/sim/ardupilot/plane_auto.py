@@ -357,7 +357,6 @@ class PlaneSetpoints:
             return
         point = plane.world_point(0, 0, message.alt, message.coordinate_frame)  # Only the altitude is used.
         if point is None:
-            plane.info(f"Unknown mavlink coordinate frame {message.coordinate_frame}")
             plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
         elif not message.type_mask & PositionMask.Z_IGNORE:
             _north, _east, down = point

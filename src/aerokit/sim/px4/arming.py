@@ -64,7 +64,7 @@ class Px4Calibration:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
             if sensor:  # calibration_routines.cpp, calibrate_cancel_check
-                self._px4.send_text(MavSeverity.CRITICAL, f"command denied during calibration: {command.command}\t")
+                self._px4.send_text(MavSeverity.CRITICAL, f"command denied during calibration: {command.command}")
                 return MavResult.TEMPORARILY_REJECTED
             self._cancel()
             return MavResult.ACCEPTED
