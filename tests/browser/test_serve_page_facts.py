@@ -164,6 +164,7 @@ def test_page_reports_crash_and_lets_disarm(browser: Any) -> None:
         banner = page.locator("#crashes .silence")
         banner.filter(has_text=re.compile(r"Vehicle 1 hit the ground at \d+\.\d m/s at \d\d:\d\d:\d\d")).wait_for()
         page.locator("#readiness.bad strong", has_text="Crashed: propellers may turn").wait_for()
+        page.locator("button.urgent[data-order='disarm']").wait_for()
         assert "It is still armed" in banner.inner_text()
         for name in ("take_off", "pick"):
             assert page.locator(f"button[data-order='{name}'] small").inner_text() == "Crashed"

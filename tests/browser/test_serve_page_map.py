@@ -23,7 +23,8 @@ Copters = tuple[list[SimulatedCopter], str]
 OWN_MAP = """async () => {
     const { MapView } = await import("/static/map.js"), node = document.getElementById("map").cloneNode();
     document.getElementById("map").replaceWith(node);
-    window.view = new MapView(node, { picked: (position) => { window.picked = position; }, changed() {} });
+    const picked = (position) => { window.picked = position; }, chosen = (id) => { window.chosen = id; };
+    window.view = new MapView(node, { picked, chosen, changed() {} });
     const fence = { polygons: [], circles: [], rally: [] };
     window.show = (vehicles, items = []) => view.draw(vehicles, 1, { items, current: null }, null, fence);
     window.boxes = (selector) => [...node.querySelectorAll(selector)].map((each) => each.getBoundingClientRect())
@@ -108,6 +109,42 @@ def test_map_with_gap_draws_no_line_across_it(own_map: Any) -> None:
         return document.querySelector("#map .track").getAttribute("d").match(/M/g).length;
     }""")
     assert moves == 2
+
+
+def test_click_with_unsteady_hand_picks_target(own_map: Any) -> None:
+    x, y = own_map.evaluate("""() => {
+        const at = (east) => ({ latitude_deg: -35.36, longitude_deg: 149.165 + east * 1e-5 });
+        show([1, 2].map((id) => ({ id, position: at(id * 100), home: at(0), age: 0, heading: 0, labels: ["1"] })));
+        view.isPicking = true;
+        const [left, top, right, bottom] = boxes(".craft")[0];
+        return [(left + right) / 2, (top + bottom) / 2];
+    }""")
+    for east, south in ((0, 0), (3, 3)):
+        own_map.evaluate("window.picked = window.chosen = null")
+        own_map.mouse.move(x, y)
+        own_map.mouse.down()
+        own_map.mouse.move(x + east, y + south)
+        own_map.mouse.up()
+        assert own_map.evaluate("[picked !== null, chosen]") == [True, None]
+    own_map.evaluate("view.isPicking = false")
+    own_map.mouse.click(x + 5, y - 5)
+    assert own_map.evaluate("chosen") == 1  # the selected vehicle is drawn first
+
+
+def test_plan_begins_and_ends_at_home(own_map: Any) -> None:
+    """The take-off and the return have no position of their own."""
+    for last, count in (("NAV_RETURN_TO_LAUNCH", 3), ("NAV_LAND", 2)):
+        points = own_map.evaluate(
+            """(last) => {
+                const at = (east) => ({ latitude_deg: -35.36, longitude_deg: 149.165 + east * 1e-5 });
+                const items = [["NAV_TAKEOFF", null], ["NAV_WAYPOINT", at(100)], [last, null]];
+                show([{ id: 1, position: at(0), home: at(0), age: 0, heading: 0, labels: ["1"] }],
+                    items.map(([name, position], index) => ({ name, position, index })));
+                return document.querySelector("#map .plan").getAttribute("d").split(/[ML]/).length - 1;
+            }""",
+            last,
+        )
+        assert points == count
 
 
 def test_zoomed_and_dragged_map_is_not_fitted_again(browser: Any, copters: Copters) -> None:

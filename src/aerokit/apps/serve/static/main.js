@@ -14,7 +14,7 @@ const page = { vehicles: new Map(), selected: undefined, receivedAt: 0, atSecond
 const selected = () => page.vehicles.get(page.selected);
 
 const map = new MapView(byId("map"), {
-  picked: (place, y) => { pick(false); orders.goTo(place, targetAltitude(page.running(page.selected)) ?? heightNow(), y); }, changed: draw,
+  picked: (place, y) => { pick(false); orders.goTo(place, targetAltitude(page.running(page.selected)) ?? heightNow(), y); }, chosen: choose, changed: draw,
 });
 const big = new BigValues(byId("tiles-of-state"));
 const table = new StateTable();

@@ -8,11 +8,13 @@ const METRES_PER_DEGREE = 111195;
 const MAX_POINTS = 5000;
 const MAX_AGE_S = 3;
 const MIN_FITTED_M = 30;
+const CLICK_RADIUS = 20; // pixels around a vehicle in which a click selects it
 const BUTTONS_WIDTH = 52, BUTTONS_HEIGHT = 170; // pixels of the buttons at the top right
 const ARROW = "M0-15L10 11L0 6L-10 11Z", DISC = "M-8 0A8 8 0 1 1 8 0A8 8 0 1 1-8 0", CROSS = "M-14 0H14M0-14V14M9 0A9 9 0 1 1-9 0A9 9 0 1 1 9 0";
 const DIRECTIONS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
 L.Renderer.mergeOptions({ padding: 0.5 }); // so much is drawn around the view, for when it is dragged
+L.Draggable.mergeOptions({ clickTolerance: 8 }); // pixels that a hand may move during a click
 const pen = document.createElement("canvas").getContext("2d");
 pen.font = '600 12px system-ui, "DejaVu Sans", sans-serif'; // as the labels in page.css
 
@@ -43,21 +45,27 @@ function shape(className, path, degrees = 0) {
 const disc = (className, text) => L.divIcon({ className: `disc ${className}`, html: element("span", {}, text), iconSize: [22, 22] });
 
 export class MapView {
-  constructor(node, { picked, changed }) {
+  // picked(position, y): a target was clicked; chosen(id): a vehicle was clicked; changed(): the view has changed
+  constructor(node, { picked, chosen, changed }) {
     this.isMoved = false;
     this.follows = null;
     this.isPicking = false;
     this.isAutomatic = false; // the view is changed by this class, not by the user
     this.isFitted = false; // the view shows everything
     this.tracks = new Map();
+    this.crafts = new Map(); // where each vehicle is drawn
     this.layers = new Map(); // by key: the layer, and the text by which it is known whether it has changed
     this.leaflet = L.map(node, {
       center: [0, 0], zoom: 2, minZoom: 2, maxZoom: 24, zoomSnap: 0, zoomAnimation: false, zoomControl: false, attributionControl: false,
-      trackResize: false,
+      trackResize: false, wheelPxPerZoomLevel: 160,
     });
     for (const pane of ["grid", "plan"]) this.leaflet.createPane(pane); // page.css has their order
     L.control.scale({ imperial: false }).addTo(this.leaflet);
-    this.leaflet.on("click", (event) => { if (this.isPicking) picked(this.position(event.latlng), event.originalEvent.clientY); });
+    this.leaflet.on("click", ({ latlng, containerPoint, originalEvent }) => {
+      const clicked = [...this.crafts].find(([, at]) => this.leaflet.latLngToContainerPoint(at).distanceTo(containerPoint) <= CLICK_RADIUS);
+      if (this.isPicking) picked(this.position(latlng), originalEvent.clientY);
+      else if (clicked) chosen(clicked[0]);
+    });
     this.leaflet.on("zoomstart dragstart", () => { if (!this.isAutomatic) this.isMoved = true; });
     this.leaflet.on("dragstart", () => { this.follows = null; });
     this.leaflet.on("moveend", () => { if (!this.isAutomatic) changed(); });
@@ -142,7 +150,7 @@ export class MapView {
         if (followed) this.leaflet.setView(this.point(followed.position), this.leaflet.getZoom(), { animate: false });
         else if (!this.isMoved) this.fit(places);
       });
-      this.drawAll(vehicles, selected, { items, current: plan.current }, target, fence);
+      this.drawAll(vehicles, selected, { ...plan, items, all: plan.items }, target, fence);
     }
     for (const key of this.unused) {
       this.layers.get(key).layer.remove();
@@ -150,18 +158,19 @@ export class MapView {
     }
   }
 
-  drawAll(vehicles, selected, { items, current }, target, fence) {
+  drawAll(vehicles, selected, plan, target, fence) {
     const { x, y } = this.leaflet.getSize();
     // What labels must not cover, as [left, top, right, bottom]: the buttons and the scale, then what is drawn.
     this.taken = [[x - BUTTONS_WIDTH, 0, x, BUTTONS_HEIGHT], [0, y - 36, 130, y]];
     this.drawGrid();
     for (const [id, track] of this.tracks) this.drawTrack(id, track, id === selected);
     this.drawFence(fence);
-    this.drawPlan(items, current, selected ?? 1);
-    for (const { id, home } of vehicles) if (home) this.mark(`home ${id}`, home, [`home`, "H"], disc, { id });
     const chosen = vehicles.find((each) => each.id === selected);
+    this.drawPlan(plan, chosen);
+    for (const { id, home } of vehicles) if (home) this.mark(`home ${id}`, home, [`home`, "H"], disc, { id });
     if (target) this.drawTarget(target, chosen?.position);
     const drawn = vehicles.filter((each) => each.position).sort((a, b) => (b.id === selected) - (a.id === selected));
+    this.crafts = new Map(drawn.map((each) => [each.id, this.point(each.position)]));
     for (const each of drawn) this.drawVehicle(each, each.id === selected);
     for (const each of drawn) this.label(each);
   }
@@ -218,10 +227,16 @@ export class MapView {
     rally.forEach((each, index) => this.mark(`rally ${index}`, each, ["rally", "R"], disc));
   }
 
-  drawPlan(items, current, id) {
-    const points = items.map((item) => this.point(item.position));
+  // The line begins at home, and ends there if the mission does. all: also the items without a position
+  drawPlan({ items, all, current }, vehicle) {
+    const places = items.map((item) => item.position), home = vehicle?.home;
+    if (home && all.length) places.unshift(home);
+    if (home && all.at(-1)?.name === "NAV_RETURN_TO_LAUNCH") places.push(home);
+    const points = places.map((place) => this.point(place));
     this.put("plan", points, () => L.polyline(points, { className: "plan", pane: "plan", interactive: false }));
-    for (const { index, position } of items) this.mark(`item ${index}`, position, [`item ${index === current ? "current" : ""}`, index], disc, { id });
+    for (const { index, position } of items) {
+      this.mark(`item ${index}`, position, [`item ${index === current ? "current" : ""}`, index], disc, { id: vehicle?.id ?? 1 });
+    }
   }
 
   drawTarget(position, vehicle) {

@@ -74,6 +74,7 @@ export class Orders {
       const title = why === "Cannot arm" ? `Cannot arm: ${vehicle.not_armable.join("; ")}` : why;
       if (button.disabled !== Boolean(why)) button.disabled = Boolean(why);
       if (button.title !== title) button.title = title;
+      button.classList.toggle("urgent", name === "disarm" && Boolean(vehicle?.crash));
       if (button !== this.modes) show(button.children[1], capitalized(why.split(": ").pop())); // the button is narrow
     }
   }
