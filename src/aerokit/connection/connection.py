@@ -71,7 +71,7 @@ HEARTBEAT_INTERVAL_S = 1.0
 class Connection:
     """One MAVLink node (system id, component id) on one link.
 
-    Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
+    Received bytes enter through ``bytes_received``. One framer per remote peer extracts frames, which go to ``bus``.
     ``send`` writes a message to the peer from which its target was last received; :class:`Routes` stores that peer
     and decides when it may change (``may_move``). Everything runs on the event loop's thread.
     """
@@ -133,7 +133,7 @@ class Connection:
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
 
     def _make_multilink(self, make_routes: Callable[[], Routes]) -> MultiLinkRoutes:
-        """Create the routes over several links, which get a :class:`Routes` of their own for each link."""
+        """Create the routes over several links, with one :class:`Routes` for each link."""
         # Imported here because few programs have several links.
         from aerokit.connection.multilink.routes import MultiLinkRoutes
         from aerokit.transport.multilink import MultiLink
@@ -276,8 +276,7 @@ class Connection:
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
         """Yield every autopilot on the link once, until the connection ends. Autopilots already known come first.
 
-        ``async for found in connection.vehicles(): async with aerokit.connect(connection,
-        system_id=found.system_id)…``
+        To use a vehicle, connect to it: ``aerokit.connect(connection, system_id=found.system_id)``.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
@@ -375,7 +374,8 @@ class Connection:
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
         """Return why signatures block communication with a component, for error texts; "" if they do not.
 
-        ``component_id`` 0 means all components of the system.
+        ``component_id`` 0 means all components of the system. Without a ``system_id``, only frames that this program
+        has refused are considered.
         """
         return self._gate.describe(
             heartbeat
@@ -394,7 +394,8 @@ class Connection:
     def close(self, error: Exception | None = None) -> None:
         """Close the link, cancel background tasks and raise ``error`` in all waiters. Never blocks; idempotent.
 
-        May be called inside the connection's block. The block continues, but its further calls on the connection raise.
+        A link that another connection has opened stays open. May be called inside the connection's block. The block
+        continues, but its further calls on the connection raise.
         """
         self._end(error or ConnectionClosed("the connection was closed"))
         if self._owns_link:

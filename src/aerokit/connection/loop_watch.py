@@ -187,9 +187,9 @@ IPYTHON_HINT = (
 
 
 def is_unintegrated_ipython() -> bool:
-    """Return True in IPython in a terminal without ``%gui asyncio``: the loop then runs only while an input runs."""
-    # `%gui asyncio` sets `active_eventloop`. Without it, IPython runs inputs on an event loop of its own, which stands
-    # still between inputs.
+    """Return True in terminal IPython without ``%gui asyncio``, where the event loop stands still at the prompt."""
+    # `%gui asyncio` sets `active_eventloop`. Without it, IPython has an event loop of its own, which runs only while
+    # entered code runs.
     module = sys.modules.get("IPython.terminal.interactiveshell")
     shell: Any = getattr(getattr(module, "TerminalInteractiveShell", None), "_instance", None)
     if shell is None or getattr(shell, "active_eventloop", None) == "asyncio":

@@ -246,7 +246,7 @@ class _Diagnosis:
         self._systems = {system for counters in statistics for system, _ in counters.sources}
 
     def text(self) -> str:
-        """Return the explanation, which depends on how far the received data could be interpreted."""
+        """Return why the wanted vehicle was not found, by how far the received data could be interpreted."""
         if not self._bytes:
             return "no bytes were received: is the vehicle on, and is it sending to this address?"
         if not self._frames:

@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Evidence in a frame of another peer: True if it continues the stream of the owner, None if unknown."""
+    """Evidence in a frame of another peer on whether it continues the stream of the route's owner; None if unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
@@ -207,9 +207,10 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers to which a message for a component goes; if the component is 0 or unknown, for its system.
+        """Return the peer of a component; if the component is 0 or unknown, those of its system, or else every peer.
 
-        Peers that send under the ids of another peer are excluded, because they would execute broadcasts.
+        Peers that send under the ids of another peer are excluded, because they would execute a message for the whole
+        system, too.
         """
         if system_id == 0:
             return EVERY_PEER

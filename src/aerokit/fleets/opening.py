@@ -313,7 +313,7 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
 
 
 class _BlockFailed(Exception):
-    """Raised in each vehicle's block if the fleet's block has failed. A vehicle left flying then logs a warning."""
+    """Raised in each vehicle's block if the fleet's block has failed. A vehicle left flying is then logged."""
 
 
 class MemberConnections:

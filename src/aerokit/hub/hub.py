@@ -266,7 +266,7 @@ class Hub:
             try:
                 listener(event)
             except Exception:
-                logger.exception("listener %r raised an exception; the other listeners are called", listener)
+                logger.exception("listener %r raised an exception; the others are still called", listener)
 
     def _on_change(self, kind: HubEventKind, source: int, port: Port, other_port: Port | None) -> None:
         """Report an event of the router about the sender ``source`` (system id + 256 · component id)."""

@@ -47,7 +47,7 @@ class FrameQueue:
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._last_key = 0  # the negative key that was used last
-        # If there are no commands or no telemetry frames, the queue is not searched for them.
+        # Numbers of queued commands and telemetry frames. While one is 0, the queue is not searched for such frames.
         self._order_count = 0
         self._telemetry_count = 0
 

@@ -80,7 +80,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that comes first in `STANDARD_FILES`, and with the added remarks."""
+    """Return ``existing`` with the origin of the two that is first in `STANDARD_FILES`, and any added remarks."""
     origin = min(
         existing.origin,
         added.origin,
@@ -90,7 +90,7 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
 
 
 def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
-    """Return the fields of both definitions. An added field keeps the type of an existing one."""
+    """Return the fields of both definitions. If both have a field, its type is the existing one."""
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:
         existing_field = fields.get(field.name)
@@ -318,7 +318,7 @@ def generate(folder: Path | None = None) -> dict[str, str]:
 
 
 def differences(folder: Path | None = None) -> list[str]:
-    """Return the committed files that differ from the generated files."""
+    """Return the paths of committed files that are missing, superfluous, or differ from the generated files."""
     files = generate(folder)
     present = {
         path.relative_to(FOLDER).as_posix()

@@ -172,7 +172,7 @@ def _message_definition(cls: Any) -> MessageDefinition:
 
 
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
-    """Return the definition with its extension fields marked, which pymavlink's classes do not tell.
+    """Return the definition with its extension fields marked. pymavlink's classes do not mark them.
 
     Each possible number of base fields is tried, until CRC_EXTRA and the wire order match.
     """

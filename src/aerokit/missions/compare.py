@@ -159,7 +159,7 @@ def _px4_letters(item: MissionItem) -> str:
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the converted value. Yield nothing if the conversion overflows, because the result is undefined in C."""
+    """Yield the value as stored in the form that ``letter`` stands for; nothing if a C conversion is undefined."""
     if letter == "-":  # not stored
         yield 0.0
     elif letter == "2":  # always 2
@@ -179,7 +179,7 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
-    """Yield a finite value in the form that ``letter`` stands for, other than an integer with a range."""
+    """Like `_convert`, for finite values and for letters other than those of integers with a range."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float
         yield struct.unpack("<f", struct.pack("<f", value))[0]

@@ -163,7 +163,7 @@ class CameraDefinition(Snapshot):
         return options
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
-        """Return the options of a setting, and the selected options of other settings that restrict them."""
+        """Return the options that a setting has now, and as texts the selected options of others that restrict them."""
         options = self.settings[name].options if name in self.settings else ()
         reasons: list[str] = []
         for setting, selected in self._selected(values):
@@ -222,7 +222,7 @@ def load_definition(path: str | os.PathLike[str]) -> CameraDefinition:
 
 
 def parse_definition(data: bytes, source: str = "camera definition") -> CameraDefinition:
-    """Parse the content of a camera definition file. Errors begin with ``source``."""
+    """Parse the content of a camera definition file. Error texts begin with ``source``."""
     from xml.etree.ElementTree import ParseError
 
     from defusedxml import ElementTree as DefusedXml

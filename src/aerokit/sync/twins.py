@@ -298,8 +298,8 @@ class StateCell(CellTwin[T]):
         single message is not missed. Exceptions of the predicate are raised here.
 
         Raises:
-            OperationTimeout: the condition was not met within ``timeout`` seconds; the text has ``description`` and the
-                last values.
+            OperationTimeout: the condition was not met within ``timeout`` seconds; the error names ``description`` and
+                the last values.
         """
         return self._loop.run(
             self.aio.wait_until,
@@ -322,10 +322,10 @@ class StateCell(CellTwin[T]):
 
 
 class Changes(ChangesTwin[T]):
-    """Endless asynchronous iterator over the values of a cell.
+    """Asynchronous iterator over the values of a cell.
 
-    Iteration raises the error with which the cell was closed. While the iterator exists, every received message of the
-    cell is decoded.
+    Iteration ends only when the cell is closed, by raising the error with which it was closed. While the iterator
+    exists, every received message of the cell is decoded.
     """
 
     @property
@@ -369,7 +369,7 @@ class Subscription(SubscriptionTwin[ItemT]):
 class Connection(ConnectionTwin):
     """One MAVLink node (system id, component id) on one link.
 
-    Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
+    Received bytes enter through ``bytes_received``. One framer per remote peer extracts frames, which go to ``bus``.
     ``send`` writes a message to the peer from which its target was last received; :class:`Routes` stores that peer
     and decides when it may change (``may_move``). Everything runs on the event loop's thread.
     """

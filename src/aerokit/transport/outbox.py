@@ -98,7 +98,7 @@ class Outbox:
         self._forwarded_bytes -= count
 
     def close(self) -> None:
-        """Forward waiting data; if the transport is stalled, drop it. Afterwards, only ``dropped`` is called."""
+        """Forward waiting data; if the transport is stalled, drop it. Afterwards, ``stalled`` is not called."""
         if self._is_closed:
             return
         self._is_closed = True

@@ -87,7 +87,8 @@ class Candidate:
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        ``may_prove`` is False while the hardware id, which is stronger evidence, may still be received.
+        `MIN_CLOCK_MATCHES` matches in a row prove the link, as many mismatches make it doubted. ``may_prove`` is False
+        while the hardware id, which is stronger evidence, may still be received.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
@@ -192,7 +193,7 @@ class LinkChoice:
     """The links to one system, and the link in use.
 
     Systems with an autopilot need proof (``needs_proof``) that a second link leads to the same vehicle: a matching
-    clock, or the same frames. Without proof, the frames of the link are refused, and no command is sent over it. A link
+    clock, or the same frames. Until then, frames of the second link are refused, and no command is sent over it. A link
     with a different hardware id is refused even if the clock matches.
     """
 
@@ -229,7 +230,7 @@ class LinkChoice:
             self.candidates = {candidate.link: candidate}
 
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
-        """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is our time at that moment."""
+        """Record an answer: the vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
         candidate = self.candidates[link]
         # True if the link in use has not answered since the previous answer over this link. Recording the new answer
         # would change the result, so it follows below.

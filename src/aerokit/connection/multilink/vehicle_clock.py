@@ -25,7 +25,7 @@ SPEED_MAX_AGE_S = 5.0  # A clock rate measured before a pause or reboot remains 
 
 
 class VehicleClock:
-    """Clock of one vehicle. ``at`` is our time, ``vehicle_s`` the vehicle's, in seconds."""
+    """Estimates the clock of one vehicle from samples: ``vehicle_s`` is its time at our time ``at``, in seconds."""
 
     def __init__(self) -> None:
         # (our time, the vehicle's time) in seconds.
@@ -100,7 +100,7 @@ class VehicleClock:
 
     @property
     def _measured_speed(self) -> float | None:
-        """Seconds of the vehicle's clock per second of ours, from the stored samples; None if they span too little."""
+        """Seconds of the vehicle's clock per second of ours; None if the stored samples span too short a time."""
         if not self._samples:
             return None
         (first_at, first_vehicle_s), (last_at, last_vehicle_s) = self._samples[0], self._samples[-1]

@@ -186,7 +186,7 @@ class ClientFilter:
         return b"".join(accepted), notices
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
-        """Return True if another program recently used this client name. A program that takes control replaces it."""
+        """Return True if another program recently used this client name, unless this program takes control."""
         is_other_program = self._nonce not in (None, nonce)
         is_recent = now - self._nonce_at <= LEASE_TIMEOUT_S
         if is_other_program and is_recent and mode != "take":
@@ -393,7 +393,10 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if frames are to be delivered. ``sent_s`` is their send time on the vehicle side's clock."""
+        """Return True if frames are to be delivered, i.e. if they are in time and from the tracked vehicle side.
+
+        ``epoch`` identifies the vehicle side that sent them, ``sent_s`` is the send time on its clock.
+        """
         if epoch != self.epoch:
             self.foreign += 1
             return False
