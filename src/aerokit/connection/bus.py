@@ -259,7 +259,7 @@ ErrorT = TypeVar("ErrorT", bound=BaseException)
 
 
 def copy_exception(error: ErrorT) -> ErrorT:
-    """Return a copy of a stored exception, to be raised once.
+    """Return a copy of a stored exception, to be raised once; the exception itself if it cannot be copied.
 
     Raising one object repeatedly would collect the tracebacks of all tasks, keep their frames alive and pass the
     context of one task to the next. The copy keeps ``__cause__``.

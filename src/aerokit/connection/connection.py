@@ -153,7 +153,7 @@ class Connection:
 
     @checked
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Number, frame and write a message. Never blocks.
+        """Encode a message with the next sequence number, and write it. Never blocks.
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
@@ -260,7 +260,7 @@ class Connection:
         capacity: int = 1,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[ItemT]:
-        """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
+        """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
 
         Raises:
             InvalidArgument: no type is given, or the dialect does not have a given type.
@@ -314,7 +314,7 @@ class Connection:
         return self._observers.add_sent(callback)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise InvalidArgument unless ``types`` are one or more event classes, or message classes of the dialect."""
+        """Raise InvalidArgument if ``types`` is empty, or an item is no event class or message class of the dialect."""
         if not types:
             raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
@@ -501,7 +501,7 @@ class Connection:
             self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
-        """Once a second, send our heartbeat if it is not paused, update the link's state, and flush the recording."""
+        """Once a second, send our heartbeat unless it is paused, and do the other periodic work."""
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)

@@ -66,7 +66,10 @@ class PeerTable:
         yield from self._unverified.values()
 
     def receive_unverified(self, peer: Peer, data: bytes, now: float) -> tuple[Framer, list[Frame]]:
-        """Process bytes of a sender that is not in :attr:`framers`. Its frames are dropped if the table stays full."""
+        """Process bytes of a sender that is not in :attr:`framers`. Return its framer, and the frames to deliver.
+
+        With its first valid frame, the sender becomes a peer. If there is no room for it, its frames are dropped.
+        """
         framer = self._unverified.get(peer)
         if framer is None:
             framer = self._add_unverified(peer)
@@ -249,7 +252,7 @@ class FrameReceiver:
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def _on_blocked(self, seconds: float) -> None:
-        """Publish that the event loop was blocked, and log a warning if heartbeats were late."""
+        """Publish that the event loop was blocked, and log a warning if it was blocked for long."""
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(
                 "the event loop was blocked for %.1f s: no messages or heartbeats were processed; %s",

@@ -261,7 +261,7 @@ class Routes:
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
         """Drop the claims of the first peer without a live component, and return the peer; None if there is none.
 
-        A component is live if it has a vehicle object, or sent a heartbeat in the last 30 s.
+        A component is live if its system has a vehicle object, or if it sent a heartbeat in the last 30 s.
         """
         live = {
             route.peer
@@ -322,7 +322,9 @@ class Routes:
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        self._claims = {(claimed, by): claim for (claimed, by), claim in self._claims.items() if claimed != source}
+        self._claims = {
+            (claimed, claimer): claim for (claimed, claimer), claim in self._claims.items() if claimed != source
+        }
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:

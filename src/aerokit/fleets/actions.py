@@ -165,7 +165,9 @@ class Actions(SelectionBase):
                 while not condition(member):
                     vehicle.connection.raise_if_ended()
                     if vehicle.connection.now() >= deadline:
-                        unready = [peer.name for peer in self if peer.is_available and not condition(peer)]
+                        unready = [
+                            candidate.name for candidate in self if candidate.is_available and not condition(candidate)
+                        ]
                         raise OperationTimeout(
                             f"{description}: not reached within {timeout:g} s by {', '.join(unready)}"
                         )

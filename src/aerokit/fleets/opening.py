@@ -260,6 +260,7 @@ async def find_systems(
         return all(found[name] for name in searched)
 
     def describe_progress() -> str:
+        """Return which vehicles were found so far, for the warning and the time-out error."""
         names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
         listed = ", ".join(names)
         if count is not None:

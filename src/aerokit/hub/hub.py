@@ -194,7 +194,7 @@ class Hub:
     # ------------------------------------------------------------------------------------ internal
 
     async def _add(self, endpoint: Endpoint) -> Attachment:
-        """Open an endpoint and attach it. If it cannot be opened, retry it in the background or raise LinkError."""
+        """Open an endpoint and attach it. If that fails, raise LinkError or, with ``retry_open``, retry it later."""
         assert self._switch is not None
         assert self._background is not None
         clock = asyncio.get_running_loop().time

@@ -264,7 +264,7 @@ class Port:
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def is_due(self, key: int, period_s: float, now: float) -> bool:
-        """Return True if the rate limit allows a frame with this sender and message now. Otherwise count a drop."""
+        """Return True if the rate limit allows a frame of this sender and message (``key``) now, else count a drop."""
         due = self._due.get(key)
         if due is not None and now < due:
             self.counters.dropped["rate_limited"] += 1

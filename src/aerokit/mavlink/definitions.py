@@ -108,7 +108,7 @@ class MessageDefinition:
 
     @property
     def crc_extra(self) -> int:
-        """Byte derived from the definition. The checksum of a frame fails if the sender's definition has another."""
+        """Byte derived from the definition. If the sender has another definition, the checksums of its frames fail."""
         # https://mavlink.io/en/guide/serialization.html#crc_extra
         text = self.name + " "
         for field in self.wire_fields:

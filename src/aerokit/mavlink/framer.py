@@ -279,7 +279,7 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        """Count a frame of an unknown message, and keep it if it is wanted."""
+        """Count a frame of an unknown message, and keep it if :attr:`keep_unknown` is set."""
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -304,8 +304,8 @@ class PythonFramer:
             if size - begin < 3:  # The flags have not arrived yet.
                 return _WAIT, begin + 3, None
             if size - begin < _MIN_LENGTH_V2:
-                are_flags_known = data[begin + 2] <= SIGNED
-                return (_WAIT if are_flags_known else _NOISE), begin + _MIN_LENGTH_V2, None
+                has_valid_flags = data[begin + 2] <= SIGNED
+                return (_WAIT if has_valid_flags else _NOISE), begin + _MIN_LENGTH_V2, None
             _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None

@@ -108,7 +108,7 @@ def format_plan(plan: Plan | Mission) -> str:
 
 
 def _document(plan: Plan) -> dict[str, Any]:
-    """Return the JSON object of a file: the object in ``plan.source``, in which only changed parts are replaced."""
+    """Return the JSON object of a .plan file: that in ``plan.source``, in which only changed parts are replaced."""
     document: dict[str, Any]
     if plan.source:
         document, old = json.loads(plan.source), parse_plan(plan.source)
@@ -271,7 +271,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    """Return the place; None if coordinates are null. ``altitude`` is its reference: "amsl" or "relative"."""
+    """Return the place; None if coordinates are null. Altitudes refer to ``altitude``: "amsl" or "relative"."""
     latitude_value, longitude_value, *altitude_values = value.elements(2, 3)
     latitude = latitude_value.number(-90, 90, null=True)
     longitude = longitude_value.number(-180, 180, null=True)

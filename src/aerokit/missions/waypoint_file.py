@@ -182,9 +182,9 @@ def _item_row(item: MissionItem, index: int) -> str:
     integers = (index, 0, int(item.frame), int(item.command))
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):
-        raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot store")
+        raise InvalidArgument(f"{item!r} has an infinite number, which a waypoint file cannot store")
     if math.isnan(item.z) and item.position is not None:
-        raise InvalidArgument(f"{item!r} has a place without an altitude, which a file cannot store")
+        raise InvalidArgument(f"{item!r} has a place without an altitude, which a waypoint file cannot store")
     # Mission Planner writes 8 decimal places of each number, but 6 of the altitude.
     columns = [(number, 8) for number in numbers] + [(item.z, 6)]
     texts = (

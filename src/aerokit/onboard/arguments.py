@@ -78,8 +78,8 @@ def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
     """Return the arguments of a handler after the first one, which is the request.
 
     Raises:
-        InvalidArgument: an annotation is missing or not supported, an argument is not positional, or an argument has no
-            parameter, because a command has only seven.
+        InvalidArgument: an annotation is missing or not supported, an argument is not positional, or the number of its
+            parameter is above seven.
     """
     name = getattr(function, "__name__", repr(function))
     parameters = list(inspect.signature(function).parameters.values())

@@ -115,7 +115,7 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
             arguments = (length, rate)
         elif method == "set_rate":
             arguments = (rate,)
-        if None in arguments:
+        if None in arguments:  # A parameter that the sender has left out is NaN, and arrives here as None.
             needed = "length and rate" if method == "pay_out" else "rate"
             raise InvalidArgument(f"this action needs {needed}; NaN is not allowed")
         if method == "pay_out" and rate is not None and rate <= 0:

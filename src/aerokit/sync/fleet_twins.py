@@ -187,7 +187,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 altitude of the first member's home.
 
         Raises:
-            InvalidArgument: a track has no member.
+            InvalidArgument: the name of a track is not that of a member.
             ValueUnknownError: the position of the first member is unknown.
         """
         return self._loop.call(self.aio.show_start_positions, show, origin)

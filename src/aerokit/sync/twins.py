@@ -389,7 +389,7 @@ class Connection(ConnectionTwin):
         return self.aio.signing
 
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Number, frame and write a message. Never blocks.
+        """Encode a message with the next sequence number, and write it. Never blocks.
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
@@ -430,7 +430,7 @@ class Connection(ConnectionTwin):
         capacity: int = 1,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[ItemT]:
-        """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
+        """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
 
         Raises:
             InvalidArgument: no type is given, or the dialect does not have a given type.

@@ -57,7 +57,7 @@ class Copies:
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
-        """Return True if an equal frame arrived a few seconds ago over another link, but not yet over this link."""
+        """Return True if an equal frame arrived in the last seconds over another link, but not yet over this link."""
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
@@ -180,7 +180,7 @@ class MergedStreams:
         return True
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Return True if a frame, of which no copy was accepted yet, is to be delivered. Record it as accepted."""
+        """Return True if a frame, of which no copy was accepted yet, is to be delivered. Then record it as accepted."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)

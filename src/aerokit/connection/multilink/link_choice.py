@@ -132,12 +132,12 @@ class Candidate:
 
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
-        was_other, self.is_other_hardware = self.is_other_hardware, is_other
         if is_other:
             self._doubt()
             self.was_proven = False  # The link now leads to another vehicle, so an earlier proof is void.
-        elif was_other:  # The link leads to this vehicle again.
+        elif self.is_other_hardware:  # Until now the link led to another vehicle.
             self.is_doubted = False
+        self.is_other_hardware = is_other
 
     def count_answer(self) -> None:
         """Count a TIMESYNC answer after a request for the hardware id."""

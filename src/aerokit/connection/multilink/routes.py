@@ -240,7 +240,7 @@ class MultiLinkRoutes:
         return True
 
     def accepts(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
-        """Return True if the frame is to be delivered. Heartbeats are recorded even if they are not."""
+        """Return True if the frame is to be delivered. Record heartbeats even if they are not to be delivered."""
         link = _link_index(peer)
         if frame.message_id == m.Timesync.ID and self._probes.is_answer(frame, link):
             return False

@@ -60,7 +60,7 @@ class VehicleClock:
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample is as expected from the last one and the clock's speed; None if that is unknown."""
+        """Return True if a sample is as expected from the last one and the speed; None if the speed is unknown."""
         speed = self._speed
         if speed is None:
             return None

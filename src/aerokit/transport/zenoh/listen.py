@@ -216,7 +216,7 @@ class ZenohListen(NetworkLink):
         return client
 
     def _remove_silent_client(self) -> None:
-        """Remove the client that has been silent longest, if this is long enough.
+        """Remove the client that has been silent longest, if its silence exceeds `CLIENT_TIMEOUT_S`.
 
         New clients must not be blocked by a client that has left although zenoh did not report the end of its token.
         """
