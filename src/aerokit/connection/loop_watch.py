@@ -22,7 +22,7 @@ BLOCKED_THRESHOLD_S = 0.25
 
 # If nothing was read in this many loop iterations, all data that arrived during the pause has been read. A single
 # iteration would not prove it, because some loops run timers before they read sockets.
-IDLE_ITERATIONS = 3
+MIN_IDLE_ITERATIONS = 3
 
 MAX_SLEEPS = 16
 
@@ -166,12 +166,12 @@ class LoopWatch:
         return self.oldest_arrival
 
     def _end_assumption_when_idle(self) -> None:
-        """Use the time of reading as receive time again, once nothing was read for `IDLE_ITERATIONS` iterations."""
+        """Use the time of reading as receive time again, once nothing was read for `MIN_IDLE_ITERATIONS` iterations."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:  # The connection is closed.
             return
-        if self._idle_iterations < IDLE_ITERATIONS:
+        if self._idle_iterations < MIN_IDLE_ITERATIONS:
             self._loop.call_soon(self._end_assumption_when_idle)
         else:
             paused_s = self._loop.time() - self.oldest_arrival

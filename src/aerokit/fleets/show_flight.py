@@ -144,7 +144,7 @@ class TrackDeviation(Snapshot):
 
 
 class ShowReport(Snapshot):
-    """Result of a show. Positions have times of the vehicles' own clocks, which ``clocks`` relate to each other.
+    """Result of a show. Positions were timed by the vehicles' own clocks; ``clocks`` has the offsets of these clocks.
 
     ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
     error of a vector from one member to another. Both are None if unknown.

@@ -36,7 +36,7 @@ _MIN_LENGTH_V2 = 12
 _MIN_LENGTH_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 # Finds possible starts of frames. A MAVLink 2 frame must have known flags, unless the data ends before the flags.
-_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
+_find_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 
 # Verdicts about a position in the data.
 _GOOD = 0  # a whole frame with a valid checksum
@@ -230,7 +230,7 @@ class PythonFramer:
         examined_to, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
-        new_candidates = ((match.start(), _NOISE, 0) for match in _magics(data, max(begin, examined_to)))
+        new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)
         for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):

@@ -205,7 +205,7 @@ def __dir__() -> list[str]:
     return sorted(set(globals()) | set(_TABLE))
 """
 
-_ENUMS_INIT = '''# pyright: reportUnsupportedDunderAll=false
+_ENUMS_INIT_TEMPLATE = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
 
 Each is an ``IntEnum``, or an ``IntFlag`` if the standard marks it as a bitmask. Fields of messages are plain ``int``,
@@ -233,7 +233,7 @@ def __dir__() -> list[str]:
     return sorted(set(globals()) | set(_MODULES))
 '''
 
-_MESSAGES_INIT = '''# pyright: reportUnsupportedDunderAll=false
+_MESSAGES_INIT_TEMPLATE = '''# pyright: reportUnsupportedDunderAll=false
 """Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
 
 Names, order and raw units of fields are those of the standard: https://mavlink.io/en/messages/
@@ -390,7 +390,7 @@ def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
         rows += f'    {message.id}: ("{message.class_name}", "{_module_of(message)}", {numbers}),\n'
     names = {message.class_name: _module_of(message) for message in messages}
     stub = _reexports("messages", names) + "\nINDEX: dict[int, tuple[str, str, int, int, int]]\n"
-    return _MESSAGES_INIT.format(rows=rows), stub
+    return _MESSAGES_INIT_TEMPLATE.format(rows=rows), stub
 
 
 def _enums_module(module: str, stems: Sequence[str], enums: Sequence[EnumDefinition]) -> str:
@@ -408,7 +408,7 @@ def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
     modules = {stem: module for module, stems in MODULES.items() for stem in stems}
     names = {enum.class_name: modules[enum.origin] for enum in enums}
     rows = "".join(f'    "{name}": "{module}",\n' for name, module in sorted(names.items()))
-    return _ENUMS_INIT.format(rows=rows), _reexports("enums", names)
+    return _ENUMS_INIT_TEMPLATE.format(rows=rows), _reexports("enums", names)
 
 
 def _reexports(package: str, names: dict[str, str]) -> str:

@@ -42,7 +42,7 @@ _CODES = {
     4: (ParameterType.REAL32, Struct("<f")),
 }
 
-_CODE_OF = {
+_CODE_BY_TYPE = {
     ParameterType.INT8: 1,
     ParameterType.UINT8: 2,
     ParameterType.INT16: 2,
@@ -241,9 +241,9 @@ def _rows(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> Iterator
 
 
 def _code_of(parameter: Parameter) -> int:
-    if parameter.type not in _CODE_OF:
+    if parameter.type not in _CODE_BY_TYPE:
         raise InvalidArgument(f"{parameter.name} is an {parameter.type.name}, which param.pck cannot store")
-    return _CODE_OF[parameter.type]
+    return _CODE_BY_TYPE[parameter.type]
 
 
 def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:

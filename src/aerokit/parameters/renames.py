@@ -24,7 +24,7 @@ _SKIP_ALL = -1
 
 
 class ParameterRenamedWarning(UserWarning):
-    """A parameter was used under the name of another firmware version, and its value was converted.
+    """A parameter was used under the name of another firmware version. If its units differ, its value was converted.
 
     Silence it with ``warnings.filterwarnings("ignore", category=ParameterRenamedWarning)``.
     """

@@ -57,7 +57,7 @@ class Copies:
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
-        """Return True if an equal frame arrived in the last seconds over another link, but not yet over this link."""
+        """Return True if an equal frame arrived within `COPY_WINDOW_S` over another link, but not yet over this one."""
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)

@@ -60,6 +60,7 @@ class Candidate:
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
         """True if :attr:`hardware` is another vehicle's. The link is then not proven by its clock or by copies."""
+        # Numbers of requests for the hardware id, and of TIMESYNC answers since the first request.
         self._hardware_requests = self._answers_since_request = 0
         # Numbers of consecutive matches and mismatches of the clock, and of copies since the proof was last reset.
         self._clock_matches = self._clock_mismatches = self._copies = 0

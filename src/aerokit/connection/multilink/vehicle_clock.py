@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import AutopilotVersion
 
 MAX_SAMPLES = 20
-TOLERANCE_S = 0.1
+MIN_TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
 MAX_DRIFT_S = 0.5  # Without this limit, any clock would match after a long enough silence.
 # A measured clock rate of 1 ± this value counts as 1. Otherwise its error would grow with the length of a silence.
@@ -75,8 +75,8 @@ class VehicleClock:
         speed = self._measured_speed
         if speed is None:
             # The rate of the vehicle's clock is not measured yet. A simulation may run up to MAX_SPEED times as fast.
-            max_advance_s = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
-            return -TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
+            max_advance_s = MAX_SPEED * (at - last_at + MIN_TOLERANCE_S + round_trip_s)
+            return -MIN_TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
         tolerance_s = self._tolerance_s(at, round_trip_s, speed)
         expected_s = speed * (at - last_at)
         min_advance_s = max(0.0, expected_s - MAX_PAUSE_S * max(1.0, speed))
@@ -85,7 +85,7 @@ class VehicleClock:
     def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
         last_at, _ = self._samples[-1]
         drift_s = min(MAX_SPEED_ERROR * abs(at - last_at), MAX_DRIFT_S)
-        return (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
+        return (MIN_TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
 
     @property
     def _speed(self) -> float | None:
