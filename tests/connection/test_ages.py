@@ -18,7 +18,7 @@ from aerokit import LinkState, open_connection
 from aerokit import messages as m
 from aerokit.connection.cells import StateCell
 from aerokit.connection.connection import Connection
-from aerokit.connection.loop_watch import IDLE_ITERATIONS, LoopWatch, suspended_s
+from aerokit.connection.loop_watch import MIN_IDLE_ITERATIONS, LoopWatch, suspended_s
 from aerokit.errors import LinkLost, StaleValueError
 from aerokit.events import ComputerSlept, VehicleRebooted, VehicleSilent
 from aerokit.mavlink.encoder import FrameEncoder
@@ -78,7 +78,7 @@ async def test_arrival_stays_old_until_waiting_data_is_read() -> None:
         block_loop(3.7)
         await anyio.lowlevel.checkpoint()
         assert all(age > 3.5 for age in await ages_of(connection, wire, receive=50))
-        for _ in range(IDLE_ITERATIONS + 2):
+        for _ in range(MIN_IDLE_ITERATIONS + 2):
             await anyio.lowlevel.checkpoint()
         for later_s in (0, 0.05, 1):
             await anyio.sleep(later_s)

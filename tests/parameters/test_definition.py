@@ -107,7 +107,9 @@ def test_range_applies_under_its_condition() -> None:
     assert len(CAMERA.options("CAM_ISO", {"CAM_MODE": 1})) == 5
     assert [option.name for option in CAMERA.options("CAM_ISO", VIDEO_BY_HAND)] == ["100", "200", "400"]
     text = refusal(CAMERA, "CAM_ISO", 800, CAM_MODE=1, CAM_EXPMODE=1)
-    assert text == "CAM_ISO = 800 is not allowed while CAM_MODE = Video: '100' (100), '200' (200), '400' (400)"
+    assert (
+        text == "CAM_ISO = 800 is not allowed while CAM_MODE = Video: it must be '100' (100), '200' (200), '400' (400)"
+    )
     assert "1/30" in refusal(CAMERA, "CAM_SHUTTER", "1/30", **VIDEO_BY_HAND)
     assert len(CAMERA.options("CAM_SHUTTER", {**VIDEO_BY_HAND, "CAM_MODE": 0})) == 4
 
@@ -151,7 +153,7 @@ def test_several_ranges_apply_together() -> None:
     camera = of(f'{ruler("A", 1, 2)}{ruler("B", 2, 3)}<parameter name="S" type="uint8"/>')
     assert camera.dependencies("S") == ("A", "B")
     assert [option.value for option in camera.options("S", {"A": 1, "B": 1})] == [2]
-    assert "while A = on, B = on: '2' (2)" in refusal(camera, "S", 3, A=1, B=1)
+    assert "while A = on, B = on: it must be '2' (2)" in refusal(camera, "S", 3, A=1, B=1)
 
 
 def test_option_cannot_exclude_own_setting() -> None:
@@ -193,7 +195,7 @@ def test_definition_accepts_value(name: str, value: object, sent: object) -> Non
 @pytest.mark.parametrize(
     ("name", "value", "complaint"),
     [
-        ("CAM_WBMODE", 3, r"CAM_WBMODE = 3 is not allowed: 'Auto' \(0\), 'Sunny' \(4\), 'Cloudy' \(5\)"),
+        ("CAM_WBMODE", 3, r"CAM_WBMODE = 3 is not allowed: it must be 'Auto' \(0\), 'Sunny' \(4\), 'Cloudy' \(5\)"),
         ("CAM_WBMODE", "sunny", r"did you mean 'Sunny'\?"),
         ("CAM_OFFSET", 70000, r"-32768\.\.32767"),
         ("CAM_EV", 3.1, r"CAM_EV = 3\.1 is not allowed: it must be -3\.\.3"),

@@ -75,7 +75,7 @@ def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
 
 
 def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> FunctionT:
-    """Function decorator: check the arguments of each call.
+    """Function decorator: check the arguments of each call against the annotations of the function.
 
     A time may be 0 (often with the meaning "do not wait") unless ``times_are_above_zero`` is True.
     """

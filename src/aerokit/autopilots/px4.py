@@ -214,7 +214,7 @@ class Px4(Autopilot):
         return (self.mode(px4_custom_mode(main & 0xFF, sub & 0xFF), CUSTOM_MODE_ENABLED, extra),)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name if it belongs to an external mode.
+        """Return the name of an external mode, or of a mode that is not known yet; otherwise None.
 
         PX4 reports the name "(Mode not available)" for an external mode that is not registered.
         """
@@ -228,6 +228,8 @@ class Px4(Autopilot):
         self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff | None:
         """Return the procedure: NAV_TAKEOFF at the current position and heading to the altitude, then LOITER.
+
+        None for vehicles that cannot fly.
 
         Raises:
             InvalidArgument: the altitude of home is not given.

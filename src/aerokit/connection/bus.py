@@ -55,14 +55,14 @@ _HEARTBEAT_ID = 0
 class Bus:
     """Delivers messages and events to the attached sinks, in the order in which they were attached.
 
-    ``wanted`` has the message ids for which a sink is attached, and is updated in place. A framer that uses this
-    mapping skips all other frames.
+    ``wanted`` maps each message id for which a sink is attached to the number of its sinks. It is updated in place, so
+    that a framer that is given this mapping skips all other frames.
     """
 
     def __init__(self, dialect: Dialect = STANDARD) -> None:
         self.dialect = dialect
         self.one_at_a_time = False
-        """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the others."""
+        """If True, :meth:`deliver_all` returns after the current frame, so that the caller can check the next ones."""
         self.wanted: dict[int, int] = {}  # message id → number of sinks
         self._sinks: dict[tuple[int, int], tuple[_Entry, ...]] = {}  # the key is (system id, message id)
         self._plans: dict[int, _DeliveryPlan] = {}  # cache; the key is system id << 24 | message id
@@ -88,7 +88,7 @@ class Bus:
         *,
         system_id: int = EVERY_SYSTEM,
     ) -> Detach:
-        """Like :meth:`attach_frames`, but also pass the message to ``sink`` if another sink needs it decoded."""
+        """Call ``sink(frame)``, or ``sink(frame, message)`` if another sink needs the message decoded anyway."""
         return self._attach((system_id, message_type.ID), (BOTH, sink))
 
     def create_on_first(
@@ -96,7 +96,7 @@ class Bus:
     ) -> Detach:
         """Call ``create()`` once, when the first of these messages arrives, and before the message is delivered.
 
-        Sinks that ``create()`` attaches get that first message too.
+        Sinks that ``create()`` attaches get that first message too. Returns a function that cancels the call.
         """
 
         def on_first(frame: Frame) -> None:
@@ -129,11 +129,10 @@ class Bus:
     def deliver_all(
         self, frames: Iterable[Frame], before_heartbeat: Callable[..., None], *context: object
     ) -> Frame | None:
-        """Deliver the frames in order, like :meth:`deliver`, and return None.
+        """Deliver the frames in order, like :meth:`deliver`, until a sink sets :attr:`one_at_a_time`.
 
-        Calls ``before_heartbeat(frame, *context)`` with each HEARTBEAT before it is delivered. If a sink sets
-        :attr:`one_at_a_time`, the method returns the frame that this sink got, and does not deliver the frames after
-        it.
+        Returns the frame that this sink got, which is the last one delivered; None if no sink did so. Calls
+        ``before_heartbeat(frame, *context)`` before each HEARTBEAT is delivered.
         """
         plans, decode = self._plans, self.dialect.decode
         for frame in frames:
@@ -190,7 +189,10 @@ class Bus:
         return once(lambda: self._detach(key, entry))
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Return the sinks of frames like this one, and cache them. A message outside the dialect has no sinks."""
+        """Return the plan for frames with this system id and message id, and cache it unless it has no sinks.
+
+        A message outside the dialect has no sinks, because it cannot be decoded.
+        """
         entries = self._entries(frame)
         if not entries or self.dialect.get(frame.message_id) is None:
             return FRAME, ()
@@ -257,7 +259,7 @@ ErrorT = TypeVar("ErrorT", bound=BaseException)
 
 
 def copy_exception(error: ErrorT) -> ErrorT:
-    """Return a copy of a stored exception, to be raised once.
+    """Return a copy of a stored exception, to be raised once; the exception itself if it cannot be copied.
 
     Raising one object repeatedly would collect the tracebacks of all tasks, keep their frames alive and pass the
     context of one task to the next. The copy keeps ``__cause__``.
@@ -271,7 +273,7 @@ def copy_exception(error: ErrorT) -> ErrorT:
 
 
 class EndSignal:
-    """Signals once that its owner has ended: stores the error that ended it, and calls callbacks with this error."""
+    """Signals once that its owner has ended: stores the error that ended the owner, and passes it to callbacks."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None
@@ -303,7 +305,7 @@ class EndSignal:
             try:
                 callback(error)
             except Exception:
-                logger.exception("a callback of on_end() raised an exception; the other callbacks are called")
+                logger.exception("a callback of on_end() raised an exception; the other callbacks are still called")
 
 
 def _nothing() -> None:

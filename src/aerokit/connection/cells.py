@@ -178,8 +178,8 @@ class StateCell(Generic[T]):
         single message is not missed. Exceptions of the predicate are raised here.
 
         Raises:
-            OperationTimeout: the condition was not met within ``timeout`` seconds; the text has ``description`` and the
-                last values.
+            OperationTimeout: the condition was not met within ``timeout`` seconds; the error names ``description`` and
+                the last values.
         """
         self._raise_if_closed()
         waiter = _Waiter(self, predicate, held_for)
@@ -312,10 +312,10 @@ class StateCell(Generic[T]):
 
 
 class Changes(AsyncIterator[T]):
-    """Endless asynchronous iterator over the values of a cell.
+    """Asynchronous iterator over the values of a cell.
 
-    Iteration raises the error with which the cell was closed. While the iterator exists, every received message of the
-    cell is decoded.
+    Iteration ends only when the cell is closed, by raising the error with which it was closed. While the iterator
+    exists, every received message of the cell is decoded.
     """
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:

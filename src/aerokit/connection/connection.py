@@ -71,7 +71,7 @@ HEARTBEAT_INTERVAL_S = 1.0
 class Connection:
     """One MAVLink node (system id, component id) on one link.
 
-    Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
+    Received bytes enter through ``bytes_received``. One framer per remote peer extracts frames, which go to ``bus``.
     ``send`` writes a message to the peer from which its target was last received; :class:`Routes` stores that peer
     and decides when it may change (``may_move``). Everything runs on the event loop's thread.
     """
@@ -133,7 +133,7 @@ class Connection:
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
 
     def _make_multilink(self, make_routes: Callable[[], Routes]) -> MultiLinkRoutes:
-        """Create the routes over several links, which get a :class:`Routes` of their own for each link."""
+        """Create the routes over several links, with one :class:`Routes` for each link."""
         # Imported here because few programs have several links.
         from aerokit.connection.multilink.routes import MultiLinkRoutes
         from aerokit.transport.multilink import MultiLink
@@ -153,7 +153,7 @@ class Connection:
 
     @checked
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Number, frame and write a message. Never blocks.
+        """Encode a message with the next sequence number, and write it. Never blocks.
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
@@ -260,7 +260,7 @@ class Connection:
         capacity: int = 1,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[ItemT]:
-        """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
+        """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
 
         Raises:
             InvalidArgument: no type is given, or the dialect does not have a given type.
@@ -276,8 +276,7 @@ class Connection:
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
         """Yield every autopilot on the link once, until the connection ends. Autopilots already known come first.
 
-        ``async for found in connection.vehicles(): async with aerokit.connect(connection,
-        system_id=found.system_id)…``
+        To use a vehicle, connect to it: ``aerokit.connect(connection, system_id=found.system_id)``.
 
         Raises:
             ConnectionClosed, LinkLost: the connection ended.
@@ -315,7 +314,7 @@ class Connection:
         return self._observers.add_sent(callback)
 
     def check_types(self, types: tuple[type[Any], ...]) -> None:
-        """Raise InvalidArgument unless ``types`` are one or more event classes, or message classes of the dialect."""
+        """Raise InvalidArgument if ``types`` is empty, or an item is no event class or message class of the dialect."""
         if not types:
             raise InvalidArgument("name at least one message or event class to subscribe to")
         for item in types:
@@ -375,7 +374,8 @@ class Connection:
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
         """Return why signatures block communication with a component, for error texts; "" if they do not.
 
-        ``component_id`` 0 means all components of the system.
+        ``component_id`` 0 means all components of the system. Without a ``system_id``, only frames that this program
+        has refused are considered.
         """
         return self._gate.describe(
             heartbeat
@@ -394,7 +394,8 @@ class Connection:
     def close(self, error: Exception | None = None) -> None:
         """Close the link, cancel background tasks and raise ``error`` in all waiters. Never blocks; idempotent.
 
-        May be called inside the connection's block. The block continues, but its further calls on the connection raise.
+        A link that another connection has opened stays open. May be called inside the connection's block. The block
+        continues, but its further calls on the connection raise.
         """
         self._end(error or ConnectionClosed("the connection was closed"))
         if self._owns_link:
@@ -500,7 +501,7 @@ class Connection:
             self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
-        """Once a second, send our heartbeat if it is not paused, update the link's state, and flush the recording."""
+        """Once a second, send our heartbeat unless it is paused, and do the other periodic work."""
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)

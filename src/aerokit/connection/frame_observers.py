@@ -88,7 +88,7 @@ class Recording:
             self._write(raw, at)
 
     def _open_new(self) -> None:
-        """Create the file. An existing file of this name is renamed, even if it was created just before."""
+        """Create the file. A file of this name is renamed, even if another program has just created it."""
         while True:
             try:
                 self._file = open(self._path, "xb")  # noqa: SIM115 - closed by close()
@@ -223,7 +223,7 @@ class FrameObservers:
             try:
                 observer(frame, peer)
             except Exception:
-                logger.exception("frame observer %r raised an exception; the other observers are called", observer)
+                logger.exception("frame observer %r raised an exception; the others are still called", observer)
 
     def notify_sent(self, raw: bytes) -> None:
         for observer in self._sent:

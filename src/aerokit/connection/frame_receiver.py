@@ -40,7 +40,7 @@ class PeerTable:
     """Remote peers and their framers.
 
     A sender becomes a peer with its first valid frame, and from then on gets broadcasts. When the table is full, the
-    first peer without a vehicle is evicted; if there is none, new senders are ignored.
+    first idle peer is evicted; if there is none, new senders are ignored.
 
     ``evict_idle_peer`` is :meth:`Routes.evict_idle_peer`. ``configure(framer)`` is called with each new framer,
     ``on_evict(peer)`` with each evicted peer.
@@ -66,7 +66,10 @@ class PeerTable:
         yield from self._unverified.values()
 
     def receive_unverified(self, peer: Peer, data: bytes, now: float) -> tuple[Framer, list[Frame]]:
-        """Process bytes of a sender that is not in :attr:`framers`. Its frames are dropped while the table is full."""
+        """Process bytes of a sender that is not in :attr:`framers`. Return its framer, and the frames to deliver.
+
+        With its first valid frame, the sender becomes a peer. If there is no room for it, its frames are dropped.
+        """
         framer = self._unverified.get(peer)
         if framer is None:
             framer = self._add_unverified(peer)
@@ -200,7 +203,7 @@ class FrameReceiver:
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
         """Deliver the frames that pass all checks, and pass them to the observers.
 
-        With one link, the recording also gets frames that only a check after the signature check refuses.
+        With one link, the recording gets every frame that passes the signature check, even if a later check refuses it.
         """
         framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
         may_be_stale = bool(framer.late or framer.foreign)
@@ -249,7 +252,7 @@ class FrameReceiver:
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def _on_blocked(self, seconds: float) -> None:
-        """Publish that the event loop was blocked, and log a warning if heartbeats were late."""
+        """Publish that the event loop was blocked, and log a warning if it was blocked for long."""
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(
                 "the event loop was blocked for %.1f s: no messages or heartbeats were processed; %s",
@@ -266,7 +269,7 @@ class FrameReceiver:
         self._routes.exclude_pause(self._clock(), paused_s)
 
     def _update_checks(self) -> None:
-        """Turn the fast path off if routes, signatures or observers need more than the delivery of frames."""
+        """Use the fast path only while no frame has to be checked or passed to an observer."""
         self._bus.one_at_a_time = (
             self._is_closed
             or self._multilink is not None
@@ -302,7 +305,11 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
     def _is_stale(self, framer: Framer, frame: Frame) -> bool:
-        """Return True if a frame must be dropped: a second sender sent it, or it is an outdated heartbeat."""
+        """Return True if a frame must be dropped.
+
+        Frames of a second sender with the same ids are dropped, if it is known that there are two. A heartbeat is also
+        dropped if it is outdated, or if only its sequence number suggests a second sender.
+        """
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False

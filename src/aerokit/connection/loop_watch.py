@@ -22,7 +22,7 @@ BLOCKED_THRESHOLD_S = 0.25
 
 # If nothing was read in this many loop iterations, all data that arrived during the pause has been read. A single
 # iteration would not prove it, because some loops run timers before they read sockets.
-IDLE_ITERATIONS = 3
+MIN_IDLE_ITERATIONS = 3
 
 MAX_SLEEPS = 16
 
@@ -166,12 +166,12 @@ class LoopWatch:
         return self.oldest_arrival
 
     def _end_assumption_when_idle(self) -> None:
-        """Use the time of reading as receive time again, once nothing was read for `IDLE_ITERATIONS` iterations."""
+        """Use the time of reading as receive time again, once nothing was read for `MIN_IDLE_ITERATIONS` iterations."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:  # The connection is closed.
             return
-        if self._idle_iterations < IDLE_ITERATIONS:
+        if self._idle_iterations < MIN_IDLE_ITERATIONS:
             self._loop.call_soon(self._end_assumption_when_idle)
         else:
             paused_s = self._loop.time() - self.oldest_arrival
@@ -187,9 +187,9 @@ IPYTHON_HINT = (
 
 
 def is_unintegrated_ipython() -> bool:
-    """Return True in IPython in a terminal without ``%gui asyncio``: the loop then runs only while an input runs."""
-    # `%gui asyncio` sets `active_eventloop`. Without it, IPython runs inputs on an event loop of its own, which stands
-    # still between inputs.
+    """Return True in terminal IPython without ``%gui asyncio``, where the event loop stands still at the prompt."""
+    # `%gui asyncio` sets `active_eventloop`. Without it, IPython has an event loop of its own, which runs only while
+    # entered code runs.
     module = sys.modules.get("IPython.terminal.interactiveshell")
     shell: Any = getattr(getattr(module, "TerminalInteractiveShell", None), "_instance", None)
     if shell is None or getattr(shell, "active_eventloop", None) == "asyncio":

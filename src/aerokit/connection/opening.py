@@ -200,7 +200,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return an equal key for addresses that open the same port or socket; None if each opening gets a new one."""
+    """Return a key that is equal for addresses of the same port or socket; None if each opening gets a new one."""
     if isinstance(target, Link):
         return id(target)
     opens_new_socket = (target.kind in ("udpin", "tcpin") and not target.port) or (
@@ -246,7 +246,7 @@ class _Diagnosis:
         self._systems = {system for counters in statistics for system, _ in counters.sources}
 
     def text(self) -> str:
-        """Return the explanation, which depends on how far the received data could be interpreted."""
+        """Return the most likely reason why the wanted vehicle was not found."""
         if not self._bytes:
             return "no bytes were received: is the vehicle on, and is it sending to this address?"
         if not self._frames:
@@ -256,7 +256,7 @@ class _Diagnosis:
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        """Explain why bytes were received, but no valid frame."""
+        """Return why the received bytes may contain no valid frame."""
         # Noise contains a few patterns that look like frames of an unknown dialect. An unknown dialect is therefore
         # only diagnosed if most bytes belong to frames.
         received = f"{self._bytes} bytes were received"
@@ -272,7 +272,7 @@ class _Diagnosis:
         return f"{received}, but no MAVLink frame: wrong baud rate, or another protocol?"
 
     def _without_heartbeats(self) -> str:
-        """Explain why frames were received, but no accepted heartbeat."""
+        """Return why there is no accepted heartbeat among the received frames."""
         received = f"{self._frames} frames were received"
         if self._signature_problems:
             return f"{received}; {self._signature_problems}"
@@ -281,7 +281,7 @@ class _Diagnosis:
         return f"{received}, but no HEARTBEAT among them"
 
     def _without_vehicle(self) -> str:
-        """Explain why heartbeats were received, but none of the wanted vehicle."""
+        """Return whose heartbeats were received instead of those of the wanted vehicle."""
         autopilots = sorted({system for (system, _), heartbeat in self._heartbeats.items() if is_autopilot(heartbeat)})
         if autopilots:
             names = ", ".join(map(str, autopilots))

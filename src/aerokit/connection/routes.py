@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Evidence in a frame of another peer: True if it continues the stream of the owner, None if unknown."""
+    """Evidence in a frame of another peer on whether it continues the stream of the route's owner; None if unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
@@ -207,9 +207,10 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers to which a message for a component goes; if the component is 0 or unknown, for its system.
+        """Return the peer of a component; if the component is 0 or unknown, those of its system, or else every peer.
 
-        Peers that send under the ids of another peer are excluded, because they would execute broadcasts.
+        Peers that send under the ids of another peer are excluded, because they would execute a message for the whole
+        system, too.
         """
         if system_id == 0:
             return EVERY_PEER
@@ -260,7 +261,7 @@ class Routes:
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
         """Drop the claims of the first peer without a live component, and return the peer; None if there is none.
 
-        A component is live if it has a vehicle object, or sent a heartbeat in the last 30 s.
+        A component is live if its system has a vehicle object, or if it sent a heartbeat in the last 30 s.
         """
         live = {
             route.peer
@@ -321,7 +322,9 @@ class Routes:
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
-        self._claims = {(claimed, by): claim for (claimed, by), claim in self._claims.items() if claimed != source}
+        self._claims = {
+            (claimed, claimer): claim for (claimed, claimer), claim in self._claims.items() if claimed != source
+        }
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:

@@ -156,7 +156,7 @@ class _Handover:
         self.signing, self.switched = signing, switched
         self._source = source  # (system id, component id)
         # Number of unsigned frames since the last signed one, and the time of the first of them.
-        self._unsigned, self._unsigned_since = 0, 0.0
+        self._unsigned_count, self._unsigned_since = 0, 0.0
 
     def concerns(self, frame: Frame) -> bool:
         return (frame.system_id, frame.component_id) == self._source
@@ -166,13 +166,13 @@ class _Handover:
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _has_key(frame):
-            self._unsigned = 0
+            self._unsigned_count = 0
             return False
-        self._unsigned += 1
-        if self._unsigned == 1:
+        self._unsigned_count += 1
+        if self._unsigned_count == 1:
             self._unsigned_since = frame.received_at
         is_long_enough = frame.received_at - self._unsigned_since >= MIN_UNSIGNED_S
-        return is_long_enough and self._unsigned >= MIN_UNSIGNED_FRAMES
+        return is_long_enough and self._unsigned_count >= MIN_UNSIGNED_FRAMES
 
 
 def check_signing(signing: Signing | None, mavlink_version: int) -> None:

@@ -21,8 +21,8 @@ class BackgroundTasks:
 
     This is not a task group, because the program's block would then run inside its cancel scope. Cancelling the
     program's task, ``asyncio.timeout`` and ``asyncio.TaskGroup`` interact with cancel scopes differently in each
-    version of Python and anyio; some swallow or exchange exceptions. A cancelled scope of the program does not reach
-    these tasks either: heartbeats continue while a shielded program lands its vehicle.
+    version of Python and anyio; some swallow or exchange exceptions. If the program cancels a scope of its own, these
+    tasks continue: heartbeats are sent while a shielded program lands its vehicle.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:

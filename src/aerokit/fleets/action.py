@@ -210,7 +210,7 @@ class FleetAction:
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _record_failure(self, member: Member, error: Exception) -> None:
-        """Record that a member failed. The first failure applies the policy."""
+        """Record that a member failed. At the first failure, the policy is applied."""
         if member.name in self._failed:
             return
         self._failed[member.name] = error

@@ -153,7 +153,7 @@ class Actions(SelectionBase):
             description: name of the barrier in errors.
 
         Raises:
-            FleetError: the condition was not true for a member in time. The failure applies the fleet's policy.
+            FleetError: the condition was not true for a member in time, and the fleet's policy was applied.
         """
         deadline = self._context.now() + timeout  # one deadline for all members
 
@@ -165,9 +165,11 @@ class Actions(SelectionBase):
                 while not condition(member):
                     vehicle.connection.raise_if_ended()
                     if vehicle.connection.now() >= deadline:
-                        missing = [other.name for other in self if other.is_available and not condition(other)]
+                        unready = [
+                            candidate.name for candidate in self if candidate.is_available and not condition(candidate)
+                        ]
                         raise OperationTimeout(
-                            f"{description}: not reached within {timeout:g} s by {', '.join(missing)}"
+                            f"{description}: not reached within {timeout:g} s by {', '.join(unready)}"
                         )
                     await change_signal.next(POLL_INTERVAL_S)
 

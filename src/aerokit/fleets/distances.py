@@ -103,6 +103,7 @@ class DistanceMonitor:
             await anyio.sleep(POLL_INTERVAL_S)
 
     def check(self) -> None:
+        """Handle the pairs that have come too close since the last call."""
         points = to_local_points(self._flying_positions())
         near_pairs = pairs_within(points, RESET_FACTOR * self._min_distance_m)
         # Pairs that are apart again can be reported again.

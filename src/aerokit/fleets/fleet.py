@@ -33,7 +33,7 @@ class Selection(Actions, Missions, Formations, Shows):
     Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
     The action returns a :class:`FleetResult` when all these members have finished or failed. If a member fails, the
     fleet's policy may send orders to the other members; then the action returns after these orders were executed. If
-    the action is cancelled, all members hold.
+    the action is cancelled, all members hold, unless it works on the ground or makes them hold, land or return.
     """
 
     def __getitem__(self, pattern: str) -> Selection:
@@ -113,7 +113,8 @@ class Fleet(Selection):
             rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
-            The number of MAVLink messages sent on each link, without those that another sender has sent there.
+            The number of MAVLink messages sent on a link. If another sender has just sent the same corrections on some
+            links, fewer are sent there; the largest number is returned.
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.

@@ -115,7 +115,8 @@ class Formation(Snapshot):
         return min(distances, default=math.inf)
 
     def _check(self) -> None:
-        # The class is frozen. Copy the offsets, so that the caller can change its own dictionary later.
+        # A copy, so that the caller may change its own dictionary later. Plain assignment would raise, because the
+        # class is immutable.
         object.__setattr__(self, "offsets", dict(self.offsets))
         if self.frame not in ("north", "heading"):
             raise InvalidArgument(f"frame = {self.frame!r} is not allowed: it must be 'north' or 'heading'")

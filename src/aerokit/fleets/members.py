@@ -203,6 +203,7 @@ class Member:
         self._on_unavailable(self)
 
     def _set_active_again(self) -> None:
+        """End the state LOST. The member is then active, or taken over if another program or a pilot controls it."""
         if self.state is not MemberState.LOST or not self._is_monitored:
             return
         if reason := self._takeover_reason():

@@ -260,6 +260,7 @@ async def find_systems(
         return all(found[name] for name in searched)
 
     def describe_progress() -> str:
+        """Return which vehicles were found so far, for the warning and the time-out error."""
         names = [f"{name}/{system_id}" for name, ids in found.items() for system_id in ids]
         listed = ", ".join(names)
         if count is not None:
@@ -313,7 +314,7 @@ def warn_while_waiting(timeout: float, describe: Callable[[], str]) -> Iterator[
 
 
 class _BlockFailed(Exception):
-    """Raised in each vehicle's block if the fleet's block has failed. A vehicle left flying then logs a warning."""
+    """Raised in each vehicle's block if the fleet's block has failed. A vehicle left flying is then logged."""
 
 
 class MemberConnections:

@@ -87,7 +87,8 @@ class Path(Snapshot):
         return list(pairwise(points))
 
     def _check(self) -> None:
-        # The class is frozen. Copy the points, so that the caller can change its own list later.
+        # A copy, so that the caller may change its own list later. Plain assignment would raise, because the class is
+        # immutable.
         object.__setattr__(self, "points", tuple(self.points))
         if not self.points:
             raise InvalidArgument(f"points: the path of {self.name} has no points")
@@ -118,7 +119,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
         other: the second path.
         slack_s: compare points whose times differ by at most this many seconds. With 0, both vehicles are exactly on
             time; infinite: ignore times.
-        below_m: if the distance is larger than this, it need not be exact; the result is then at least this distance.
+        below_m: a distance above this is not computed exactly; the result is then this distance or more.
     """
     begin_s = min(path.begins_at_s, other.begins_at_s)
     end_s = max(path.ends_at_s, other.ends_at_s)

@@ -238,11 +238,11 @@ def _vertical_conflict(routes: Sequence[Route], stationary: Mapping[str, LocalPo
         for name, point in points.items():
             # The vertical path leads upwards from the point, so stationary vehicles well below the point do not matter.
             lowest_m = _altitude_m(point) - min_distance_m
-            obstacles = {other: place for other, place in stationary.items() if _altitude_m(place) > lowest_m}
-            for other, other_point in {**points, **obstacles}.items():
-                distance = math.dist(point[:2], other_point[:2])
-                if other != name and distance < min_distance_m:
-                    return f"the {end} of {name} is horizontally {distance:.1f} m from that of {other}: too close"
+            obstacles = {obstacle: place for obstacle, place in stationary.items() if _altitude_m(place) > lowest_m}
+            for neighbour, neighbour_point in {**points, **obstacles}.items():
+                distance = math.dist(point[:2], neighbour_point[:2])
+                if neighbour != name and distance < min_distance_m:
+                    return f"at the {end} of {name}, {neighbour} is horizontally {distance:.1f} m away: too close"
     return ""
 
 

@@ -161,7 +161,8 @@ class Show(Snapshot):
         write_atomically(path, self.to_json() if str(path).lower().endswith(".json") else self.to_csv())
 
     def _check(self) -> None:
-        # The class is frozen. Copy the tracks, so that the caller can change its own dictionary later.
+        # A copy, so that the caller may change its own dictionary later. Plain assignment would raise, because the
+        # class is immutable.
         object.__setattr__(self, "tracks", dict(self.tracks))
         if not self.tracks:
             raise InvalidArgument("a show needs at least one track")

@@ -144,7 +144,7 @@ class TrackDeviation(Snapshot):
 
 
 class ShowReport(Snapshot):
-    """Result of a show. Positions have times of the vehicles' own clocks, which ``clocks`` relate to each other.
+    """Result of a show. Positions were timed by the vehicles' own clocks; ``clocks`` has the offsets of these clocks.
 
     ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
     error of a vector from one member to another. Both are None if unknown.
@@ -158,7 +158,7 @@ class ShowReport(Snapshot):
 
 
 def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
-    """Compare a path with measured positions. Times of ``samples`` are in seconds since the start of the show.
+    """Compare a path with measured positions: ``samples`` has (seconds since the start of the show, position).
 
     The lag is the delay of the path with which it fits the samples best (least squares along the track).
     """
@@ -266,7 +266,7 @@ class TrackRecorder:
         raise StaleValueError(f"no GLOBAL_POSITION_INT was received in the last {POSITION_MAX_AGE_S:g} s")
 
     def _on_message(self, message: GlobalPositionInt) -> None:
-        """Record a position, unless it was measured before the start of the show."""
+        """Store the latest position, and add it to the samples unless it was measured before the start of the show."""
         frame = message.received_frame
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
@@ -305,7 +305,7 @@ class Shows(Travel):
                 altitude of the first member's home.
 
         Raises:
-            InvalidArgument: a track has no member.
+            InvalidArgument: the name of a track is not that of a member.
             ValueUnknownError: the position of the first member is unknown.
         """
         local_origin, origin_amsl_m = self._local_origin(show, origin)

@@ -194,7 +194,7 @@ class Hub:
     # ------------------------------------------------------------------------------------ internal
 
     async def _add(self, endpoint: Endpoint) -> Attachment:
-        """Open an endpoint and attach it. If it cannot be opened, retry it in the background or raise LinkError."""
+        """Open an endpoint and attach it. If that fails, raise LinkError or, with ``retry_open``, retry it later."""
         assert self._switch is not None
         assert self._background is not None
         clock = asyncio.get_running_loop().time
@@ -266,7 +266,7 @@ class Hub:
             try:
                 listener(event)
             except Exception:
-                logger.exception("listener %r raised an exception; the other listeners are called", listener)
+                logger.exception("listener %r raised an exception; the others are still called", listener)
 
     def _on_change(self, kind: HubEventKind, source: int, port: Port, other_port: Port | None) -> None:
         """Report an event of the router about the sender ``source`` (system id + 256 · component id)."""

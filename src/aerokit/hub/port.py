@@ -47,7 +47,7 @@ class FrameQueue:
         self._frames: dict[int, QueuedFrame] = {}
         self._bytes = 0
         self._last_key = 0  # the negative key that was used last
-        # If there are no commands or no telemetry frames, the queue is not searched for them.
+        # Numbers of queued commands and telemetry frames. While one is 0, the queue is not searched for such frames.
         self._order_count = 0
         self._telemetry_count = 0
 
@@ -264,7 +264,7 @@ class Port:
         self._drop(self._queue.put(QueuedFrame(raw, kind, plan.message_id, plan.target, now), plan.key))
 
     def is_due(self, key: int, period_s: float, now: float) -> bool:
-        """Return True if the rate limit allows a frame with this sender and message now. Otherwise count a drop."""
+        """Return True if the rate limit allows a frame of this sender and message (``key``) now, else count a drop."""
         due = self._due.get(key)
         if due is not None and now < due:
             self.counters.dropped["rate_limited"] += 1

@@ -250,7 +250,7 @@ class Switch:
                     self._start_batch(out, raw, plan, now)
 
     def _poll(self) -> None:
-        """Write queued frames of full links that accept data again."""
+        """Write queued frames to the links that accept data again."""
         now, unix_time = self._clock(), self.unix_time()
         self._timer = None
         self._poll_interval_s = min(2 * self._poll_interval_s, MAX_POLL_INTERVAL_S)

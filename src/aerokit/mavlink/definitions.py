@@ -108,7 +108,7 @@ class MessageDefinition:
 
     @property
     def crc_extra(self) -> int:
-        """Byte derived from the definition; the checksum of a frame fails if the sender has another definition."""
+        """Byte derived from the definition. If the sender has another definition, the checksums of its frames fail."""
         # https://mavlink.io/en/guide/serialization.html#crc_extra
         text = self.name + " "
         for field in self.wire_fields:
@@ -411,4 +411,5 @@ def _member_name(enum: str, prefix: str, name: str) -> str:
     # A Python name cannot begin with a digit, so the last word of the prefix is kept.
     if member[:1].isdigit():
         member = prefix.rstrip("_").rpartition("_")[2] + "_" + member
+    # Python reserves keywords, and enum classes cannot have a member called "mro".
     return member + "_" if keyword.iskeyword(member) or member == "mro" else member

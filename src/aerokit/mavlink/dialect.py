@@ -168,7 +168,7 @@ class _Extended(Dialect):
         return first[message_id] if message_id in first else second[message_id]
 
     def enum(self, name: str) -> type[Any]:
-        """Return an enum of all parts: the first one that has every member, otherwise a merged one."""
+        """Return the first part's enum if it has all members of the other enums, otherwise a merged enum."""
         enum_types: list[type[Any]] = []
         for part in self._parts:
             try:

@@ -36,7 +36,7 @@ _MIN_LENGTH_V2 = 12
 _MIN_LENGTH_V1 = 8
 _MAGICS = (MAGIC_V1, MAGIC_V2)
 # Finds possible starts of frames. A MAVLink 2 frame must have known flags, unless the data ends before the flags.
-_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
+_find_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).finditer
 
 # Verdicts about a position in the data.
 _GOOD = 0  # a whole frame with a valid checksum
@@ -230,7 +230,7 @@ class PythonFramer:
         examined_to, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
-        new_candidates = ((match.start(), _NOISE, 0) for match in _magics(data, max(begin, examined_to)))
+        new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)
         for position, verdict, end in chain(candidates, new_candidates, (end_of_data,)):
@@ -279,7 +279,7 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        """Count a frame of an unknown message, and keep it if it is wanted."""
+        """Count a frame of an unknown message, and keep it if :attr:`keep_unknown` is set."""
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -304,8 +304,8 @@ class PythonFramer:
             if size - begin < 3:  # The flags have not arrived yet.
                 return _WAIT, begin + 3, None
             if size - begin < _MIN_LENGTH_V2:
-                are_flags_known = data[begin + 2] <= SIGNED
-                return (_WAIT if are_flags_known else _NOISE), begin + _MIN_LENGTH_V2, None
+                has_valid_flags = data[begin + 2] <= SIGNED
+                return (_WAIT if has_valid_flags else _NOISE), begin + _MIN_LENGTH_V2, None
             _, length, flags, sequence, key, message_id = _HEADER_V2(data, begin)
             if flags & ~SIGNED:
                 return _NOISE, size, None

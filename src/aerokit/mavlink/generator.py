@@ -80,7 +80,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that comes first in `STANDARD_FILES`, and with the added remarks."""
+    """Return ``existing`` with the origin of the two that is first in `STANDARD_FILES`, and any added remarks."""
     origin = min(
         existing.origin,
         added.origin,
@@ -90,7 +90,7 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
 
 
 def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
-    """Return the fields of both definitions. An added field keeps the type of an existing one."""
+    """Return the fields of both definitions. If both have a field, its type is the existing one."""
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:
         existing_field = fields.get(field.name)
@@ -205,7 +205,7 @@ def __dir__() -> list[str]:
     return sorted(set(globals()) | set(_TABLE))
 """
 
-_ENUMS_INIT = '''# pyright: reportUnsupportedDunderAll=false
+_ENUMS_INIT_TEMPLATE = '''# pyright: reportUnsupportedDunderAll=false
 """Enums of the standard: ``MAV_CMD`` is `MavCmd`, ``MAV_CMD_NAV_TAKEOFF`` is ``MavCmd.NAV_TAKEOFF``.
 
 Each is an ``IntEnum``, or an ``IntFlag`` if the standard marks it as a bitmask. Fields of messages are plain ``int``,
@@ -233,7 +233,7 @@ def __dir__() -> list[str]:
     return sorted(set(globals()) | set(_MODULES))
 '''
 
-_MESSAGES_INIT = '''# pyright: reportUnsupportedDunderAll=false
+_MESSAGES_INIT_TEMPLATE = '''# pyright: reportUnsupportedDunderAll=false
 """Messages of the standard, one class each: ``GLOBAL_POSITION_INT`` is `GlobalPositionInt`.
 
 Names, order and raw units of fields are those of the standard: https://mavlink.io/en/messages/
@@ -318,7 +318,7 @@ def generate(folder: Path | None = None) -> dict[str, str]:
 
 
 def differences(folder: Path | None = None) -> list[str]:
-    """Return the committed files that differ from the generated files."""
+    """Return the paths of committed files that are missing, superfluous, or differ from the generated files."""
     files = generate(folder)
     present = {
         path.relative_to(FOLDER).as_posix()
@@ -390,7 +390,7 @@ def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
         rows += f'    {message.id}: ("{message.class_name}", "{_module_of(message)}", {numbers}),\n'
     names = {message.class_name: _module_of(message) for message in messages}
     stub = _reexports("messages", names) + "\nINDEX: dict[int, tuple[str, str, int, int, int]]\n"
-    return _MESSAGES_INIT.format(rows=rows), stub
+    return _MESSAGES_INIT_TEMPLATE.format(rows=rows), stub
 
 
 def _enums_module(module: str, stems: Sequence[str], enums: Sequence[EnumDefinition]) -> str:
@@ -408,7 +408,7 @@ def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
     modules = {stem: module for module, stems in MODULES.items() for stem in stems}
     names = {enum.class_name: modules[enum.origin] for enum in enums}
     rows = "".join(f'    "{name}": "{module}",\n' for name, module in sorted(names.items()))
-    return _ENUMS_INIT.format(rows=rows), _reexports("enums", names)
+    return _ENUMS_INIT_TEMPLATE.format(rows=rows), _reexports("enums", names)
 
 
 def _reexports(package: str, names: dict[str, str]) -> str:

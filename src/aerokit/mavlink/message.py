@@ -378,8 +378,10 @@ def make_enum(
 ) -> type[Any]:
     """Create an ``IntFlag`` for a bitmask, else an ``IntEnum``. Two names for one value are aliases.
 
+    ``is_external`` is True for a definition that aerokit has not generated. Its names are checked.
+
     Raises:
-        TypeError, ValueError: a name of an enum that ``is_external`` is a duplicate or reserved.
+        TypeError, ValueError: a checked name is a duplicate or reserved.
     """
     base: Any = _Flags if bitmask else enum.IntEnum
     enum_type: type[Any]

@@ -228,7 +228,7 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
 @cache
 def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
-    """Return the decoder of the first pymavlink dialect that has the message, with the standard's definition if any."""
+    """Return the decoder of the first pymavlink dialect that has the message and does not contradict the standard."""
     row = STANDARD.rows.get(message_id)
     for module in _dialects(preferred):
         message_class = module.mavlink_map.get(message_id)

@@ -182,7 +182,7 @@ def _is_tuple(field: FieldDefinition) -> bool:
 
 
 def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
-    """Return the type of an attribute, or of the constructor's ``argument``, which may be any sequence."""
+    """Return the type of a field's attribute; with ``argument``, that of the constructor's argument."""
     if field.is_text:
         return "str"
     if field.is_bytes:

@@ -127,7 +127,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
 
 
 def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
-    """Return the generated class if the wire formats are the same. Additional extension fields are allowed."""
+    """Return the generated class if the wire formats are the same. It may have additional extension fields."""
     row = standard.rows.get(definition.id)
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None
@@ -172,7 +172,7 @@ def _message_definition(cls: Any) -> MessageDefinition:
 
 
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
-    """Return the definition with its extension fields marked, which pymavlink's classes do not tell.
+    """Return the definition with its extension fields marked. pymavlink's classes do not mark them.
 
     Each possible number of base fields is tried, until CRC_EXTRA and the wire order match.
     """

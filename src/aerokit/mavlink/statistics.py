@@ -110,7 +110,7 @@ class SourceStatistics(SourceFields):
                 return self._continue_other(sequence, now)
             self._other_expected = -1
         if ahead < _HALF:
-            self._on_gap(ahead, sequence, now)
+            self._on_gap(ahead, now)
             return IN_ORDER
         if self._consume_missing(256 - ahead):  # A frame that counted as lost has arrived late.
             self._unreceived -= 1
@@ -123,7 +123,7 @@ class SourceStatistics(SourceFields):
         self.expected += count
         self._unreceived += count
 
-    def _on_gap(self, ahead: int, sequence: int, now: float) -> None:
+    def _on_gap(self, ahead: int, now: float) -> None:
         """Process a frame after ``ahead`` missing frames, which count as lost until they arrive late."""
         self.lost += ahead
         if ahead > _MAX_GAP:  # The frame may belong to another stream.
@@ -196,15 +196,15 @@ class SourceStatistics(SourceFields):
         Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
         other stream counts as the sender's.
         """
-        count = self.received - self._stream_start
-        is_other_longer = self._other_count > count
+        current_count = self.received - self._stream_start
+        is_other_longer = self._other_count > current_count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
         self._count_alternation(now)
         if is_other_longer:
             self._returns += 1
         if is_over or self._returns >= _MIN_RETURNS:
             other_count = self._other_count if is_other_longer else 0
-            self._swap(sequence, now, count, other_count)
+            self._swap(sequence, now, current_count, other_count)
             return IN_ORDER
         if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
             # The frame is in the gap before the current stream, which was counted as lost.
@@ -217,13 +217,13 @@ class SourceStatistics(SourceFields):
         self._stream_start += 1  # The frame does not count as one of the current stream.
         return LATE if is_other_longer else OTHERS
 
-    def _swap(self, sequence: int, now: float, count: int, other_count: int) -> None:
+    def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
         """Swap the two streams: the other stream becomes the sender's stream, the current stream the other one."""
         # The gap before the current stream was no loss, so it is subtracted. Frames of the gap may have arrived late,
         # so the result could be negative without max().
         self.lost = max(0, self.lost - self._skipped_over)
         self._other_expected = self.expected & 0xFF
-        self._other_count = count
+        self._other_count = current_count
         self._other_at = now
         self._stream_start = self.received - other_count
         self._returns = 0

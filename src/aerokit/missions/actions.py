@@ -50,7 +50,7 @@ def delay(duration_s: float) -> MissionItem:
     """
     if duration_s == 0:
         raise InvalidArgument(
-            "duration_s = 0 is not allowed: it must be above 0, because ArduPilot then uses a time of day instead"
+            "duration_s = 0 is not allowed: it must be above 0, because with 0 ArduPilot waits until a time of day"
         )
     no_time_of_day = (-1.0, -1.0, -1.0)
     return action_item(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _MAX_DURATION_S), *no_time_of_day)

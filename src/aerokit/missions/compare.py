@@ -49,7 +49,7 @@ class ItemStorage(Enum):
     """Changes made by any of the other three."""
 
 
-_ARDUPILOT: dict[int, tuple[str, ...]] = {
+_ARDUPILOT_FORMS: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_WAYPOINT: ("u", "-cc"),  # The first string is for Copter, Rover and Sub, the second for Plane.
     MavCmd.NAV_LOITER_UNLIM: ("--r",),
     MavCmd.NAV_LOITER_TURNS: ("n-R?",),
@@ -115,7 +115,7 @@ _ARDUPILOT: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_ATTITUDE_TIME: ("usiss",),
 }
 
-_PX4: dict[int, tuple[str, ...]] = {
+_PX4_FORMS: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_WAYPOINT: ("ff-y",),
     MavCmd.NAV_LOITER_UNLIM: ("--fy",),
     MavCmd.NAV_LOITER_TIME: ("f?f?",),
@@ -130,9 +130,9 @@ _PX4: dict[int, tuple[str, ...]] = {
     MavCmd.NAV_FENCE_CIRCLE_EXCLUSION: ("f",),
 }
 
-_PX4_JUMP = "sUfffff"
+_PX4_JUMP_FORMS = "sUfffff"
 
-_PX4_OTHERS = "fffffff"
+_PX4_OTHER_FORMS = "fffffff"
 
 _INTEGERS = {"b": (0, 0xFF), "u": (0, 0xFFFF), "i": (-0x80, 0x7F), "s": (-0x8000, 0x7FFF)}
 
@@ -141,7 +141,7 @@ def _stored_values(item: MissionItem, field: str, storage: ItemStorage) -> Itera
     """Yield the values that a field may have when the item is read back."""
     number, value = FIELDS.index(field), getattr(item, field)
     if storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY):
-        for letters in _ARDUPILOT.get(item.command, ("",)):
+        for letters in _ARDUPILOT_FORMS.get(item.command, ("",)):
             yield from _convert(_letter_at(letters, number), value)
     if storage in (ItemStorage.PX4, ItemStorage.ANY):
         yield from _convert(_letter_at(_px4_letters(item), number), value)
@@ -153,13 +153,13 @@ def _letter_at(letters: str, number: int) -> str:
 
 def _px4_letters(item: MissionItem) -> str:
     if item.frame == MavFrame.MISSION:
-        return _PX4_JUMP if item.command == MavCmd.DO_JUMP else _PX4_OTHERS
-    (letters,) = _PX4.get(item.command, ("",))
+        return _PX4_JUMP_FORMS if item.command == MavCmd.DO_JUMP else _PX4_OTHER_FORMS
+    (letters,) = _PX4_FORMS.get(item.command, ("",))
     return letters
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the converted value. Yield nothing if the conversion overflows, because the result is undefined in C."""
+    """Yield the value as stored in the form that ``letter`` stands for; nothing if a C conversion is undefined."""
     if letter == "-":  # not stored
         yield 0.0
     elif letter == "2":  # always 2
@@ -179,7 +179,7 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
-    """Yield a finite value in the form that ``letter`` stands for, other than an integer with a range."""
+    """Like `_convert`, for finite values and for letters other than those of integers with a range."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float
         yield struct.unpack("<f", struct.pack("<f", value))[0]

@@ -258,8 +258,8 @@ def place_item(
 ) -> MissionItem:
     """Create an item at a place.
 
-    One of the three ``altitudes`` is given: above home, above mean sea level or above the terrain. A Position supplies
-    latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
+    Exactly one of the three ``altitudes`` must be given: above home, above mean sea level or above the terrain. A
+    Position supplies latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
     place is given and ``is_needed`` is False, the item has 0°, 0°, which ArduPilot takes for the current position.
     """
     if isinstance(latitude_deg, (Position, Home)):

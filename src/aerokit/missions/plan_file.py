@@ -36,7 +36,7 @@ _NUMBER_KEYS = {
 
 
 def read_plan_file(path: str | os.PathLike[str]) -> Plan:
-    """Read a plan from a file.
+    """Read a plan from a .plan file.
 
     Surveys, corridor scans and landing patterns are converted to simple items. Other complex items are refused, because
     the file has only their settings and not their items. Ranges of parameters are not checked here, but by ``check``.
@@ -50,7 +50,7 @@ def read_plan_file(path: str | os.PathLike[str]) -> Plan:
 
 
 def write_plan_file(path: str | os.PathLike[str], plan: Plan | Mission) -> None:
-    """Write a plan, or a mission as a plan without fence and rally points, to a file; see :func:`format_plan`.
+    """Write a plan, or a mission as a plan without fence and rally points, to a .plan file; see :func:`format_plan`.
 
     Raises:
         InvalidArgument: the plan cannot be written. No file was changed.
@@ -60,7 +60,7 @@ def write_plan_file(path: str | os.PathLike[str], plan: Plan | Mission) -> None:
 
 
 def parse_plan(text: str, name: str = "plan") -> Plan:
-    """Parse the text of a file. Errors begin with ``name``."""
+    """Parse the text of a .plan file. Error texts begin with ``name``."""
     document = load_json(text, name)
     # Check the kind of file before the missing fields, because a file of another kind lacks most of these fields.
     for key, allowed in (("fileType", "Plan"), ("version", 1)):
@@ -80,7 +80,7 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
 
 
 def format_plan(plan: Plan | Mission) -> str:
-    """Format a plan or a mission as the text of a file.
+    """Format a plan or a mission as the text of a .plan file.
 
     If the plan was read from a file, only the changed parts of that file's text are replaced.
 
@@ -108,7 +108,7 @@ def format_plan(plan: Plan | Mission) -> str:
 
 
 def _document(plan: Plan) -> dict[str, Any]:
-    """Return the JSON object of a file: the object in ``plan.source``, in which only changed parts are replaced."""
+    """Return the JSON object of a .plan file: that in ``plan.source``, in which only changed parts are replaced."""
     document: dict[str, Any]
     if plan.source:
         document, old = json.loads(plan.source), parse_plan(plan.source)
@@ -271,7 +271,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    """Return the place; None if coordinates are null. ``altitude`` is its reference: "amsl" or "relative"."""
+    """Return the place; None if coordinates are null. Altitudes refer to ``altitude``: "amsl" or "relative"."""
     latitude_value, longitude_value, *altitude_values = value.elements(2, 3)
     latitude = latitude_value.number(-90, 90, null=True)
     longitude = longitude_value.number(-180, 180, null=True)

@@ -40,7 +40,7 @@ _COLUMNS = (
 
 
 def read_waypoint_file(path: str | os.PathLike[str]) -> Mission:
-    """Read a mission from a file.
+    """Read a mission from a ``QGC WPL`` file (.waypoints, .txt).
 
     Spaces are accepted instead of tabs; empty lines and lines that begin with ``#`` are skipped. The home line becomes
     ``mission.home``. Places in MAVProxy's files are rounded to 1e-6 degrees.
@@ -58,7 +58,7 @@ def write_waypoint_file(path: str | os.PathLike[str], mission: Mission, *, versi
 
 
 def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
-    """Parse the text of a file. Errors begin with ``name``."""
+    """Parse the text of a ``QGC WPL`` file. Error texts begin with ``name``."""
     numbered_lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     numbered_lines = [(number, line) for number, line in numbered_lines if line and not line.startswith("#")]
     _, first_line = numbered_lines[0] if numbered_lines else (0, "nothing")
@@ -77,7 +77,7 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
 
 
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:
-    """Format a mission as the text of a file, with Mission Planner's precision, or more where a number needs more.
+    """Format a mission as a ``QGC WPL`` file, with Mission Planner's precision, or more where a number needs more.
 
     Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
     (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north. A .plan file
@@ -182,9 +182,9 @@ def _item_row(item: MissionItem, index: int) -> str:
     integers = (index, 0, int(item.frame), int(item.command))
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):
-        raise InvalidArgument(f"{item!r} has an infinite number, which a file cannot store")
+        raise InvalidArgument(f"{item!r} has an infinite number, which a waypoint file cannot store")
     if math.isnan(item.z) and item.position is not None:
-        raise InvalidArgument(f"{item!r} has a place without an altitude, which a file cannot store")
+        raise InvalidArgument(f"{item!r} has a place without an altitude, which a waypoint file cannot store")
     # Mission Planner writes 8 decimal places of each number, but 6 of the altitude.
     columns = [(number, 8) for number in numbers] + [(item.z, 6)]
     texts = (

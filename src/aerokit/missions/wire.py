@@ -215,8 +215,8 @@ def pack_items(
 
     A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` only for missions: items from index
     ``first`` on are replaced or appended, all others are kept. Jump targets must then be below the number of items in
-    the file (4.7). ArduPilot processes a file when it is closed, and first clears the old mission. If ArduPilot refuses
-    an item, the new mission consists of the items before the refused item.
+    the file (ArduPilot 4.7). ArduPilot processes a file when it is closed, and first clears the old mission. If it
+    refuses an item, the new mission consists of the items before that item.
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

@@ -176,7 +176,7 @@ def _implements(camera: CameraDriver, name: str) -> bool:
 
 
 def capabilities_of(camera: CameraDriver) -> int:
-    """Return the CAMERA_CAP_FLAGS for the methods that the camera's class overrides."""
+    """Return the CAMERA_CAP_FLAGS that follow from the methods of the camera's class and from its attributes."""
     flags = CameraCapFlags(0)
     if _implements(camera, "take_photo"):
         flags |= CameraCapFlags.CAPTURE_IMAGE

@@ -92,7 +92,7 @@ class CommandRequest:
 
 
 def outcome_of(value: object) -> Outcome:
-    """Convert the return value of a handler to a result: None and True mean ACCEPTED, False means FAILED."""
+    """Convert the return value of a handler: None and True mean ACCEPTED, False FAILED, a number is a MAV_RESULT."""
     if value is None or value is True:
         return Outcome(MavResult.ACCEPTED)
     if isinstance(value, CommandResult):
@@ -198,7 +198,7 @@ class ComponentCommands:
 
         # The event loop calls `cancel` after this method has returned. The variables below are then set.
         def cancel() -> None:
-            """Cancel the handler because its sender or the end of the component requires it."""
+            """Cancel the handler, because the sender of the command or the end of the component requires it."""
             nonlocal is_cancelled
             if task in self._tasks_in_threads:
                 return  # The command cannot be cancelled. Its sender gets the result.

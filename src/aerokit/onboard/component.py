@@ -196,7 +196,7 @@ class OnboardComponent:
         """Decorator: send the message that the function returns, on request and at intervals that other programs set.
 
         The function returns None while it has no values. ``hz`` (0 to 200) is the rate at which the message is sent to
-        all programs from the start. With 0, the message is sent only on request.
+        all programs from the start. With 0, the message is sent only when other programs ask for it.
 
         Raises:
             InvalidArgument: ``hz`` is out of range, or the message already has a function.

@@ -115,9 +115,9 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
             arguments = (length, rate)
         elif method == "set_rate":
             arguments = (rate,)
-        if None in arguments:
+        if None in arguments:  # A parameter that the sender has left out is NaN, and arrives here as None.
             needed = "length and rate" if method == "pay_out" else "rate"
-            raise InvalidArgument(f"this action needs {needed}, but {needed} is not set")
+            raise InvalidArgument(f"this action needs {needed}; NaN is not allowed")
         if method == "pay_out" and rate is not None and rate <= 0:
             raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
         await services.commands.call(getattr(winch, method), *arguments)
@@ -154,7 +154,7 @@ def add_gripper(
 def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> None:
     """Answer ARM_AUTHORIZATION_REQUEST.
 
-    ``authorize`` returns the seconds for which arming is allowed, or a CommandResult, and raises an error to deny it.
+    ``authorize`` returns the seconds for which arming is allowed, or a CommandResult. An error denies arming.
     """
 
     async def arm_authorization(request: CommandRequest, system_id: int) -> CommandResult:

@@ -29,7 +29,7 @@ _ERROR_NUMBERS = {errno.ENOTEMPTY: 39, errno.ELOOP: ENOENT, errno.ENAMETOOLONG: 
 
 
 def _raises_file_fault(function: FunctionT) -> FunctionT:
-    """Decorator: turn an OSError into a FileFault with the same error number."""
+    """Decorator: turn an OSError into a FileFault with the error number that Linux has for it."""
 
     @wraps(function)
     def guarded(*args: Any, **kwargs: Any) -> Any:

@@ -109,7 +109,7 @@ class GimbalAdapter(GimbalMount):
         self.slew_rad_s: float = math.radians(gimbal.max_rate_deg_s)
         self.can_point_at_positions: bool = overrides(gimbal, GimbalDriver, "look_at")
         self.capabilities: int = ALL_CAPABILITIES
-        for axis_flags, (low, high) in ((_ROLL, roll), (_PITCH, pitch), (_YAW, yaw)):
+        for axis_flags, (low, high) in ((_ROLL_FLAGS, roll), (_PITCH_FLAGS, pitch), (_YAW_FLAGS, yaw)):
             if low == high:  # The gimbal does not turn about this axis.
                 self.capabilities &= ~axis_flags
         if yaw == _FULL_TURN_DEG:
@@ -177,6 +177,6 @@ class GimbalAdapter(GimbalMount):
             self._followed_system_id = system_id  # `look_at` has reset it.
 
 
-_ROLL = DeviceCapFlags.HAS_ROLL_AXIS | DeviceCapFlags.HAS_ROLL_LOCK | DeviceCapFlags.HAS_ROLL_FOLLOW
-_PITCH = DeviceCapFlags.HAS_PITCH_AXIS | DeviceCapFlags.HAS_PITCH_LOCK | DeviceCapFlags.HAS_PITCH_FOLLOW
-_YAW = DeviceCapFlags.HAS_YAW_AXIS | DeviceCapFlags.HAS_YAW_LOCK | DeviceCapFlags.HAS_YAW_FOLLOW
+_ROLL_FLAGS = DeviceCapFlags.HAS_ROLL_AXIS | DeviceCapFlags.HAS_ROLL_LOCK | DeviceCapFlags.HAS_ROLL_FOLLOW
+_PITCH_FLAGS = DeviceCapFlags.HAS_PITCH_AXIS | DeviceCapFlags.HAS_PITCH_LOCK | DeviceCapFlags.HAS_PITCH_FOLLOW
+_YAW_FLAGS = DeviceCapFlags.HAS_YAW_AXIS | DeviceCapFlags.HAS_YAW_LOCK | DeviceCapFlags.HAS_YAW_FOLLOW

@@ -58,7 +58,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
     def __init__(self, host: ComponentHost, path: Path | None, *, bytewise: bool) -> None:
         self._host, self._path = host, path
         self._rows: dict[str, _Row] = {}
-        self._small_names: list[str] = []  # names of the parameters that are not strings, which PARAM_VALUE can carry
+        self._numeric_names: list[str] = []  # names of parameters that are numbers; PARAM_VALUE carries no strings
         self._stored: dict[str, Any] = _read_stored(path)  # values that were in the file at the start
         self._is_dirty = False  # True if the file does not contain the last change
         self._save_task: asyncio.Task[None] | None = None  # None while the file is not being written
@@ -133,7 +133,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
                 logger.warning("%s: the default is used instead of the stored value: %s", self._path, error)
         self._rows[name] = row
         if fits_param_value(row.type):
-            self._small_names.append(name)
+            self._numeric_names.append(name)
         # Create the server only when the first parameter is added, because a component without parameters may use
         # PARAM_EXT for the settings of a camera.
         if self._param_ext_server is None:
@@ -247,7 +247,7 @@ class _Store:
 
     @property
     def small_names(self) -> list[str]:
-        return self._parameters._small_names
+        return self._parameters._numeric_names
 
     def __contains__(self, name: object) -> bool:
         return name in self._parameters._rows

@@ -41,7 +41,7 @@ class ComponentServices:
         """Send the message that ``function`` returns: on request, and at a rate of ``hz``.
 
         Raises:
-            InvalidArgument: the rate is above 200 Hz, or the message already has a function.
+            InvalidArgument: the rate is not 0 to 200 Hz, or the message already has a function.
         """
         if not 0.0 <= hz <= 1.0 / MIN_STREAM_INTERVAL_S:
             raise InvalidArgument(f"hz = {hz} is not allowed: it must be 0 to {1.0 / MIN_STREAM_INTERVAL_S:g}")

@@ -163,7 +163,7 @@ class CameraDefinition(Snapshot):
         return options
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
-        """Return the options of a setting, and the selected options of other settings that restrict them."""
+        """Return the options that a setting has now, and as texts the selected options of others that restrict them."""
         options = self.settings[name].options if name in self.settings else ()
         reasons: list[str] = []
         for setting, selected in self._selected(values):
@@ -222,7 +222,7 @@ def load_definition(path: str | os.PathLike[str]) -> CameraDefinition:
 
 
 def parse_definition(data: bytes, source: str = "camera definition") -> CameraDefinition:
-    """Parse the content of a camera definition file. Errors begin with ``source``."""
+    """Parse the content of a camera definition file. Error texts begin with ``source``."""
     from xml.etree.ElementTree import ParseError
 
     from defusedxml import ElementTree as DefusedXml
@@ -269,9 +269,9 @@ def _check_option(
     shown = list(by_name.items())[:MAX_SHOWN_OPTIONS]
     names = ", ".join(f"{name!r} ({short_repr(option_value)})" for name, option_value in shown)
     more = f" and {len(by_name) - MAX_SHOWN_OPTIONS} more" if len(by_name) > MAX_SHOWN_OPTIONS else ""
+    allowed = f"it must be {names}{more}" if names else "no value is allowed"
     raise InvalidArgument(
-        f"{setting.name} = {short_repr(value)} is not allowed{restriction}: {names or 'nothing'}{more}"
-        + did_you_mean(value, by_name)
+        f"{setting.name} = {short_repr(value)} is not allowed{restriction}: {allowed}" + did_you_mean(value, by_name)
     )
 
 
@@ -482,6 +482,8 @@ def _parse_value(text: str | None, wire_type: int) -> SettingValue | None:
 
 
 def _translated(setting: SettingDefinition, texts: Mapping[str, str]) -> SettingDefinition:
+    """Translate the texts of a setting. ``texts`` maps original texts to translations."""
+
     def translated(option: SettingOption) -> SettingOption:
         ranges = tuple(
             restriction.replace(options=tuple(map(translated, restriction.options))) for restriction in option.ranges

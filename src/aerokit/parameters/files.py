@@ -68,7 +68,7 @@ class ParameterFile(Mapping[str, "int | float"]):
 
 
 def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | None = None) -> ParameterFile:
-    """Read a file in any of the three formats. The line of the first parameter determines the format.
+    """Read a file of Mission Planner, MAVProxy or QGroundControl. Its first parameter shows which format it has.
 
     If a QGroundControl file has several components, ``component_id`` selects one, by default the autopilot (1).
 
@@ -85,7 +85,7 @@ def read_parameter_file(path: str | os.PathLike[str], *, component_id: int | Non
 
 
 def parse_parameter_file(text: str, source: str = "parameters", *, component_id: int | None = None) -> ParameterFile:
-    """Parse the text of a file. Errors begin with ``source``."""
+    """Parse the text of a parameter file. Error texts begin with ``source``."""
     comments: list[str] = []
     lines: list[tuple[str, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -131,7 +131,7 @@ def parameter_file_text(
     system_id: int = 1,
     component_id: int = _AUTOPILOT,
 ) -> str:
-    """Format parameters as the text of a file; see :func:`write_parameter_file`."""
+    """Format parameters as the text of a parameter file; see :func:`write_parameter_file`."""
     if format not in ("missionplanner", "mavproxy", "qgroundcontrol"):
         raise InvalidArgument(
             f"format = {format!r} is not allowed: it must be missionplanner, mavproxy or qgroundcontrol"

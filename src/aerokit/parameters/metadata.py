@@ -140,7 +140,7 @@ class Metadata(Mapping[str, ParameterMetadata]):
 
 
 def load_metadata(path: str | os.PathLike[str]) -> Metadata:
-    """Read a metadata file of either autopilot, XML or JSON, compressed (``.xz``) or not.
+    """Read a metadata file of ArduPilot or PX4, XML or JSON, compressed (``.xz``) or not.
 
     If a parameter is defined several times, for different frame types, the first definition counts.
 
@@ -152,7 +152,7 @@ def load_metadata(path: str | os.PathLike[str]) -> Metadata:
 
 
 def parse_metadata(data: bytes, source: str = "metadata") -> Metadata:
-    """Parse the content of a metadata file. Errors begin with ``source``."""
+    """Parse the content of a metadata file. Error texts begin with ``source``."""
     try:
         parameters = _parse(decompress(data, source))
     except FileFormatError:
@@ -170,7 +170,7 @@ _BITS = range(64)
 
 
 def _parse(data: bytes) -> list[ParameterMetadata]:
-    """Parse a file of either autopilot, XML or JSON."""
+    """Parse a metadata file of ArduPilot or PX4, XML or JSON."""
     byte_order_mark = b"\xef\xbb\xbf"
     if data.lstrip(byte_order_mark + b" \t\r\n").startswith(b"<"):
         root = DefusedXml.fromstring(data, forbid_dtd=True)

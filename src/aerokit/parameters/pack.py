@@ -42,7 +42,7 @@ _CODES = {
     4: (ParameterType.REAL32, Struct("<f")),
 }
 
-_CODE_OF = {
+_CODE_BY_TYPE = {
     ParameterType.INT8: 1,
     ParameterType.UINT8: 2,
     ParameterType.INT16: 2,
@@ -54,7 +54,7 @@ _CODE_OF = {
 
 
 class PackHeader(NamedTuple):
-    """Header of the file.
+    """Header of a ``param.pck`` file.
 
     ``total`` is the number of the vehicle's parameters in a downloaded file, and the file size in bytes in an upload.
     """
@@ -65,7 +65,7 @@ class PackHeader(NamedTuple):
 
 
 class PackEntry(NamedTuple):
-    """One parameter in the file.
+    """One parameter in a ``param.pck`` file.
 
     ``default`` is None if the file does not include it; ``end`` is the position after the entry.
     """
@@ -78,7 +78,7 @@ class PackEntry(NamedTuple):
 
 
 def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
-    """Decode a downloaded file. ``start`` is the index of its first parameter, as requested in the path.
+    """Decode a downloaded ``param.pck``. ``start`` is the index of its first parameter, as requested in the path.
 
     If defaults were requested, every returned parameter has a default, although the file omits defaults that equal the
     value.
@@ -241,9 +241,9 @@ def _rows(parameters: Mapping[str, Parameter] | Iterable[Parameter]) -> Iterator
 
 
 def _code_of(parameter: Parameter) -> int:
-    if parameter.type not in _CODE_OF:
+    if parameter.type not in _CODE_BY_TYPE:
         raise InvalidArgument(f"{parameter.name} is an {parameter.type.name}, which param.pck cannot store")
-    return _CODE_OF[parameter.type]
+    return _CODE_BY_TYPE[parameter.type]
 
 
 def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> bytes:

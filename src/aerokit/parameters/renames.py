@@ -24,7 +24,7 @@ _SKIP_ALL = -1
 
 
 class ParameterRenamedWarning(UserWarning):
-    """A parameter was used under the name of another firmware version, and its value was converted.
+    """A parameter was used under the name of another firmware version. If its units differ, its value was converted.
 
     Silence it with ``warnings.filterwarnings("ignore", category=ParameterRenamedWarning)``.
     """
@@ -95,11 +95,11 @@ class Renamed(Snapshot):
     def parameter(self, parameter: Parameter) -> Parameter:
         """Convert the vehicle's parameter to the requested name and units. A scaled value becomes a REAL32."""
         default = None if parameter.default is None else self.to_requested(parameter.default)
-        changed = parameter.replace(name=self.requested, value=self.to_requested(parameter.value), default=default)
+        converted = parameter.replace(name=self.requested, value=self.to_requested(parameter.value), default=default)
         if self.rename.divisor == 1 or not self._has_other_units:
-            return changed
+            return converted
         default = None if default is None else to_float32(default)
-        return changed.replace(value=to_float32(changed.value), default=default, type=ParameterType.REAL32)
+        return converted.replace(value=to_float32(converted.value), default=default, type=ParameterType.REAL32)
 
     @property
     def warning(self) -> str:

@@ -215,7 +215,7 @@ class ComponentSources(TwinOf["AsyncComponentSources"]):
             distances_m: at most 72 distances in metres. None means that there was no measurement, infinity that nothing
                 is in range.
             increment_deg: angle between two distances, above 0.
-            first_deg: direction of the first distance from the nose.
+            first_deg: direction of the first distance in degrees, clockwise from the nose.
             min_m: minimum range of the sensor, 0 to 655 m.
             max_m: maximum range of the sensor, at most 655 m.
             sensor_type: MAV_DISTANCE_SENSOR: 0 laser, 1 ultrasound, 2 infrared, 3 radar.

@@ -91,7 +91,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
     Every action runs on all available members at once. A member is available unless it is lost, taken over or released.
     The action returns a :class:`FleetResult` when all these members have finished or failed. If a member fails, the
     fleet's policy may send orders to the other members; then the action returns after these orders were executed. If
-    the action is cancelled, all members hold.
+    the action is cancelled, all members hold, unless it works on the ground or makes them hold, land or return.
     """
 
     @property
@@ -187,7 +187,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 altitude of the first member's home.
 
         Raises:
-            InvalidArgument: a track has no member.
+            InvalidArgument: the name of a track is not that of a member.
             ValueUnknownError: the position of the first member is unknown.
         """
         return self._loop.call(self.aio.show_start_positions, show, origin)
@@ -467,7 +467,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             description: name of the barrier in errors.
 
         Raises:
-            FleetError: the condition was not true for a member in time. The failure applies the fleet's policy.
+            FleetError: the condition was not true for a member in time, and the fleet's policy was applied.
         """
         return self._loop.run(self.aio.barrier, condition, timeout=timeout, description=description)
 
@@ -539,7 +539,8 @@ class Fleet(FleetTwin, Selection):
             rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
-            The number of MAVLink messages sent on each link, without those that another sender has sent there.
+            The number of MAVLink messages sent on a link. If another sender has just sent the same corrections on some
+            links, fewer are sent there; the largest number is returned.
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.

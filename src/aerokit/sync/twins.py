@@ -298,8 +298,8 @@ class StateCell(CellTwin[T]):
         single message is not missed. Exceptions of the predicate are raised here.
 
         Raises:
-            OperationTimeout: the condition was not met within ``timeout`` seconds; the text has ``description`` and the
-                last values.
+            OperationTimeout: the condition was not met within ``timeout`` seconds; the error names ``description`` and
+                the last values.
         """
         return self._loop.run(
             self.aio.wait_until,
@@ -322,10 +322,10 @@ class StateCell(CellTwin[T]):
 
 
 class Changes(ChangesTwin[T]):
-    """Endless asynchronous iterator over the values of a cell.
+    """Asynchronous iterator over the values of a cell.
 
-    Iteration raises the error with which the cell was closed. While the iterator exists, every received message of the
-    cell is decoded.
+    Iteration ends only when the cell is closed, by raising the error with which it was closed. While the iterator
+    exists, every received message of the cell is decoded.
     """
 
     @property
@@ -369,7 +369,7 @@ class Subscription(SubscriptionTwin[ItemT]):
 class Connection(ConnectionTwin):
     """One MAVLink node (system id, component id) on one link.
 
-    Received bytes enter through ``bytes_received``, are checked by one framer per remote peer, and go to ``bus``.
+    Received bytes enter through ``bytes_received``. One framer per remote peer extracts frames, which go to ``bus``.
     ``send`` writes a message to the peer from which its target was last received; :class:`Routes` stores that peer
     and decides when it may change (``may_move``). Everything runs on the event loop's thread.
     """
@@ -389,7 +389,7 @@ class Connection(ConnectionTwin):
         return self.aio.signing
 
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Number, frame and write a message. Never blocks.
+        """Encode a message with the next sequence number, and write it. Never blocks.
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
@@ -430,7 +430,7 @@ class Connection(ConnectionTwin):
         capacity: int = 1,
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[ItemT]:
-        """Return a stream of these messages or events, of one system (0: of all), for use in a ``with`` block.
+        """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
 
         Raises:
             InvalidArgument: no type is given, or the dialect does not have a given type.

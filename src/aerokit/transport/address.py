@@ -191,12 +191,12 @@ class _Parser:
         return "", text
 
     def parse_with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
-        """Parse the part after a known scheme. Aliases of the scheme, e.g. ``file``, were already resolved."""
+        """Parse the part after a known scheme, which may be an alias of a link's kind, e.g. ``file`` of replay."""
         kind = _SCHEMES[scheme]
         target, _, query = after_scheme.partition("?")
         options = self.parse_options(kind, query)
         if kind == "serial":
-            return self.parse_serial(target, options, decode=True)
+            return self.parse_serial(target, options, has_scheme=True)
         if kind == "replay":
             if scheme == "file" and re.match(r"/[a-z]:[/\\]", target, re.IGNORECASE):
                 target = target[1:]  # In file:///C:/…, the slash before a Windows drive is not part of the path.
@@ -215,7 +215,7 @@ class _Parser:
         if match := _WITHOUT_COLON.match(text):
             raise self.missing_colon_error(match[1].lower(), match[0], text)
         if _COM_PORT.fullmatch(text) or "\\" in text or "/" in text:
-            return self.parse_serial(text, {}, decode=False)
+            return self.parse_serial(text, {}, has_scheme=False)
         if ":" not in text:
             raise self.error("it is neither host:port nor the path of a serial port or of a .tlog file")
         if not text.startswith("[") and text.count(":") > 1 and not _is_ipv6(text.rpartition(":")[0]):
@@ -279,11 +279,11 @@ class _Parser:
             raise self.error(f"the port {port} is out of range ({min_port} to 65535)")
         return port
 
-    def parse_serial(self, text: str, options: dict[str, str], *, decode: bool) -> LinkAddress:
-        """Parse a serial port and its baud rate. ``decode`` is True for an address with a scheme."""
+    def parse_serial(self, text: str, options: dict[str, str], *, has_scheme: bool) -> LinkAddress:
+        """Parse a serial port and its baud rate. ``has_scheme`` is True if a scheme preceded ``text``."""
         # In an address without a scheme, only the name of a COM port may be followed by a colon and the baud rate.
         # Other names may contain colons themselves.
-        colon_baud = _COLON_BAUD if decode else _COM_COLON_BAUD
+        colon_baud = _COLON_BAUD if has_scheme else _COM_COLON_BAUD
         baud_text: str | None
         if "," in text:
             device, _, baud_text = text.partition(",")
@@ -292,7 +292,7 @@ class _Parser:
         else:
             device, baud_text = text, None
         baud_text = options.pop("baud", baud_text)
-        device = _unquote(device) if decode else device
+        device = _unquote(device) if has_scheme else device
         if not device.strip("/"):
             raise self.error("the serial port is missing")
         baud = None if baud_text is None else self.parse_whole_number("the baud rate", baud_text)

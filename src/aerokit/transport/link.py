@@ -249,19 +249,18 @@ class BaseLink(Link):
 
     def _report_stalled(self, is_stalled: bool) -> None:
         """Notify the receiver when one of the link's transports stalls, and when none is stalled any more."""
-        stalled_at = self._stalled_at
-        was_stalled = stalled_at is not None
-        if is_stalled == was_stalled:
+        stalled_since = self._stalled_at  # None if the link was not stalled until now
+        if is_stalled == (stalled_since is not None):
             return
         now = asyncio.get_running_loop().time()
         self._stalled_at = now if is_stalled else None
         receiver = self._receiver
         if not isinstance(receiver, DrainListener):
             return
-        if stalled_at is None:  # The stall begins now.
+        if stalled_since is None:
             receiver.link_stalled(self.unsent_bytes)
         else:
-            receiver.link_drained(now - stalled_at)
+            receiver.link_drained(now - stalled_since)
 
     def _lose(self, reason: str, cause: BaseException | None = None, kind: type[LinkLost] = LinkLost) -> None:
         """Release the link and report its loss to the receiver, once."""

@@ -203,7 +203,7 @@ class MultiLink(Link):
         return None
 
     async def _abort_opening(self, openings: Collection[asyncio.Future[LinkOpenError | None]]) -> None:
-        """Cancel all attempts after a failed open(), and make new links, so that it can be called again."""
+        """After a failed open(), cancel all attempts and make new links, so that open() can be called again."""
         self._receiver = None
         for opening in openings:
             opening.cancel()

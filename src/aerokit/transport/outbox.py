@@ -98,7 +98,7 @@ class Outbox:
         self._forwarded_bytes -= count
 
     def close(self) -> None:
-        """Forward waiting data; if the transport is stalled, drop it. Afterwards, only ``dropped`` is called."""
+        """Forward waiting data; if the transport is stalled, drop it. Afterwards, ``stalled`` is not called."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -165,9 +165,9 @@ class Outbox:
         """Check whether data has left since the last poll. Polling ends when there is no unsent data."""
         self._timer = None
         self._drop_outdated()
-        pending, now = self._pending(), self._loop.time()
-        sent_bytes = self._forwarded_bytes - pending  # Forwarded bytes that are no longer pending have left.
-        is_idle = not (pending or self._waiting or self._is_full)
+        pending_bytes, now = self._pending(), self._loop.time()
+        sent_bytes = self._forwarded_bytes - pending_bytes  # Forwarded bytes that are no longer pending have left.
+        is_idle = not (pending_bytes or self._waiting or self._is_full)
         if sent_bytes != self._sent_bytes or is_idle:
             self._sent_bytes, self._progress_at = sent_bytes, now
             self._set_stalled(False)
@@ -177,7 +177,7 @@ class Outbox:
             self._schedule_poll()
 
     def _set_stalled(self, is_stalled: bool) -> None:
-        """Report a change. When the stall ends, forward the buffered data first."""
+        """Report when a stall begins or ends. When it ends, forward the buffered data first."""
         if is_stalled == self._is_stalled:
             return
         self._is_stalled = is_stalled

@@ -49,8 +49,8 @@ class SerialLink(BaseLink):
     """A serial port, 8N1, opened exclusively. Unplugging the device counts as a lost link.
 
     ``baud`` is in bits per second. The rate matters for UARTs, not for USB ports such as /dev/ttyACM0. ``rtscts``
-    enables hardware flow control. The write buffer holds about two seconds of data (at least 4096 bytes), and drops
-    data after a second.
+    enables hardware flow control. The write buffer holds about two seconds of data (at least 4096 bytes). Data that has
+    waited in it for a second is dropped.
     """
 
     def __init__(self, device: str, baud: int = 57600, *, rtscts: bool = False) -> None:

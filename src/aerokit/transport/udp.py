@@ -85,7 +85,7 @@ class _UdpLink(BaseLink):
             await self._connect_without_reader(sock)
 
     async def _connect_without_reader(self, sock: socket.socket) -> None:
-        """Let asyncio read the socket, through a protocol, and close it."""
+        """Let asyncio read the socket through a protocol. asyncio then also closes the socket."""
         assert self._loop is not None
         self._transport_owns_socket = True
         self._released.clear()

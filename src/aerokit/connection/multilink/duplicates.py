@@ -29,7 +29,7 @@ COPY_WINDOW_FRAMES = 128
 
 
 class _Seen:
-    """Record of a received frame: its links, and whether it was admitted and accepted."""
+    """Record of a received frame: its links, whether its signature is valid, and whether it was delivered."""
 
     __slots__ = ("at", "count", "is_accepted", "is_admitted", "link_bits")
 
@@ -42,10 +42,10 @@ class _Seen:
 
 
 class Copies:
-    """Remembers which frame arrived over which link, and detects copies.
+    """Remembers which frame arrived over which link, and detects copies: equal frames over different links.
 
-    An equal frame over the same link is not a copy, because the sender sent it again, perhaps by chance with the same
-    sequence number after a wrap-around.
+    An equal frame over the same link is not a copy: the sender has sent a new frame that is equal by chance, with a
+    sequence number that has wrapped around.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class Copies:
         """True if the last checked frame equals one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
-        """Return True if an equal frame arrived a few seconds ago over another link, but not yet over this link."""
+        """Return True if an equal frame arrived within `COPY_WINDOW_S` over another link, but not yet over this one."""
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
@@ -146,8 +146,9 @@ class _Stream:
 class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
-    If two links carry separate streams (each port of an autopilot has its own sequence numbers), only frames of the
-    link in use are accepted, because frames of the other link may be older. ``choices`` has the links to each system.
+    If two links carry separate streams (each port of an autopilot has its own sequence numbers), frames of the link
+    that is not in use may be older. Of these, only late answers, and frames of components that the link in use does not
+    reach, are accepted. ``choices`` has the links to each system.
     """
 
     def __init__(self, link_count: int, choices: Mapping[int, LinkChoice]) -> None:
@@ -179,7 +180,7 @@ class MergedStreams:
         return True
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Return True if a frame is to be delivered, and record it as accepted. No copy of it was accepted before."""
+        """Return True if a frame, of which no copy was accepted yet, is to be delivered. Then record it as accepted."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)

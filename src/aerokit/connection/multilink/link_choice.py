@@ -60,6 +60,7 @@ class Candidate:
         """Hardware id received over the link; None if none was received."""
         self.is_other_hardware: bool = False
         """True if :attr:`hardware` is another vehicle's. The link is then not proven by its clock or by copies."""
+        # Numbers of requests for the hardware id, and of TIMESYNC answers since the first request.
         self._hardware_requests = self._answers_since_request = 0
         # Numbers of consecutive matches and mismatches of the clock, and of copies since the proof was last reset.
         self._clock_matches = self._clock_mismatches = self._copies = 0
@@ -87,7 +88,8 @@ class Candidate:
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        ``may_prove`` is False while the hardware id, which is stronger evidence, may still be received.
+        `MIN_CLOCK_MATCHES` matches in a row prove the link, as many mismatches make it doubted. ``may_prove`` is False
+        while the hardware id, which is stronger evidence, may still be received.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
@@ -131,12 +133,12 @@ class Candidate:
 
     def record_hardware(self, *, is_other: bool) -> None:
         """Record whether the hardware id received over the link contradicts that of the vehicle."""
-        was_other, self.is_other_hardware = self.is_other_hardware, is_other
         if is_other:
             self._doubt()
             self.was_proven = False  # The link now leads to another vehicle, so an earlier proof is void.
-        elif was_other:  # The link leads to this vehicle again.
+        elif self.is_other_hardware:  # Until now the link led to another vehicle.
             self.is_doubted = False
+        self.is_other_hardware = is_other
 
     def count_answer(self) -> None:
         """Count a TIMESYNC answer after a request for the hardware id."""
@@ -192,7 +194,7 @@ class LinkChoice:
     """The links to one system, and the link in use.
 
     Systems with an autopilot need proof (``needs_proof``) that a second link leads to the same vehicle: a matching
-    clock, or the same frames. Without proof, the frames of the link are refused, and no command is sent over it. A link
+    clock, or the same frames. Until then, frames of the second link are refused, and no command is sent over it. A link
     with a different hardware id is refused even if the clock matches.
     """
 
@@ -229,7 +231,7 @@ class LinkChoice:
             self.candidates = {candidate.link: candidate}
 
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
-        """Record the vehicle's time ``vehicle_s``, received over a link; ``at`` is our time at that moment."""
+        """Record an answer: the vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
         candidate = self.candidates[link]
         # True if the link in use has not answered since the previous answer over this link. Recording the new answer
         # would change the result, so it follows below.

@@ -140,7 +140,7 @@ class LinkProbes:
         return max(0.0, now - sent_at)
 
     def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
-        """Report that another vehicle has the same system id: once, until the link leads to the known vehicle again."""
+        """If the link is doubted, report a second vehicle with the same system id, once until the doubt has ended."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)

@@ -36,7 +36,10 @@ STATUS_INTERVAL_S = 0.95  # A little below 1 s, because the time is only checked
 
 
 class LinkStates:
-    """Cell with the status of all links, and events when a state changes. ``choices`` maps system ids to links."""
+    """Keeps the status of all links in a cell, and publishes an event when the state of a link changes.
+
+    ``choices`` maps each system id to the links over which the system is received.
+    """
 
     def __init__(
         self,
@@ -148,7 +151,10 @@ class MultiLinkRoutes:
     # ------------------------------------------------------------ the interface of Routes
 
     def record_heartbeat(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
-        """See :meth:`Routes.record_heartbeat`. Also return False for system id 0."""
+        """Record a heartbeat and the link over which it arrived. Return False if that is not possible.
+
+        A heartbeat is not recorded if the routing table is full, or if its system id is 0.
+        """
         if not frame.system_id or not self._routes[_link_index(peer)].record_heartbeat(frame, peer, counters):
             return False
         heartbeat = self._bus.dialect.decode(frame)
@@ -194,10 +200,10 @@ class MultiLinkRoutes:
         return None
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers that get a message for this component, all of them on the best link.
+        """Return the peers that get a message for this component: those on the best link that reaches it.
 
-        A broadcast reaches each known system once if possible, and is sent over all links without a known system.
-        Heartbeats and time messages go to all peers of all links.
+        A message for an unknown system goes to every peer. A broadcast reaches each known system once if possible, and
+        is also sent over links without a known system. Heartbeats and time messages go to all peers of all links.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
@@ -234,7 +240,7 @@ class MultiLinkRoutes:
         return True
 
     def accepts(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
-        """Return True if the frame is to be delivered. Heartbeats of links not in use are recorded here."""
+        """Return True if the frame is to be delivered. Record heartbeats even if they are not to be delivered."""
         link = _link_index(peer)
         if frame.message_id == m.Timesync.ID and self._probes.is_answer(frame, link):
             return False
@@ -329,7 +335,7 @@ class MultiLinkRoutes:
         return peers
 
     def _choose(self, system_id: int, choice: LinkChoice, now: float) -> None:
-        """Choose the link for a system. If it changes, discard unsent data of the link before, and publish it."""
+        """Choose the link for a system. Publish a change, and discard the unsent data of the previous link."""
         before = choice.used
         reason = choice.choose(now)
         used = choice.used

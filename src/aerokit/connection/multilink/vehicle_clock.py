@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.messages import AutopilotVersion
 
 MAX_SAMPLES = 20
-TOLERANCE_S = 0.1
+MIN_TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
 MAX_DRIFT_S = 0.5  # Without this limit, any clock would match after a long enough silence.
 # A measured clock rate of 1 ± this value counts as 1. Otherwise its error would grow with the length of a silence.
@@ -25,7 +25,7 @@ SPEED_MAX_AGE_S = 5.0  # A clock rate measured before a pause or reboot remains 
 
 
 class VehicleClock:
-    """Clock of one vehicle. ``at`` is our time, ``vehicle_s`` the vehicle's, in seconds."""
+    """Estimates the clock of one vehicle from samples: ``vehicle_s`` is its time at our time ``at``, in seconds."""
 
     def __init__(self) -> None:
         # (our time, the vehicle's time) in seconds.
@@ -60,7 +60,7 @@ class VehicleClock:
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample is as expected from the last one and the clock's speed; None if that is unknown."""
+        """Return True if a sample is as expected from the last one and the speed; None if the speed is unknown."""
         speed = self._speed
         if speed is None:
             return None
@@ -75,8 +75,8 @@ class VehicleClock:
         speed = self._measured_speed
         if speed is None:
             # The rate of the vehicle's clock is not measured yet. A simulation may run up to MAX_SPEED times as fast.
-            max_advance_s = MAX_SPEED * (at - last_at + TOLERANCE_S + round_trip_s)
-            return -TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
+            max_advance_s = MAX_SPEED * (at - last_at + MIN_TOLERANCE_S + round_trip_s)
+            return -MIN_TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
         tolerance_s = self._tolerance_s(at, round_trip_s, speed)
         expected_s = speed * (at - last_at)
         min_advance_s = max(0.0, expected_s - MAX_PAUSE_S * max(1.0, speed))
@@ -85,7 +85,7 @@ class VehicleClock:
     def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
         last_at, _ = self._samples[-1]
         drift_s = min(MAX_SPEED_ERROR * abs(at - last_at), MAX_DRIFT_S)
-        return (TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
+        return (MIN_TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
 
     @property
     def _speed(self) -> float | None:
@@ -100,7 +100,7 @@ class VehicleClock:
 
     @property
     def _measured_speed(self) -> float | None:
-        """Seconds of the vehicle's clock per second of ours, from the stored samples; None if they span too little."""
+        """Seconds of the vehicle's clock per second of ours; None if the stored samples span too short a time."""
         if not self._samples:
             return None
         (first_at, first_vehicle_s), (last_at, last_vehicle_s) = self._samples[0], self._samples[-1]

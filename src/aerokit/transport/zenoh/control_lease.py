@@ -186,7 +186,10 @@ class ClientFilter:
         return b"".join(accepted), notices
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
-        """Return True if another program recently used this client name. A program that takes control replaces it."""
+        """Return True if another program recently used this client name. Otherwise record this program as its user.
+
+        A program that takes control replaces the other program.
+        """
         is_other_program = self._nonce not in (None, nonce)
         is_recent = now - self._nonce_at <= LEASE_TIMEOUT_S
         if is_other_program and is_recent and mode != "take":
@@ -300,7 +303,7 @@ class FreshnessChecker:
         return Beacon(self.epoch, self._number, now, lease_holder)
 
     def accepts(self, client: str, stamp: Stamp | None, now: float) -> bool:
-        """Return True if a datagram with this stamp is fresh and new. Refused datagrams are counted."""
+        """Return True if a datagram with this stamp is neither outdated nor a duplicate. Count refused datagrams."""
         self._expire(now)
         if stamp is None or not self._is_fresh(stamp):
             self.late += 1
@@ -371,7 +374,7 @@ class VehicleSideTracker:
         self._delays = DelayEstimator()
 
     def receive_beacon(self, beacon: Beacon, now: float) -> bool:
-        """Return True if a beacon is valid, i.e. in time and from the tracked vehicle side.
+        """Record a beacon. Return False if it is late, older than the last one, or not from the tracked vehicle side.
 
         Another vehicle side is tracked when the first has been silent for `MAX_DELAY_S`, or after :meth:`reset`.
         """
@@ -393,7 +396,10 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if frames are to be delivered. ``sent_s`` is their send time on the vehicle side's clock."""
+        """Return True if frames are to be delivered, i.e. if they are in time and from the tracked vehicle side.
+
+        ``epoch`` identifies the vehicle side that sent them, ``sent_s`` is the send time on its clock.
+        """
         if epoch != self.epoch:
             self.foreign += 1
             return False

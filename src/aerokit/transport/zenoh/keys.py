@@ -58,7 +58,7 @@ def check_name(argument: str, name: str) -> str:
 
 
 class KeySpace(Snapshot):
-    """Keys of the vehicle side ``name`` in the fleet ``fleet``."""
+    """Zenoh keys that the vehicle side ``name`` in the fleet ``fleet`` and its clients use."""
 
     fleet: str
     name: str

@@ -183,7 +183,7 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- receiving
 
     def _on_datagram(self, name: str, data: bytes, attachment: bytes) -> None:
-        """Deliver the frames of a client that may be sent, and notify the client of refused ones."""
+        """Deliver the frames that a client may send, and notify the client of refused frames."""
         now = self._now()
         client = self._add_client(name)
         if client is None:
@@ -205,7 +205,7 @@ class ZenohListen(NetworkLink):
             self._deliver(accepted, name)
 
     def _add_client(self, name: str) -> ClientFilter | None:
-        """Return the client of this name, new or known; None if there are too many."""
+        """Return the client with this name, new or known; None if there are too many, or the name is not allowed."""
         client = self._clients.get(name)
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
@@ -216,7 +216,7 @@ class ZenohListen(NetworkLink):
         return client
 
     def _remove_silent_client(self) -> None:
-        """Remove the client that has been silent longest, if this is long enough.
+        """Remove the client that has been silent longest, if its silence exceeds `CLIENT_TIMEOUT_S`.
 
         New clients must not be blocked by a client that has left although zenoh did not report the end of its token.
         """

@@ -108,7 +108,7 @@ _TX = "transport/link/tx/queue"
 # By default, zenoh waits for a millisecond before it drops data of a put(), which would block the event loop.
 _DROP_AT_ONCE = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 
-_SETTINGS = (
+_DEFAULT_SETTINGS = (
     # Maximum number of waiting batches of up to 64 KB. Four are enough for a burst of 1000 frames. The number is small,
     # because data in the queue of a broken connection arrives late.
     (f"{_TX}/size/data", 4),
@@ -233,7 +233,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         raise InvalidArgument(f"{address}: zenoh does not accept the options: {_reason(error)}") from error
-    defaults = () if options.config else _SETTINGS  # A configuration file replaces aerokit's settings.
+    defaults = () if options.config else _DEFAULT_SETTINGS  # A configuration file replaces aerokit's settings.
     for key, value in (_DROP_AT_ONCE, *defaults):
         with contextlib.suppress(zenoh.ZError):  # Some versions of zenoh do not know the option.
             config.insert_json5(key, json.dumps(value))
