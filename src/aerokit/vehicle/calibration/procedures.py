@@ -107,7 +107,7 @@ def _step_after(step: CalibrationStep, report: CalibrationReport) -> Calibration
         return step.replace(instruction=report.text, pose=next(iter(remaining), None), remaining=remaining)
     if report.kind in ("text", "already done"):
         return step.replace(instruction=report.text)
-    return step
+    return step  # The other reports ("started", "side progress") do not change the step.
 
 
 async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
@@ -179,7 +179,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
     def on_message(message: MagCalProgress | MagCalReport) -> None:
-        """Record progress or result of one compass. A repeated progress is no change."""
+        """Record the progress or result of one compass. The same progress again does not count as a change."""
         nonlocal compass_mask, has_changed
         compass_mask |= message.cal_mask
         if isinstance(message, MagCalReport):

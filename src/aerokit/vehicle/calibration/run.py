@@ -190,7 +190,7 @@ class CalibrationRun:
                     with anyio.move_on_after(CANCEL_INTERVAL_S):
                         while not self._is_cancelled(self._cancel_command[0]):  # noqa: ASYNC110
                             await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
-                        return
+                        return  # The vehicle has confirmed in time.
                 # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                 await self.session.wait_for_heartbeat(self._cancel_sent_at)
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)

@@ -143,9 +143,9 @@ class CameraLink(CameraOrders):
             self._session.background.start(self.requests.run, "aerokit camera")
 
     async def identify(self) -> CameraInformation | None:
-        """Find the camera and request its information, unless it is known.
+        """Find the camera, and request its information unless this is known already.
 
-        Returns None for a camera attached to the autopilot that sends no information.
+        Returns None if the camera is attached to an autopilot that has sent no information about it.
         """
         if self._needs_information():
             async with self._identify_lock:

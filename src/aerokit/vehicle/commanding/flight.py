@@ -72,8 +72,8 @@ class FlightActions(VehicleBase):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, it disarmed
-                meanwhile or hit the ground.
+            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, or it disarmed or
+                hit the ground, during the take-off.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.

@@ -81,7 +81,7 @@ class ImpactDetector:
         self._has_slowed = False
 
     def update(self) -> None:
-        """Process the vehicle's last reported velocity."""
+        """Detect an impact by the vehicle's last reported velocity; called repeatedly."""
         cell = self._telemetry.velocity
         velocity = cell.latest
         if velocity is None or cell.updated_at == self._updated_at:

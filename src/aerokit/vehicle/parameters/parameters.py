@@ -42,8 +42,8 @@ ParameterSource = ParameterTable | Mapping[str, float] | str | os.PathLike[str]
 class Parameters(ReadOnly):
     """The parameters of one autopilot. Coroutines exchange messages with it; ``table`` is the local copy.
 
-    Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations, and is published as
-    :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
+    Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations. Each change of a value
+    is published as :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
 
     ArduPilot 4.7 renamed parameters and changed their units (``WPNAV_SPEED`` in cm/s became ``WP_SPD`` in m/s). Every
     method accepts the old and the new name with either firmware, and converts the value. An old name that the vehicle

@@ -102,7 +102,7 @@ class ComponentSubscriber:
     def cell(self, message_type: type[MessageT], rate_hz: float | None) -> StateCell[MessageT]:
         """Return the cell with the latest message of a type.
 
-        All calls return the same cell. A call with ``rate_hz`` replaces the rate of earlier calls.
+        All calls for a type return the same cell. A call with ``rate_hz`` replaces the rate of earlier calls.
         """
         cell = self._cells.get(message_type)
         if cell is None:
