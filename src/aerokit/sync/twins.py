@@ -611,7 +611,7 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
+        ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
         set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
         return SetpointStream(
@@ -1476,7 +1476,7 @@ class Files(TwinOf["AsyncFiles"]):
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
         Raises:
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         return self._loop.run(self.aio.crc32, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -1497,7 +1497,7 @@ class Files(TwinOf["AsyncFiles"]):
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         self._loop.run(
             self.aio.write,
@@ -1691,7 +1691,8 @@ class Logs(TwinOf["AsyncLogs"]):
     def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
-        LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
+        LOG_ERASE is not acknowledged, so it is repeated until the list of logs shows the effect. A log that was started
+        meanwhile may remain.
 
         Raises:
             FileTimeout: some of the old logs still exist.
@@ -2004,7 +2005,7 @@ class Winch(TwinOf["AsyncWinch"]):
         """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
 
         Args:
-            timeout: seconds until it is retracted.
+            timeout: seconds until the line is retracted.
 
         Raises:
             NotSupported: the autopilot has no such order. Nothing was sent.
@@ -2404,7 +2405,7 @@ class Calibration(CalibrationTwin):
     """
 
     def cancel(self) -> None:
-        """Cancel the calibration, and return when the vehicle has confirmed that it has ended.
+        """Cancel the calibration, and return when the vehicle has confirmed the end.
 
         Does nothing if the calibration has not started or has ended.
 
@@ -3363,7 +3364,7 @@ class Camera(TwinOf["AsyncCamera"]):
     def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.
 
-        The block's target is an asynchronous iterator over the captures, in order; lost captures are requested again.
+        Entering gives an asynchronous iterator over the captures, in order; lost captures are requested again.
         MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block, also under cancellation. PX4's trigger is started
         and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
 
@@ -4506,7 +4507,7 @@ class Vehicle(VehicleTwin):
         Raises:
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot in time.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """
@@ -4844,7 +4845,7 @@ class Vehicle(VehicleTwin):
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
         ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
-        sets the speed at that time.
+        sets the speed when the vehicle is on its way.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.

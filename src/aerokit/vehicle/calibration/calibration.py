@@ -68,7 +68,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             raise
 
     async def cancel(self) -> None:
-        """Cancel the calibration, and return when the vehicle has confirmed that it has ended.
+        """Cancel the calibration, and return when the vehicle has confirmed the end.
 
         Does nothing if the calibration has not started or has ended.
 

@@ -206,9 +206,10 @@ class CalibrationRun:
             self.finish()
 
     def _is_cancelled(self, cancel_command: float) -> bool:
-        """Return True if the vehicle has confirmed the cancellation: ArduPilot by COMMAND_ACK, PX4 by HEARTBEAT.
+        """Return True if the vehicle has confirmed the cancellation.
 
-        PX4's acknowledgements are no confirmation, because PX4 sends two with different results.
+        COMMAND_ACK confirms DO_CANCEL_MAG_CAL. HEARTBEAT confirms PREFLIGHT_CALIBRATION, because PX4 acknowledges it
+        twice with different results.
         """
         if self._has_rebooted:
             return True

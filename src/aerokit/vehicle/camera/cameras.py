@@ -97,7 +97,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.
 
-        The block's target is an asynchronous iterator over the captures, in order; lost captures are requested again.
+        Entering gives an asynchronous iterator over the captures, in order; lost captures are requested again.
         MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block, also under cancellation. PX4's trigger is started
         and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
 

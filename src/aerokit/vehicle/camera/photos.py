@@ -389,7 +389,7 @@ class PhotoInterval:
         self._collect()
         if capture is not None:
             self._unanswered = 0
-            if capture.success is False:
+            if capture.success is False:  # `_collect` has added it to `_failed`.
                 self._next_index += 1
             else:
                 self._waiting[self._next_index] = capture

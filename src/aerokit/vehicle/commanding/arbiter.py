@@ -63,7 +63,7 @@ class CommandArbiter:
         # Until this time, any reported mode may be the effect of a raw command.
         self._any_mode_until = -math.inf
         self._arming_accepted_at = -math.inf
-        # Time of the last report of disarmed.
+        # Time of the last HEARTBEAT that reported disarmed.
         self._disarmed_at = -math.inf
         # Time of the last change from disarmed to armed, and the order with which this program caused it; None if
         # another party armed the vehicle.

@@ -174,7 +174,7 @@ class ArmingActions(VehicleBase):
     async def _arm_with_fallback_mode(
         self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
     ) -> None:
-        """Arm in the present mode. If a parameter may forbid arming in this mode, change the mode after a refusal."""
+        """Arm in the present mode. If a parameter may forbid this, change the mode after a refusal, and arm then."""
         began_at = self.connection.now()
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
@@ -326,7 +326,7 @@ class ArmingActions(VehicleBase):
         Raises:
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot in time.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """

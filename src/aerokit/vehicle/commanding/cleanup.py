@@ -253,6 +253,8 @@ class FlightCleanup:
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Give the order to change to ``mode``. The caller prepares a stream in the `with` block, and may wait there.
 
+        If the block raises, the vehicle is ordered to hold.
+
         Raises:
             BusyError: another stream is open.
             OperationRejected: the order has ended meanwhile: it was superseded or taken over.

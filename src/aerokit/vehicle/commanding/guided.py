@@ -145,7 +145,7 @@ class Guided:
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
+        ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
         set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)

@@ -88,9 +88,9 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for the next HEARTBEAT if the last one is not recent; called before a later command of an order.
+        """Wait for the next HEARTBEAT if the last one is not recent; called before each further command of an order.
 
-        The event loop may have been blocked since the order began. Without ``order``, nothing was sent yet.
+        The event loop may have been blocked since the previous command. Without ``order``, nothing was sent yet.
 
         Raises:
             OperationRejected: the order has ended meanwhile, or the computer slept since it was given.
@@ -299,7 +299,7 @@ class OrderSender:
         return failure_reason
 
     def landing_failure(self, order: Order) -> Callable[[], str | None]:
-        """Like :meth:`mode_failure` with the order's modes, for an order that ends by disarming."""
+        """Like :meth:`mode_failure` with the order's modes, for an order that the vehicle completes by disarming."""
         mode_failure, armed = self.mode_failure(order, *order.modes), self._session.telemetry.armed
 
         def failure_reason() -> str | None:

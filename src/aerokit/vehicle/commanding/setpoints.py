@@ -219,7 +219,7 @@ class SetpointEncoder:
     def position(self, setpoint: PositionSetpoint, velocity: tuple[float, float, float] | None = None) -> Message:
         """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level.
 
-        ``velocity`` is the velocity of the position itself, in m/s north, east, down.
+        ``velocity`` is the velocity at which the position itself moves, in m/s north, east, down.
         """
         mask, yaw, yaw_rate = _encode_yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION

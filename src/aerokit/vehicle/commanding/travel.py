@@ -210,7 +210,7 @@ class TravelActions(VehicleBase):
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
         ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
-        sets the speed at that time.
+        sets the speed when the vehicle is on its way.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.

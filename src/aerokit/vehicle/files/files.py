@@ -158,7 +158,7 @@ class Files:
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
         Raises:
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         reply = await self._request(MavFtpOpcode.CALCFILECRC, path, idle_timeout_s, timeout)
         return _crc32_in(path, reply)
@@ -180,7 +180,7 @@ class Files:
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         path_bytes(path)  # Raises InvalidArgument before anything is sent.
         data = bytes(data)

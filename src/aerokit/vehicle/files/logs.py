@@ -203,7 +203,8 @@ class Logs:
     async def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
-        LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
+        LOG_ERASE is not acknowledged, so it is repeated until the list of logs shows the effect. A log that was started
+        meanwhile may remain.
 
         Raises:
             FileTimeout: some of the old logs still exist.

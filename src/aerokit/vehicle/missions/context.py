@@ -254,8 +254,7 @@ class MissionTracker:
         """Publish that an item was reached, unless MISSION_ITEM_REACHED is a duplicate or is about home."""
         now = self._session.connection.now()
         item = seq - self._offset  # negative if ArduPilot reports item 0 (home), as it does at a guided target
-        # The vehicle repeats its report, so an item counts as reached again only if it was approached again.
-        if self._repeats_item_reached:
+        if self._repeats_item_reached:  # An item counts as reached again only if it was approached again.
             is_duplicate = item == self.reached and not self._is_approached_again
         else:
             is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S

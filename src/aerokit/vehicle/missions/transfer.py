@@ -282,7 +282,10 @@ class PlanTransfer(Generic[PlanT]):
         return received.items
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
-        """Return True if the plan is to be transferred as a file."""
+        """Return True if the plan is to be transferred as a file.
+
+        Raises NotSupported if ``method`` is ``"ftp"`` and the vehicle has no MAVFTP.
+        """
         if method == "items":
             return False
         has_ftp = await self._channel.has_ftp()

@@ -280,13 +280,13 @@ class Parameters(ReadOnly):
         The vehicle's parameters are downloaded if they are not known. Only names in ``parameters`` are compared;
         ``before`` is None for a name that the vehicle does not have. Names and units in the result are the vehicle's.
         """
-        from aerokit.parameters import diff
+        from aerokit.parameters import diff as compare
 
         values = _values_of(parameters)
         check_values(values)
         table = await self.download(idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress)
         translated = self._names.translated(values, table)
-        return diff(table, translated, names=translated)
+        return compare(table, translated, names=translated)
 
     async def changed_from_default(
         self,

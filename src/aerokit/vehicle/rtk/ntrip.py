@@ -140,7 +140,7 @@ class _Response:
         while line := await self._reader.readline():
             size_text, _, _ = line.partition(b";")  # Extensions of the chunk may follow the size.
             chunk_size = int(size_text or b"0", 16)
-            if not 0 < chunk_size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
+            if not 0 < chunk_size <= MAX_CHUNK_SIZE:  # Size 0 ends the body; a greater size is invalid.
                 return
             yield await self._reader.readexactly(chunk_size)
             await self._reader.readline()  # Skip the line break after the chunk.

@@ -209,7 +209,7 @@ class StreamedMessage:
         """The latest frame of each instance, until it is decoded (or its message, until that is applied)."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
-        """Keep a frame until a cell is read, or apply it now if a cell has observers or the last decoding is long ago.
+        """Keep a frame until a cell is read. Apply it now if a cell has observers, or the last decoding was long ago.
 
         ``message`` is the decoded frame, if it was decoded already.
         """
