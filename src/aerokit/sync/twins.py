@@ -2122,7 +2122,7 @@ class Transaction(TransactionTwin):
 
 
 class Parameters(TwinOf["AsyncParameters"]):
-    """The parameters of one autopilot. Coroutines exchange messages with it; ``table`` is the local copy.
+    """The parameters of one autopilot. Coroutines exchange messages with the autopilot; ``table`` is the local copy.
 
     Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations. Each change of a value
     is published as :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
@@ -4395,9 +4395,9 @@ class Vehicle(VehicleTwin):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
-        without a position.
+        If the vehicle's arming checks fail, the result includes the vehicle's status texts about them from the
+        last 35 s; :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in
+        STABILIZE without a position.
         """
         return self._loop.call(self.aio.missing_for_flight)
 

@@ -86,7 +86,7 @@ class CaptureLog:
 
     PX4 sends two messages for each picture; the log keeps the message with the position.
 
-    When the camera counts from 0 again, after a restart or formatting, the log resets itself.
+    When the camera counts from 0 again, after a restart or after its storage was formatted, the log resets itself.
     """
 
     def __init__(self, link: CameraLink) -> None:

@@ -160,8 +160,8 @@ class CameraLink(CameraOrders):
         return not self.information.is_known or self._was_silent
 
     async def _find_first_camera(self) -> None:
-        # A camera with its own component id takes precedence over one that is attached to the autopilot. Wait for its
-        # first heartbeat.
+        # A camera with its own component id takes precedence over one that is attached to the autopilot, so
+        # wait for the heartbeat of such a camera.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_bound.wait()

@@ -55,9 +55,9 @@ class ArmingActions(VehicleBase):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
-        without a position.
+        If the vehicle's arming checks fail, the result includes the vehicle's status texts about them from the
+        last 35 s; :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in
+        STABILIZE without a position.
         """
         return self._health.missing_for_flight()
 

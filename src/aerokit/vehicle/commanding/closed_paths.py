@@ -198,7 +198,7 @@ class LobeCounter:
     """Counts figure eights: two different lobes in a row are one figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
-        # A vehicle that is farther from the centre along the axis is in a lobe.
+        # A vehicle is in a lobe if it is farther than this from the centre along the axis.
         self._min_along_m = major_m / 2
         self._axis = math.radians(axis_deg)
         self._lobe = 0  # The last lobe that the vehicle was in is 1 or -1; 0 means that it was in none yet.

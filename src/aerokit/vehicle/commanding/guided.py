@@ -188,13 +188,13 @@ class Guided:
         return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
 
     def _stream(
-        self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *limits: float
+        self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *timing: float
     ) -> SetpointStream[SetpointT]:
         autopilot = self._context.session.autopilot
         if kind not in autopilot.setpoints.names:
             supported = ", ".join(autopilot.setpoints.names) or "none"
             raise NotSupported(f"{autopilot.firmware} does not support {kind} set-points; supported: {supported}")
-        return SetpointStream(self._context, encode, initial, *limits)
+        return SetpointStream(self._context, encode, initial, *timing)
 
 
 @checks_arguments

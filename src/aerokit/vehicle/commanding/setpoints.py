@@ -107,8 +107,8 @@ class PositionSetpoint(Snapshot):
 class AttitudeSetpoint(Snapshot):
     """Attitude in degrees and ``thrust`` from 0 to 1.
 
-    ArduCopter reads ``thrust`` as climb rate in GUIDED unless GUID_OPTIONS selects thrust: 0.5 holds the altitude.
-    PX4 reads it as collective thrust.
+    ArduCopter in GUIDED reads ``thrust`` as climb rate, where 0.5 holds the altitude, unless GUID_OPTIONS selects
+    thrust. PX4 reads it as collective thrust.
     """
 
     roll_deg: float

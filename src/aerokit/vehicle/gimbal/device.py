@@ -153,7 +153,7 @@ class ControlBlock(Protocol):
 
 
 class GimbalDevice:
-    """One gimbal, addressed by the component that sends its attitude, and a number.
+    """One gimbal, addressed by a number and by the component that sends its attitude.
 
     ``number`` is 1 to 6 for gimbals attached to that component, and 0 if the component itself is the gimbal. Before any
     gimbal is discovered, a placeholder with ``component_id`` 0 stands for the first gimbal.

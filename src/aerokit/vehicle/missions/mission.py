@@ -52,8 +52,8 @@ class MissionEndDetector:
     A mission has ended when the vehicle reports the mission as complete, or has landed and disarmed at its last item.
     If the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the
     ground. PX4 reports completion when the return starts, and then changes the mode. A return without a landing ends at
-    home. If a vehicle reports no mission state, the mission has ended when the last item is reached. If
-    the items are unknown, the mode after the completion shows whether the vehicle lands.
+    home. If a vehicle reports no mission state, the mission has ended when the last item is reached. If the items are
+    unknown, the mode after the completion shows whether the vehicle lands.
 
     After a failsafe in the last item, a vehicle may land elsewhere, in another mode than that of the item: then the
     mission has failed.

@@ -40,7 +40,7 @@ ParameterSource = ParameterTable | Mapping[str, float] | str | os.PathLike[str]
 
 @checks_arguments
 class Parameters(ReadOnly):
-    """The parameters of one autopilot. Coroutines exchange messages with it; ``table`` is the local copy.
+    """The parameters of one autopilot. Coroutines exchange messages with the autopilot; ``table`` is the local copy.
 
     Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations. Each change of a value
     is published as :class:`aerokit.events.ParameterChanged`. A reboot clears the table.

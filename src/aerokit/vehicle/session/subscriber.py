@@ -162,7 +162,7 @@ class ComponentSubscriber:
 
 
 class WatchedStream:
-    """Requests the message of a state cell, only while the program waits for the cell or iterates over its values.
+    """Requests the message of a state cell only while the program waits for the cell or iterates over its values.
 
     The object is one of the feeds of the cell. ``request`` returns None if the message need not be requested now.
     """
