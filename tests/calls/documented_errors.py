@@ -16,7 +16,8 @@ AS_OTHERS = re.compile(
     r"(?:[Rr]aises\s+as|else\s+as|[Ee]rrors\s+as\s+for|errors\s+are\s+those\s+of|is\s+as\s+for|see)\s+:meth:`([\w.]+)`"
 )
 FOR_ALL = re.compile(
-    r"(Every method raises:|All methods take|Methods that send something take|NotSupported is\s+raised for).*",
+    r"(Every method (?:but ``\w+`` )?raises:|All methods take|Methods that send something take"
+    r"|NotSupported is\s+raised for).*",
     re.DOTALL,
 )
 """Errors that a class docstring documents for all its methods."""

@@ -462,9 +462,9 @@ class SetpointStream(StreamTwin[SetpointT]):
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
     ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
-    positions and trajectories only), or stays in place for twelve seconds although it should move. ``set`` and leaving
-    the block then raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode, nothing more is sent
-    to the vehicle.
+    positions and trajectories only), or stays in place for twelve seconds although it should move. After such a stop,
+    ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode,
+    nothing more is sent to the vehicle.
     """
 
     @property
@@ -611,7 +611,7 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
+        ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
         set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
         return SetpointStream(
@@ -675,7 +675,7 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
     when the source of positions ends or raises, or when the target is farther away than ``max_distance_m``. The stream
     also stops for the same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops
-    and sends nothing more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+    and sends nothing more. After a stop, ``fly`` and leaving the block raise :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).
@@ -785,8 +785,8 @@ class MeasurementStream(MeasurementTwin[MeasurementT]):
     def estimator_use(self) -> EstimatorUse:
         """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
-        No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
-        parameters when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
+        No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from parameters
+        that it read when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
         other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
         if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """
@@ -950,8 +950,8 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
     releases control, without waiting if the block exits by an error or cancellation. When another station takes
     control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block then releases nothing; it raises GimbalTaken too, unless your program has
-    already seen the loss. Another station that uses your own system and component id cannot be detected.
+    :class:`GimbalTaken`. Leaving the block after a loss releases nothing, and raises GimbalTaken unless your program
+    has already seen the loss. Another station that uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -989,7 +989,7 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
         """Raise GimbalTaken if control was lost.
 
         Raises:
-            GimbalTaken: another station is in control, or none.
+            GimbalTaken: another station has taken control, or the manager reports that no station has it.
         """
         self._loop.call(self.aio.raise_if_taken)
 
@@ -1001,8 +1001,8 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
     ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
     orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
     no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
-    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. ``set`` and
-    leaving the block then raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
+    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. After a stop,
+    ``set`` and leaving the block raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -1328,8 +1328,8 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
-            InvalidArgument: a parameter is not a number or does not fit, or the `with` block was left. Nothing was
-                sent.
+            InvalidArgument: a parameter has the wrong type or is too large for its field, or the `with` block was left.
+                Nothing was sent.
             OperationRejected: the order has ended: it was superseded or taken over.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
@@ -1391,12 +1391,10 @@ class Files(TwinOf["AsyncFiles"]):
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; None for no limit). You can cancel any call; the file is then closed on the vehicle.
 
-    Every method raises:
+    Every method but ``is_supported`` raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; see ``code`` and ``errno``.
         FileTimeout: the operation did not finish; ``missing`` has the missing ranges.
-
-    :meth:`is_supported` raises none of them.
     """
 
     def is_supported(self) -> bool:
@@ -1478,7 +1476,7 @@ class Files(TwinOf["AsyncFiles"]):
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
         Raises:
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         return self._loop.run(self.aio.crc32, path, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -1499,7 +1497,7 @@ class Files(TwinOf["AsyncFiles"]):
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         self._loop.run(
             self.aio.write,
@@ -1643,7 +1641,7 @@ class Logs(TwinOf["AsyncLogs"]):
             resume: continue an interrupted download of this log to this file. By LOG_* this works only if the vehicle
                 reports the time of the log.
             method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster of the two for this autopilot,
-                then the slower if the faster fails. MAVFTP requires that the file of the log can be identified.
+                or the slower if the faster is not available. MAVFTP requires that the log's file can be identified.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the bytes so far and in total.
@@ -1693,7 +1691,8 @@ class Logs(TwinOf["AsyncLogs"]):
     def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
-        LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
+        LOG_ERASE is not acknowledged, so it is repeated until the list of logs shows the effect. A log that was started
+        meanwhile may remain.
 
         Raises:
             FileTimeout: some of the old logs still exist.
@@ -2006,7 +2005,7 @@ class Winch(TwinOf["AsyncWinch"]):
         """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
 
         Args:
-            timeout: seconds until it is retracted.
+            timeout: seconds until the line is retracted.
 
         Raises:
             NotSupported: the autopilot has no such order. Nothing was sent.
@@ -2123,10 +2122,10 @@ class Transaction(TransactionTwin):
 
 
 class Parameters(TwinOf["AsyncParameters"]):
-    """The parameters of one autopilot. Coroutines exchange messages with it; ``table`` is the local copy.
+    """The parameters of one autopilot. Coroutines exchange messages with the autopilot; ``table`` is the local copy.
 
-    Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations, and is published as
-    :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
+    Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations. Each change of a value
+    is published as :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
 
     ArduPilot 4.7 renamed parameters and changed their units (``WPNAV_SPEED`` in cm/s became ``WP_SPD`` in m/s). Every
     method accepts the old and the new name with either firmware, and converts the value. An old name that the vehicle
@@ -2388,10 +2387,10 @@ class Parameters(TwinOf["AsyncParameters"]):
 class Calibration(CalibrationTwin):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
-    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's ``async with``
-    block, cancels the calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a
-    warning. The other calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed,
-    PX4's ESCs) end in seconds.
+    The calibration starts with the first step. Leaving the loop before the last step, or leaving the vehicle's
+    ``async with`` block, cancels the calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit
+    then logs a warning. The other calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope
+    and airspeed, PX4's ESCs) end in seconds.
 
     Iterating raises:
         OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
@@ -2406,7 +2405,7 @@ class Calibration(CalibrationTwin):
     """
 
     def cancel(self) -> None:
-        """Cancel the calibration, and return when the vehicle has confirmed that it has ended.
+        """Cancel the calibration, and return when the vehicle has confirmed the end.
 
         Does nothing if the calibration has not started or has ended.
 
@@ -3019,7 +3018,7 @@ class Camera(TwinOf["AsyncCamera"]):
     def set_mode(self, mode: ModeName, *, timeout: float = 5.0) -> None:
         """Change the mode (MAV_CMD_SET_CAMERA_MODE); returns when the camera reports the new mode.
 
-        If the camera does not report its mode (CAMERA_SETTINGS), the call returns when the camera has accepted the
+        If the camera refuses to report its mode (CAMERA_SETTINGS), the call returns when the camera has accepted the
         command.
 
         Args:
@@ -3030,7 +3029,7 @@ class Camera(TwinOf["AsyncCamera"]):
             NotSupported: the camera has no modes. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or does not support this mode.
             CommandTimeout: the camera did not answer.
-            OperationTimeout: the camera accepted the command but reports another mode, or no camera was found.
+            OperationTimeout: the camera accepted the command, but reports another mode or none; or no camera was found.
         """
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
@@ -3053,7 +3052,7 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Args:
             number: number of the medium, 1 to 255.
-            timeout: seconds to wait for the answer. Each progress report starts this time again.
+            timeout: seconds to wait for the answer. Each progress report restarts this time.
             on_progress: called with the progress in percent, or None if unknown.
 
         Raises:
@@ -3354,7 +3353,7 @@ class Camera(TwinOf["AsyncCamera"]):
             timeout: seconds to wait for the report.
 
         Raises:
-            NotSupported: the camera takes no pictures. Nothing was sent.
+            NotSupported: the camera cannot take pictures. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: the camera did not answer; it may have taken the picture.
             OperationRejected: the camera failed to take the picture.
@@ -3365,9 +3364,9 @@ class Camera(TwinOf["AsyncCamera"]):
     def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.
 
-        ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …`` gives the
-        captures in order; lost captures are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the
-        block, also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
+        Entering gives an asynchronous iterator over the captures, in order; lost captures are requested again.
+        MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block, also under cancellation. PX4's trigger is started
+        and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
 
         Args:
             seconds: time between two pictures, above 0, at most 3600.
@@ -3410,10 +3409,11 @@ class Camera(TwinOf["AsyncCamera"]):
 
 
 class Settings(TwinOf["AsyncSettings"]):
-    """The settings of one component. Coroutines exchange messages with it; ``table`` is the local copy.
+    """The settings of one component. Coroutines exchange messages with the component; ``table`` is the local copy.
 
-    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations,
-    and is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the table.
+    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations.
+    Each change of a value is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the
+    table.
 
     A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
@@ -3549,8 +3549,8 @@ class Settings(TwinOf["AsyncSettings"]):
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        With a definition, ``value`` may be the name of an option. Unknown settings that restrict this setting are read
-        before, and settings that it may change are read again afterwards.
+        With a definition, ``value`` may be the name of an option. Settings that restrict this setting are read first if
+        their values are unknown. Settings that this setting may change are read again afterwards.
 
         Raises:
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
@@ -4075,7 +4075,7 @@ class Vehicle(VehicleTwin):
             on_progress: called for each IN_PROGRESS with the progress, 0–100 or None if unknown.
 
         Raises:
-            InvalidArgument: a parameter is not a number or does not fit. Nothing was sent.
+            InvalidArgument: a parameter has the wrong type or is too large for its field. Nothing was sent.
             CommandRejected: the result is not ACCEPTED; ``reasons`` has the status texts received meanwhile.
             CommandTimeout: there was no ack. The error text has the attempts, the seconds, the age of the last
                 heartbeat and the packet loss.
@@ -4181,8 +4181,8 @@ class Vehicle(VehicleTwin):
 
         ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped messages. For the duration of the
         block, aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if
-        another subscriber needs it. None requests the default rate of streamed messages; messages sent on demand
-        (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
+        another subscriber needs it. None requests streamed messages at their default rate. Messages that are not
+        streamed (STATUSTEXT, acks), and HEARTBEAT, are not requested. For a camera or another component use
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:
@@ -4326,8 +4326,7 @@ class Vehicle(VehicleTwin):
             timeout: seconds until the vehicle is silent.
 
         Raises:
-            InvalidArgument: the intent is another text (found by its annotation, before this method runs). Nothing was
-                sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.
@@ -4396,9 +4395,9 @@ class Vehicle(VehicleTwin):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
-        without a position.
+        If the vehicle's arming checks fail, the result includes the vehicle's status texts about them from the
+        last 35 s; :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in
+        STABILIZE without a position.
         """
         return self._loop.call(self.aio.missing_for_flight)
 
@@ -4508,7 +4507,7 @@ class Vehicle(VehicleTwin):
         Raises:
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot in time.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """
@@ -4750,8 +4749,8 @@ class Vehicle(VehicleTwin):
     def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
         """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).
 
-        Returns when EXTENDED_SYS_STATE reports the state: at once if the vehicle is already in it. ArduPilot accepts
-        the command only in AUTO. A cancelled call does not stop the transition.
+        Returns when the next EXTENDED_SYS_STATE reports the state, also if the vehicle is in this state already.
+        ArduPilot accepts the command only in AUTO. A cancelled call does not stop the transition.
 
         Args:
             state: ``"fixed_wing"`` or ``"multicopter"``.
@@ -4846,7 +4845,7 @@ class Vehicle(VehicleTwin):
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
         ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
-        sets the speed at that time.
+        sets the speed when the vehicle is on its way.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -4881,7 +4880,7 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed, or the vehicle disarmed meanwhile or hit the ground.
+            OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """
@@ -4940,8 +4939,8 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, it disarmed
-                meanwhile or hit the ground.
+            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, or it disarmed or
+                hit the ground, during the take-off.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -5181,8 +5180,8 @@ class Vehicle(VehicleTwin):
     def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude at which the vehicle returns to launch. Returns when the vehicle has confirmed the value.
 
-        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
-        higher than this when the return starts keeps its height.
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. If the vehicle is
+        higher than this when the return starts, ArduCopter and PX4 keep the height, and ArduPlane descends.
 
         Args:
             altitude_m: metres above home, above 0, at most 3,000. The parameter Q_RTL_ALT can hold only whole metres.

@@ -192,7 +192,7 @@ async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None
 def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
-    """Raise InvalidArgument before anything is opened."""
+    """Raise InvalidArgument for an argument that is not allowed; called before anything is opened."""
     if system_id is not None and not 1 <= system_id <= 255:
         raise InvalidArgument(
             f"system_id = {system_id} is not allowed: it must be 1 to 255, or None for the first vehicle found"

@@ -316,8 +316,8 @@ class Vehicle(
     async def set_return_altitude(self, altitude_m: float) -> None:
         """Set the altitude at which the vehicle returns to launch. Returns when the vehicle has confirmed the value.
 
-        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. A vehicle that is
-        higher than this when the return starts keeps its height.
+        Writes the parameter that :meth:`return_altitude` reads, so the value survives a reboot. If the vehicle is
+        higher than this when the return starts, ArduCopter and PX4 keep the height, and ArduPlane descends.
 
         Args:
             altitude_m: metres above home, above 0, at most 3,000. The parameter Q_RTL_ALT can hold only whole metres.

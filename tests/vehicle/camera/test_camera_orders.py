@@ -156,7 +156,7 @@ async def test_video_block_end_does_not_stop_newer_recording() -> None:
         await vehicle.camera.start_video()
         commands = commands_to(camera, STOP_VIDEO)
         await anyio.sleep(6)
-        status = await vehicle.camera._shutter.status()
+        status = await vehicle.camera._shutter.request_status()
         assert status is not None
         assert status.is_recording
         assert commands == []

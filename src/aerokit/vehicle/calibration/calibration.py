@@ -30,10 +30,10 @@ EscIntent = Literal["propellers are removed"]
 class Calibration(AsyncIterator["CalibrationStep"]):
     """The steps of a calibration: iterate with ``async for``. The last step has the ``result``.
 
-    The calibration starts with the first step. Leaving the loop in any way, or leaving the vehicle's ``async with``
-    block, cancels the calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit then logs a
-    warning. The other calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope and airspeed,
-    PX4's ESCs) end in seconds.
+    The calibration starts with the first step. Leaving the loop before the last step, or leaving the vehicle's
+    ``async with`` block, cancels the calibration on the vehicle. ArduPilot cannot cancel ``accelerometer``, and aerokit
+    then logs a warning. The other calibrations that a vehicle cannot cancel (level, barometer, ArduPilot's gyroscope
+    and airspeed, PX4's ESCs) end in seconds.
 
     Iterating raises:
         OperationRejected: the calibration failed, or another party cancelled it (``reasons`` has the vehicle's status
@@ -68,7 +68,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             raise
 
     async def cancel(self) -> None:
-        """Cancel the calibration, and return when the vehicle has confirmed that it has ended.
+        """Cancel the calibration, and return when the vehicle has confirmed the end.
 
         Does nothing if the calibration has not started or has ended.
 

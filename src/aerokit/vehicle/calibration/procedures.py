@@ -47,7 +47,7 @@ ACCELEROMETER_CANNOT_CANCEL = (
 
 
 async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
-    """PX4: yield a step for each ``[cal]`` status text. PX4 itself detects the poses."""
+    """PX4: yield a new step when a ``[cal]`` status text changes the step. PX4 itself detects the poses."""
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
@@ -107,7 +107,7 @@ def _step_after(step: CalibrationStep, report: CalibrationReport) -> Calibration
         return step.replace(instruction=report.text, pose=next(iter(remaining), None), remaining=remaining)
     if report.kind in ("text", "already done"):
         return step.replace(instruction=report.text)
-    return step
+    return step  # The other reports ("started", "side progress") do not change the step.
 
 
 async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
@@ -179,7 +179,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
     def on_message(message: MagCalProgress | MagCalReport) -> None:
-        """Record progress or result of one compass. A repeated progress is no change."""
+        """Record the progress or result of one compass. The same progress again does not count as a change."""
         nonlocal compass_mask, has_changed
         compass_mask |= message.cal_mask
         if isinstance(message, MagCalReport):
@@ -190,7 +190,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             percents[message.compass_id] = message.completion_pct
         has_changed = True
 
-    def was_reported() -> bool:
+    def has_new_report() -> bool:
         return has_changed
 
     def is_complete() -> bool:
@@ -207,7 +207,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         instruction = "turn the vehicle slowly in all directions, about each of its axes"
         yield run.new_step(0.0, instruction)
         while not is_complete():
-            await run.wait(was_reported)
+            await run.wait(has_new_report)
             has_changed = False
             progress = min(percents.values(), default=0) / 100
             yield run.new_step(progress, instruction)

@@ -190,7 +190,7 @@ class CalibrationRun:
                     with anyio.move_on_after(CANCEL_INTERVAL_S):
                         while not self._is_cancelled(self._cancel_command[0]):  # noqa: ASYNC110
                             await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
-                        return
+                        return  # The vehicle has confirmed in time.
                 # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                 await self.session.wait_for_heartbeat(self._cancel_sent_at)
                 is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
@@ -206,9 +206,10 @@ class CalibrationRun:
             self.finish()
 
     def _is_cancelled(self, cancel_command: float) -> bool:
-        """Return True if the vehicle has confirmed the cancellation: ArduPilot by COMMAND_ACK, PX4 by HEARTBEAT.
+        """Return True if the vehicle has confirmed the cancellation.
 
-        PX4's acknowledgements are no confirmation, because PX4 sends two with different results.
+        COMMAND_ACK confirms DO_CANCEL_MAG_CAL. HEARTBEAT confirms PREFLIGHT_CALIBRATION, because PX4 acknowledges it
+        twice with different results.
         """
         if self._has_rebooted:
             return True

@@ -95,7 +95,11 @@ _FORMATS = {
 
 
 class CalibrationReport(Snapshot):
-    """One ``[cal]`` text of PX4. ``kind`` is a key of ``_FORMATS``, or ``"text"``; ``text`` is without ``[cal]``."""
+    """One ``[cal]`` text of PX4.
+
+    ``kind`` is the key of ``_FORMATS`` whose pattern matches, or ``"text"`` if none does. ``text`` is the text without
+    its prefix ``[cal]``.
+    """
 
     kind: str
     text: str

@@ -85,7 +85,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             timeout: seconds to wait for the report.
 
         Raises:
-            NotSupported: the camera takes no pictures. Nothing was sent.
+            NotSupported: the camera cannot take pictures. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or in the wrong mode.
             CommandTimeout: the camera did not answer; it may have taken the picture.
             OperationRejected: the camera failed to take the picture.
@@ -97,9 +97,9 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     def photo_interval(self, seconds: float, count: int = 0) -> PhotoInterval:
         """Take a photo every ``seconds`` for the duration of an ``async with`` block.
 
-        ``async with camera.photo_interval(2, count=10) as captures: async for capture in captures: …`` gives the
-        captures in order; lost captures are requested again. MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the
-        block, also under cancellation. PX4's trigger is started and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
+        Entering gives an asynchronous iterator over the captures, in order; lost captures are requested again.
+        MAV_CMD_IMAGE_STOP_CAPTURE is sent at the end of the block, also under cancellation. PX4's trigger is started
+        and stopped by MAV_CMD_DO_TRIGGER_CONTROL.
 
         Args:
             seconds: time between two pictures, above 0, at most 3600.
@@ -133,7 +133,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         count: int | None = None
         with anyio.move_on_after(timeout):
             await self._link.identify()
-            status = await self._shutter.status()
+            status = await self._shutter.request_status()
             if status is None:
                 raise self._link.timeout_error("did not report how many pictures it has taken")
             count = status.image_count
@@ -142,9 +142,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             max_stored = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
             for index in range(max(0, count - max_stored), count):
                 capture = await self._log.fetch(index)
-                consecutive_missing += 1
-                if capture is not None:
-                    consecutive_missing = 0
+                consecutive_missing = consecutive_missing + 1 if capture is None else 0
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:
                     break
             return self.captures()
@@ -216,7 +214,7 @@ class Cameras:
 
     @property
     def first(self) -> Camera:
-        """The first camera found. Low component ids take precedence; cameras attached to the autopilot come last."""
+        """The first camera found with its own component id; if there is none, one attached to the autopilot."""
         if not self._is_first_in_use and self._first_link.number in self._cameras:
             # `at` has already created an object for this camera.
             return self._cameras[self._first_link.number]

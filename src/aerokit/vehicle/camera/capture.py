@@ -53,8 +53,8 @@ class Capture(Snapshot):
     camera's pictures from 0
     - ``success``: False if the camera failed to take the picture; None if not reported (CAMERA_TRIGGER)
     - ``received_at``: when the message arrived, on the loop's clock; ``taken_at``: seconds since 1970
-    - ``place``: position of the camera; ``quaternion`` (w, x, y, z) and angles from the horizon and from north: its
-    attitude
+    - ``place``: position of the camera; ``quaternion`` (w, x, y, z): its attitude, also given as ``roll_deg`` and
+    ``pitch_deg`` from the horizon, ``yaw_deg`` from north
     - ``file_url``: ``mftp:///…`` on the camera itself, or ``http://…``
     """
 
@@ -161,7 +161,7 @@ def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Rounding may exceed 1, which asin() refuses.
-    if abs(sine) > MAX_PITCH_SINE:  # In gimbal lock, the whole turn counts as yaw.
+    if abs(sine) > MAX_PITCH_SINE:  # In gimbal lock, roll and yaw cannot be distinguished; both count as yaw.
         roll = 0.0
         yaw = -2 * math.copysign(1, sine) * math.atan2(x, w)
     else:
@@ -262,7 +262,7 @@ def geotagged(jpeg: bytes, capture: Capture) -> bytes:
 
 @checked
 def geotag_file(path: str | os.PathLike[str], capture: Capture, *, to: str | os.PathLike[str] | None = None) -> None:
-    """Write the position of a capture into a JPEG file, or a copy of it.
+    """Write time, position and direction of a capture into a JPEG file, or into a copy of it.
 
     Raises as :func:`geotagged`, and OSError if a file cannot be read or written.
 

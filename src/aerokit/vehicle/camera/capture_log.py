@@ -86,7 +86,7 @@ class CaptureLog:
 
     PX4 sends two messages for each picture; the log keeps the message with the position.
 
-    When the camera counts from 0 again, after a restart or formatting, the log resets itself.
+    When the camera counts from 0 again, after a restart or after its storage was formatted, the log resets itself.
     """
 
     def __init__(self, link: CameraLink) -> None:
@@ -191,7 +191,7 @@ class CaptureLog:
             self._add(message, capture)
 
     def _on_status(self, message: m.CameraCaptureStatus) -> None:
-        """Process the number of pictures. A lower number than before shows that the camera counts from 0 again."""
+        """Record the number of pictures. A lower number than before shows that the camera counts from 0 again."""
         boot_ms, count = message.time_boot_ms, message.image_count
         if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
             return  # This status was sent before the newest one, and arrived late.
@@ -225,7 +225,7 @@ class CaptureLog:
         return has_wrapped or entry.was_taken_later(highest)
 
     def _add(self, message: Message, capture: Capture) -> None:
-        """Store a capture and publish it, unless another message about the same picture was better."""
+        """Store a capture and publish it, unless an earlier message about this picture has the same content or more."""
         entry = _Entry(message, capture)
         if capture.success is False:
             self._add_failed(message, entry)
@@ -246,8 +246,8 @@ class CaptureLog:
         if isinstance(message, m.CameraImageCaptured):
             # A CAMERA_CAPTURE_STATUS that was sent before this picture does not count it, so it is ignored.
             self._count_boot_ms = message.time_boot_ms
-        # An index far above the count shows that the camera does not count as the standard says. The count then stays
-        # as it is.
+        # An index far above the count shows that the camera does not count as the standard says. The count is then left
+        # unchanged.
         if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)

@@ -297,7 +297,7 @@ class StorageMixin(CameraMixin):
     async def set_mode(self, mode: ModeName, *, timeout: float = 5.0) -> None:
         """Change the mode (MAV_CMD_SET_CAMERA_MODE); returns when the camera reports the new mode.
 
-        If the camera does not report its mode (CAMERA_SETTINGS), the call returns when the camera has accepted the
+        If the camera refuses to report its mode (CAMERA_SETTINGS), the call returns when the camera has accepted the
         command.
 
         Args:
@@ -308,7 +308,7 @@ class StorageMixin(CameraMixin):
             NotSupported: the camera has no modes. Nothing was sent.
             CommandRejected: the camera refused: it is busy, or does not support this mode.
             CommandTimeout: the camera did not answer.
-            OperationTimeout: the camera accepted the command but reports another mode, or no camera was found.
+            OperationTimeout: the camera accepted the command, but reports another mode or none; or no camera was found.
         """
         await self._link.require_capability("set_mode", "has_modes")
         with self._link.new_order("mode") as order:
@@ -350,7 +350,7 @@ class StorageMixin(CameraMixin):
 
         Args:
             number: number of the medium, 1 to 255.
-            timeout: seconds to wait for the answer. Each progress report starts this time again.
+            timeout: seconds to wait for the answer. Each progress report restarts this time.
             on_progress: called with the progress in percent, or None if unknown.
 
         Raises:

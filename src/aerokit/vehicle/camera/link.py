@@ -143,9 +143,9 @@ class CameraLink(CameraOrders):
             self._session.background.start(self.requests.run, "aerokit camera")
 
     async def identify(self) -> CameraInformation | None:
-        """Find the camera and request its information, unless it is known.
+        """Find the camera, and request its information unless this is known already.
 
-        Returns None for a camera attached to the autopilot that sends no information.
+        Returns None if the camera is attached to an autopilot that has sent no information about it.
         """
         if self._needs_information():
             async with self._identify_lock:
@@ -160,8 +160,8 @@ class CameraLink(CameraOrders):
         return not self.information.is_known or self._was_silent
 
     async def _find_first_camera(self) -> None:
-        # A camera with its own component id takes precedence over one that is attached to the autopilot. Wait for its
-        # first heartbeat.
+        # A camera with its own component id takes precedence over one that is attached to the autopilot, so
+        # wait for the heartbeat of such a camera.
         connected_for_s = self.now() - self._session.transfers.began_at
         with anyio.move_on_after(max(0.0, DISCOVERY_TIMEOUT_S - connected_for_s)):
             await self._is_bound.wait()

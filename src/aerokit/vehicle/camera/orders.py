@@ -239,9 +239,9 @@ DOUBTFUL_POLL_INTERVAL_S = 60.0
 
 
 class _PolledCell:
-    """A state value whose message is requested while the program reads or watches the value.
+    """The ``Feed`` of a state value whose message is requested while the program reads or watches the value.
 
-    The state value calls `pending`, `catch_up` and `watchers_changed` of this object, which is its ``Feed``.
+    The state value calls `pending`, `catch_up` and `watchers_changed` of its feed.
     """
 
     def __init__(

@@ -39,7 +39,7 @@ MAX_UNANSWERED = 3
 
 
 class Shutter:
-    """Orders one photo, or a series, and determines whether a lost order was executed."""
+    """Orders one photo, or a series, and determines whether an unacknowledged order was executed."""
 
     def __init__(self, link: CameraLink, log: CaptureLog) -> None:
         self.link: CameraLink = link
@@ -49,7 +49,7 @@ class Shutter:
         self._reports_status = False  # True once the camera has sent CAMERA_CAPTURE_STATUS
         self._never_answered = False  # True if all requests for CAMERA_CAPTURE_STATUS of an order were unanswered
 
-    async def status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
+    async def request_status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
         """Request CAMERA_CAPTURE_STATUS; None if the camera does not send it."""
         if self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
             return None
@@ -57,14 +57,14 @@ class Shutter:
         self._reports_status = self._reports_status or message is not None
         return None if message is None else status_of(message)
 
-    async def reliable_status(self) -> CameraStatus | None:
-        """Request the status repeatedly, because it decides whether an order was executed and may be sent again."""
+    async def request_status_reliably(self) -> CameraStatus | None:
+        """Request the status, several times if necessary: the answer decides whether an order may be sent again."""
         # A camera that has never sent its status may not support the message, so it gets fewer requests:
         # FIRST_STATUS_ATTEMPTS for the first order, and only one for later orders.
         attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
         attempts = STATUS_ATTEMPTS if self._reports_status else attempts_before_first
         for _ in range(attempts):
-            status = await self.status(STATUS_TIMEOUT_S)
+            status = await self.request_status(STATUS_TIMEOUT_S)
             if status is not None or self.link.is_trigger or m.CameraCaptureStatus in self.link.unavailable:
                 return status
         self._never_answered = not self._reports_status
@@ -74,7 +74,7 @@ class Shutter:
         """Take one photo and return its capture, which is requested if lost; errors as for `Camera.take_photo`."""
         async with self._lock:
             series = self.link.latest_order("series")
-            before = await self.reliable_status()
+            before = await self.request_status_reliably()
             known_indices = {capture.index for capture in self.log.captures()}
             error: CommandTimeout | None = None
             with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
@@ -88,7 +88,7 @@ class Shutter:
                     has_arrived = await new_captures.wait(max(CHECK_INTERVAL_S, 2.0 * round_trip_s))
                     if has_arrived:
                         continue
-                    status = await self.status()
+                    status = await self.request_status()
                     if status is None:
                         continue
                     missed = await self._fetch_missed(before, status, known_indices, is_accepted=error is None)
@@ -169,7 +169,7 @@ class Shutter:
             return
 
         async def has_started() -> bool | None:
-            status = await self.reliable_status()
+            status = await self.request_status_reliably()
             if status is None or before is None:
                 return None  # Without both reports, the number of pictures cannot be compared.
             return status.is_in_series or status.is_capturing or status.image_count > before.image_count
@@ -257,7 +257,7 @@ class PhotoInterval:
 
     async def _begin(self, operation: ActiveOperation) -> None:
         """Determine the index of the first capture, and start the series. Captures are queued from now on."""
-        before = await self._shutter.reliable_status()
+        before = await self._shutter.request_status_reliably()
         self._next_index = None if before is None else before.image_count
         first_index = 0 if before is None else before.image_count
         self._set_newest(first_index - 1)
@@ -383,18 +383,18 @@ class PhotoInterval:
         """
         assert self._next_index is not None
         capture = None
-        if not self._link.is_trigger and self._unanswered < MAX_UNANSWERED:
+        can_fetch = not self._link.is_trigger and self._unanswered < MAX_UNANSWERED
+        if can_fetch:
             capture = await self._log.fetch(self._next_index)
         self._collect()
         if capture is not None:
             self._unanswered = 0
-            if capture.success is False:
+            if capture.success is False:  # `_collect` has added it to `_failed`.
                 self._next_index += 1
             else:
                 self._waiting[self._next_index] = capture
         elif self._next_index not in self._waiting:
             self._unanswered += 1
-            can_fetch = not self._link.is_trigger and self._unanswered <= MAX_UNANSWERED
             following_index = self._next_index + 1
             if not can_fetch and self._waiting:  # Skip to the next capture that was received.
                 following_index = min(self._waiting)
@@ -403,7 +403,7 @@ class PhotoInterval:
 
     async def _check_silence(self, silent_checks: int) -> None:
         """Request missed captures, or raise the error if the camera has ended the series or reports nothing more."""
-        status = await self._shutter.status(2.0 * CHECK_INTERVAL_S)
+        status = await self._shutter.request_status(2.0 * CHECK_INTERVAL_S)
         self._collect()
         is_ahead = status is not None and self._next_index is not None and status.image_count > self._next_index
         is_over = status is not None and not status.is_in_series and not status.is_capturing

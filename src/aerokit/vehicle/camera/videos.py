@@ -156,7 +156,7 @@ class VideoMixin(CameraMixin):
         """
         await self._link.require_capability("load_streams", "has_video_stream")
         first = await self._link.request(m.VideoStreamInformation, 0)  # 0 requests all streams.
-        if first is None:  # The camera may only answer requests for a single stream.
+        if first is None:  # Some cameras answer only requests for a single stream.
             first = await self._link.request(m.VideoStreamInformation, 1)
         if first is None or not self._streams:
             raise self._link.timeout_error("reported no video stream")

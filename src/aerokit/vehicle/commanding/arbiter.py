@@ -45,7 +45,8 @@ def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
 class CommandArbiter:
     """Keeps the orders to one vehicle, updates them with each HEARTBEAT, and knows the newest order about each topic.
 
-    Every order of the program is registered here: flight actions, set-points, devices, fleets and classic scripts.
+    Every order of the program is registered here, whether it comes from a flight action, a set-point, a device, a fleet
+    or the classic API.
     """
 
     def __init__(self, now: Callable[[], float], telemetry: Telemetry) -> None:
@@ -62,7 +63,7 @@ class CommandArbiter:
         # Until this time, any reported mode may be the effect of a raw command.
         self._any_mode_until = -math.inf
         self._arming_accepted_at = -math.inf
-        # Time of the last report of disarmed.
+        # Time of the last HEARTBEAT that reported disarmed.
         self._disarmed_at = -math.inf
         # Time of the last change from disarmed to armed, and the order with which this program caused it; None if
         # another party armed the vehicle.
@@ -121,8 +122,8 @@ class CommandArbiter:
     def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion"), ends_flight: bool = False) -> Order:
         """Create a steering order. ``modes`` are the modes that the vehicle may enter because of it.
 
-        The new order supersedes the previous steering order, and the posted orders about these subjects (orders whose
-        effect nobody awaits). With ``ends_flight``, a failsafe does not end the order.
+        The new order supersedes the previous steering order, and the posted orders about these subjects (orders that
+        the program does not wait for). With ``ends_flight``, a failsafe does not end the order.
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
@@ -413,7 +414,7 @@ class CommandArbiter:
             order.on_system_status(state)
 
     def _on_armed(self, armed_before: bool | None, armed: bool) -> None:
-        """Process the armed state in each HEARTBEAT, changed or not."""
+        """Record the armed state of each HEARTBEAT, changed or not, and pass it to orders and commands in progress."""
         if armed_before and not armed:
             self._ordered_since_disarmed.clear()
         if armed and not armed_before:

@@ -21,7 +21,6 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity, MavState
 from aerokit.mavlink.messages import Statustext
-from aerokit.vehicle.commanding.cleanup import ARM_WATCH_S
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
@@ -41,6 +40,8 @@ POLL_INTERVAL_S = 0.1
 BOOT_STATES = (MavState.BOOT, MavState.CALIBRATING)
 REBOOT_ACK_TIMEOUT_S = 3.0
 """Seconds to wait for the acknowledgement of a reboot command."""
+LATE_REBOOT_TIMEOUT_S = 15.0
+"""Seconds to wait for a reboot after a reboot command that was not acknowledged."""
 MODE_READY_TIMEOUT_S = 3.0
 """Seconds to wait after a mode change until the vehicle can arm in the new mode."""
 
@@ -54,9 +55,9 @@ class ArmingActions(VehicleBase):
     def missing_for_flight(self) -> list[str]:
         """Return what is still missing before the vehicle can fly, from what was received so far. Sends nothing.
 
-        If the vehicle's arming checks fail, the result includes its status texts about them of the last 35 seconds;
-        :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in STABILIZE
-        without a position.
+        If the vehicle's arming checks fail, the result includes the vehicle's status texts about them from the
+        last 35 s; :meth:`why_not_armable` requests these texts. The vehicle may arm all the same: ArduCopter arms in
+        STABILIZE without a position.
         """
         return self._health.missing_for_flight()
 
@@ -173,7 +174,7 @@ class ArmingActions(VehicleBase):
     async def _arm_with_fallback_mode(
         self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
     ) -> None:
-        """Arm in the present mode. If a parameter may forbid arming in this mode, change the mode after a refusal."""
+        """Arm in the present mode. If a parameter may forbid this, change the mode after a refusal, and arm then."""
         began_at = self.connection.now()
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
@@ -265,7 +266,7 @@ class ArmingActions(VehicleBase):
     # ------------------------------------------------------------------------ modes for arming
 
     def _mode_to_arm_in(self, mode: str | int | None) -> Mode | None:
-        """Return the mode to change to before arming; None if the present mode allows arming."""
+        """Return the mode to change to before arming; None to arm in the present mode."""
         if mode is not None:
             arming_mode = self.autopilot.find_mode(mode, self.telemetry.mode_names)
             if arming_mode.name in self.autopilot.unarmable_modes:
@@ -291,7 +292,7 @@ class ArmingActions(VehicleBase):
         return is_optional and self.telemetry.is_confirmed_disarmed and self._flight_cleanup.stop_stream is None
 
     async def _change_to_arming_mode(self, mode: Mode) -> None:
-        """Change the mode for arming; raise if the order to arm was superseded meanwhile."""
+        """Change the mode for arming; raise if a newer order or a silence then forbids the arm command."""
         order = self._arbiter.order(mode)
         arming_orders_before = self._arbiter.arming_orders
         await self._sender.ensure_mode(mode, order)
@@ -325,7 +326,7 @@ class ArmingActions(VehicleBase):
         Raises:
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot.
+            CommandTimeout: there was no acknowledgement, and the vehicle did not reboot in time.
             LinkLost: the link went down with the vehicle (USB, TCP); connect again.
             OperationTimeout: the vehicle did not restart in time.
         """
@@ -340,8 +341,9 @@ class ArmingActions(VehicleBase):
                 await self._order_reboot(force)
             except CommandTimeout as error:
                 unanswered = error
-            # A command without an answer was probably lost, so a shorter wait than the whole time-out is enough.
-            with anyio.move_on_after(timeout if unanswered is None else min(timeout, ARM_WATCH_S)):
+            # A command that was not acknowledged was probably lost, so a wait shorter than the time-out is enough.
+            wait_s = timeout if unanswered is None else min(timeout, LATE_REBOOT_TIMEOUT_S)
+            with anyio.move_on_after(wait_s):
                 await self._await_reboot(reboots_before)
                 return
         # The vehicle has not rebooted in time.

@@ -78,7 +78,7 @@ class BackgroundTask:
             self._scope = scope
 
     async def finish(self, within_s: float) -> None:
-        """At the end of the vehicle's `async with` block, wait at most ``within_s`` for the task, or log a warning."""
+        """At the end of the vehicle's `async with` block, wait at most ``within_s``; warn if the task still runs."""
         if self._scope is None or self._done is None or not self._session.connection.is_open:
             return
         if within_s:
@@ -252,6 +252,8 @@ class FlightCleanup:
     @contextmanager
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Give the order to change to ``mode``. The caller prepares a stream in the `with` block, and may wait there.
+
+        If the block raises, the vehicle is ordered to hold.
 
         Raises:
             BusyError: another stream is open.

@@ -185,7 +185,7 @@ class TurnCounter:
         """True while the vehicle is near the circle."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a reported position of the vehicle, in metres from the centre."""
+        """Add the part of a turn since the previous report. The position is in metres from the centre."""
         self.is_on_path = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
         bearing_before = self._bearing
         self._bearing = math.atan2(east_m, north_m) if self.is_on_path else None
@@ -198,7 +198,7 @@ class LobeCounter:
     """Counts figure eights: two different lobes in a row are one figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
-        # A vehicle that is farther from the centre along the axis is in a lobe.
+        # A vehicle is in a lobe if it is farther than this from the centre along the axis.
         self._min_along_m = major_m / 2
         self._axis = math.radians(axis_deg)
         self._lobe = 0  # The last lobe that the vehicle was in is 1 or -1; 0 means that it was in none yet.
@@ -207,7 +207,7 @@ class LobeCounter:
         """True while the vehicle is in one of the lobes."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a reported position of the vehicle, in metres from the centre."""
+        """Count half a figure if the vehicle has reached the other lobe. The position is in metres from the centre."""
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._min_along_m
         lobe = 1 if along > 0 else -1

@@ -72,8 +72,8 @@ class FlightActions(VehicleBase):
         Raises:
             InvalidArgument: the altitude is out of range. Nothing was sent.
             NotSupported: this type of vehicle cannot take off.
-            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, it disarmed
-                meanwhile or hit the ground.
+            OperationRejected: the vehicle is not armed or is already flying; or its mode changed, or it disarmed or
+                hit the ground, during the take-off.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -163,7 +163,7 @@ class FlightActions(VehicleBase):
     async def _await_altitude(
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
-        """Wait for the altitude. Fail if the vehicle leaves the mode of the take-off and the mode that follows it."""
+        """Wait for the altitude. Fail in any mode but that of the take-off and the mode that follows it."""
         # A vehicle that hovers at the altitude may be slightly below it.
         min_altitude_m = altitude_m - max(0.5, 0.05 * altitude_m)
         started = self.connection.now()

@@ -105,7 +105,7 @@ class FollowedTarget:
         self.latest = TargetState(place, speeds, reported_at=received_at, first_reported_at=received_at)
 
     def add(self, position: object) -> None:
-        """Process a position that the program supplied. An unchanged position counts as a new report.
+        """Update ``latest`` from a position that the program supplied. An unchanged position counts as a new report.
 
         The velocity is computed from two different positions, because the program may report the same position several
         times. The velocity becomes zero after a jump, and when the next different position is overdue.
@@ -117,7 +117,7 @@ class FollowedTarget:
             raise InvalidArgument(f"position = {short_repr(position)} is not allowed: it must be a Position")
         latest, now = self.latest, self._now()
         if latest is not None and now - latest.reported_at < MIN_INTERVAL_S:
-            return
+            return  # A velocity computed from two positions in such quick succession would be inexact.
         if latest is None:
             self.latest = TargetState(position, ZERO, reported_at=now, first_reported_at=now)
         elif position == latest.position:
@@ -150,7 +150,7 @@ class FollowStream(SteeringStream[TargetState]):
     The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
     when the source of positions ends or raises, or when the target is farther away than ``max_distance_m``. The stream
     also stops for the same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops
-    and sends nothing more. ``fly`` and leaving the block then raise :class:`SetpointStreamStopped`.
+    and sends nothing more. After a stop, ``fly`` and leaving the block raise :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).
@@ -237,7 +237,10 @@ class FollowStream(SteeringStream[TargetState]):
         await super().__aexit__(exc_type, exc, traceback)
 
     def _start_reading(self) -> None:
-        """Read an asynchronous iterable in the background; other targets are read at each tick of the stream."""
+        """Read the target in the background if it is an asynchronous iterable.
+
+        Other targets are read at each tick of the stream.
+        """
         target = self._target
         if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
             return

@@ -61,7 +61,7 @@ MAX_SLIDE_M_S = 8.0
 class ImpactDetector:
     """Detects that a vehicle hits the ground: it sinks at ``IMPACT_M_S`` or faster, and suddenly stops.
 
-    Its height must have decreased, and it must not fly on.
+    A vehicle whose height has not decreased, or that flies on, has not hit the ground.
     """
 
     def __init__(self, telemetry: Telemetry) -> None:
@@ -81,7 +81,7 @@ class ImpactDetector:
         self._has_slowed = False
 
     def update(self) -> None:
-        """Process the vehicle's last reported velocity."""
+        """Detect an impact by the vehicle's last reported velocity; called repeatedly."""
         cell = self._telemetry.velocity
         velocity = cell.latest
         if velocity is None or cell.updated_at == self._updated_at:

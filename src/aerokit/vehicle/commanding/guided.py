@@ -145,7 +145,7 @@ class Guided:
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
-        ArduCopter and PX4 execute them. The autopilot does not level the vehicle: it keeps turning until the next
+        ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
         set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
         return self._stream("attitude rate", self._encode.attitude_rate, initial, rate_hz, valid_for_s, max_lag_s)
@@ -188,13 +188,13 @@ class Guided:
         return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
 
     def _stream(
-        self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *limits: float
+        self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *timing: float
     ) -> SetpointStream[SetpointT]:
         autopilot = self._context.session.autopilot
         if kind not in autopilot.setpoints.names:
             supported = ", ".join(autopilot.setpoints.names) or "none"
             raise NotSupported(f"{autopilot.firmware} does not support {kind} set-points; supported: {supported}")
-        return SetpointStream(self._context, encode, initial, *limits)
+        return SetpointStream(self._context, encode, initial, *timing)
 
 
 @checks_arguments
@@ -206,9 +206,9 @@ class SetpointStream(SteeringStream[SetpointT]):
 
     The stream stops by itself if there is no new set-point for ``valid_for_s``, or if the event loop is late by
     ``max_lag_s``. It also stops if the vehicle leaves the mode, disarms or falls silent, hits the ground (velocities,
-    positions and trajectories only), or stays in place for twelve seconds although it should move. ``set`` and leaving
-    the block then raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode, nothing more is sent
-    to the vehicle.
+    positions and trajectories only), or stays in place for twelve seconds although it should move. After such a stop,
+    ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changed the mode,
+    nothing more is sent to the vehicle.
     """
 
     _NAME, _VALUE = "set-point stream", "set-point"
@@ -225,8 +225,8 @@ class SetpointStream(SteeringStream[SetpointT]):
         super().__init__(context, encode, initial, rate_hz, valid_for_s, max_lag_s)
         is_place = isinstance(initial, (PositionSetpoint, LocalPositionSetpoint))
         self._restarts_path = is_place and context.session.autopilot.setpoints.position_restarts_path
-        # How often the set-point is still sent at the stream's rate, and when it was last sent. Both matter only for
-        # autopilots that restart their path.
+        # How many more times the set-point is sent at the stream's rate, and when it was last sent. Both matter only
+        # for autopilots that restart their path at each position set-point.
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)

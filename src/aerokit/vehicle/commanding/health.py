@@ -152,7 +152,7 @@ class Health:
         return [self.unarmable_text(mode)] if mode is not None and mode.name in self._modes_to_leave() else []
 
     def unarmable_text(self, mode: Mode) -> str:
-        """Return a sentence that names the modes that allow arming."""
+        """Return a sentence that says why this mode does not allow arming, and what does."""
         option = self._autopilot.armable_by_option.get(mode.name)
         armable_modes = ", ".join(sorted({*self._autopilot.modes.names} - self._modes_to_leave()))
         if option is None:

@@ -301,8 +301,8 @@ class ManeuverActions(VehicleBase):
     async def transition_to(self, state: FlightState, *, timeout: float = 60.0) -> None:
         """Change a VTOL between hover and forward flight (MAV_CMD_DO_VTOL_TRANSITION).
 
-        Returns when EXTENDED_SYS_STATE reports the state: at once if the vehicle is already in it. ArduPilot accepts
-        the command only in AUTO. A cancelled call does not stop the transition.
+        Returns when the next EXTENDED_SYS_STATE reports the state, also if the vehicle is in this state already.
+        ArduPilot accepts the command only in AUTO. A cancelled call does not stop the transition.
 
         Args:
             state: ``"fixed_wing"`` or ``"multicopter"``.

@@ -65,7 +65,7 @@ REQUIRED_STATES = (
 
 @contextmanager
 def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
-    """Implement ``Vehicle.streams``."""
+    """Request all streams of the vehicle for the duration of a `with` block: the body of ``Vehicle.streams``."""
     check_range("rate_hz", rate_hz, 0, 1000, above=True)
     tasks = BackgroundTasks(session.connection.fail)
     with ExitStack() as cleanup:
@@ -186,7 +186,7 @@ class MessagingActions(VehicleBase):
             on_progress: called for each IN_PROGRESS with the progress, 0–100 or None if unknown.
 
         Raises:
-            InvalidArgument: a parameter is not a number or does not fit. Nothing was sent.
+            InvalidArgument: a parameter has the wrong type or is too large for its field. Nothing was sent.
             CommandRejected: the result is not ACCEPTED; ``reasons`` has the status texts received meanwhile.
             CommandTimeout: there was no ack. The error text has the attempts, the seconds, the age of the last
                 heartbeat and the packet loss.
@@ -319,8 +319,8 @@ class MessagingActions(VehicleBase):
 
         ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped messages. For the duration of the
         block, aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if
-        another subscriber needs it. None requests the default rate of streamed messages; messages sent on demand
-        (HEARTBEAT, STATUSTEXT, acks) are not requested. For a camera or another component use
+        another subscriber needs it. None requests streamed messages at their default rate. Messages that are not
+        streamed (STATUSTEXT, acks), and HEARTBEAT, are not requested. For a camera or another component use
         ``vehicle.component(100).subscribe(...)``.
 
         Raises:

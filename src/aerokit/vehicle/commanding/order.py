@@ -244,7 +244,7 @@ class Order:
     # -------------------------------------------------------------------- vehicle reports
 
     def on_mode(self, mode: Mode, reported_at: float) -> None:
-        """Process the mode reported at this time; the class describes the kinds of modes.
+        """Update the order from a mode reported at this time; the class docstring describes the kinds of modes.
 
         Once one of the order's own modes was reported, a return to the mode before the order is a takeover.
         """
@@ -276,7 +276,7 @@ class Order:
         self._mode_now = number
 
     def on_system_status(self, state: int) -> None:
-        """Process MAV_STATE. A failsafe that was already active when the program gave the order does not end the order.
+        """Record a failsafe from MAV_STATE, unless it was active already when the program gave the order.
 
         An order to land, to return or to disarm is not ended by any failsafe.
         """
@@ -285,7 +285,7 @@ class Order:
         self._state_before = state
 
     def on_armed(self, armed: bool, reported_at: float) -> None:
-        """Process the armed state reported by HEARTBEAT."""
+        """Update the order from the armed state that HEARTBEAT reports."""
         armed_before, self._armed_now = self._armed_now, armed
         has_changed = armed_before is not None and armed_before is not armed
         if has_changed and armed is self.armed:  # The order to arm or disarm has taken effect.

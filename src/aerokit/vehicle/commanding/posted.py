@@ -68,8 +68,8 @@ class PostedOrder:
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
-            InvalidArgument: a parameter is not a number or does not fit, or the `with` block was left. Nothing was
-                sent.
+            InvalidArgument: a parameter has the wrong type or is too large for its field, or the `with` block was left.
+                Nothing was sent.
             OperationRejected: the order has ended: it was superseded or taken over.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
@@ -124,12 +124,12 @@ class PostedOrder:
                     return
                 if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
                     raise
-                if not await self._is_still_valid(timeout):
+                if not await self._is_valid_at_next_heartbeat(timeout):
                     raise
             else:
                 return
 
-    async def _is_still_valid(self, timeout: float) -> bool:
+    async def _is_valid_at_next_heartbeat(self, timeout: float) -> bool:
         """Wait for the next HEARTBEAT; return True if the order is still valid after it."""
         answered_at, armed = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(MODE_RETRY_INTERVAL_S)

@@ -261,7 +261,7 @@ class RoundFlight:
                     raise OperationTimeout(
                         f"{self._operation}: the vehicle did not follow its set-points; {self._describe()}"
                     )
-                await self._supply(stream, flight.advance(0.0))  # Send the set-point at the end once more.
+                await self._supply(stream, flight.advance(0.0))  # Send the last set-point again.
 
     async def _supply(self, stream: SetpointStream[TrajectorySetpoint], setpoint: TrajectorySetpoint) -> None:
         stream.set(setpoint)

@@ -50,13 +50,13 @@ class OrderSender:
     ) -> None:
         """Send one command of an order until it is acknowledged or its effect is reported.
 
-        The effect is a change to one of ``modes``, to ``armed``, or ``is_done()``. A further step of an order that
-        steers waits for a recent HEARTBEAT.
+        The effect is reported once the vehicle has changed to one of ``modes`` or to ``armed``, or ``is_done()``
+        returns True. Each command after the first one of an order that steers waits for a recent HEARTBEAT.
 
         Raises:
             OperationRejected: the order has ended: it was superseded or taken over. Or the computer slept before a
-                further step.
-            HeartbeatTimeout: the vehicle was silent before a further step.
+                later command of the order.
+            HeartbeatTimeout: the vehicle was silent before a later command of the order.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
@@ -88,9 +88,9 @@ class OrderSender:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for the next HEARTBEAT if the last one is not recent; called before a further step of an order.
+        """Wait for the next HEARTBEAT if the last one is not recent; called before each further command of an order.
 
-        The event loop may have been blocked before this step. Without ``order``, nothing was sent yet.
+        The event loop may have been blocked since the previous command. Without ``order``, nothing was sent yet.
 
         Raises:
             OperationRejected: the order has ended meanwhile, or the computer slept since it was given.
@@ -299,7 +299,7 @@ class OrderSender:
         return failure_reason
 
     def landing_failure(self, order: Order) -> Callable[[], str | None]:
-        """Like :meth:`mode_failure` with the order's modes, for an order that ends by disarming."""
+        """Like :meth:`mode_failure` with the order's modes, for an order that the vehicle completes by disarming."""
         mode_failure, armed = self.mode_failure(order, *order.modes), self._session.telemetry.armed
 
         def failure_reason() -> str | None:

@@ -107,8 +107,8 @@ class PositionSetpoint(Snapshot):
 class AttitudeSetpoint(Snapshot):
     """Attitude in degrees and ``thrust`` from 0 to 1.
 
-    ArduCopter reads ``thrust`` as climb rate in GUIDED unless GUID_OPTIONS selects thrust: 0.5 holds the altitude.
-    PX4 reads it as collective thrust.
+    ArduCopter in GUIDED reads ``thrust`` as climb rate, where 0.5 holds the altitude, unless GUID_OPTIONS selects
+    thrust. PX4 reads it as collective thrust.
     """
 
     roll_deg: float
@@ -219,7 +219,7 @@ class SetpointEncoder:
     def position(self, setpoint: PositionSetpoint, velocity: tuple[float, float, float] | None = None) -> Message:
         """Return SET_POSITION_TARGET_GLOBAL_INT, relative to home or above mean sea level.
 
-        ``velocity`` is the velocity of the position itself, in m/s north, east, down.
+        ``velocity`` is the velocity at which the position itself moves, in m/s north, east, down.
         """
         mask, yaw, yaw_rate = _encode_yaw(setpoint.yaw_deg, setpoint.yaw_rate_deg_s)
         mask |= IGNORE_ACCELERATION

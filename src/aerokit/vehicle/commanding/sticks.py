@@ -183,7 +183,8 @@ class StickStream(SteeringStream[StickInput]):
             target = self._session.system_id
             message = ManualControl(target=target, x=NO_VALUE, y=NO_VALUE, z=NO_VALUE, r=NO_VALUE, buttons=0)
         elif self._rules.release == "channels":
-            # The message has 18 channels. A release has one value for channels 1 to 8, and another for 9 to 18.
+            # The message has 18 channels, of which the first SUB_CHANNELS are released. The value for a release differs
+            # between channels 1 to 8 and the channels above.
             released_upper_count = SUB_CHANNELS - 8
             unchanged_count = 18 - SUB_CHANNELS
             values = [RELEASED] * 8 + [RELEASED_UPPER] * released_upper_count + [UNCHANGED] * unchanged_count

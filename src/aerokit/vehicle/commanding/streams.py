@@ -172,7 +172,7 @@ class ValueStream(Generic[ValueT]):
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        """Stop the stream by itself; order the vehicle to hold unless there was a takeover."""
+        """Stop the stream for this reason; with ``hold``, order the vehicle to hold."""
         self._end()
         is_hold_ordered = hold and self._hold()
         self._release()
@@ -359,7 +359,8 @@ class TakeoverCheck:
     def raise_if_changed(self, operation: str) -> None:
         """Raise OperationRejected if an order was given, or if the mode was changed.
 
-        A change from the take-off mode to the hold mode is allowed, because it is the end of a take-off.
+        Two changes are allowed: to the mode that is ordered next, and from the take-off mode to the hold mode, which is
+        the end of a take-off.
         """
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")

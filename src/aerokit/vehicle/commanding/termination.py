@@ -46,6 +46,7 @@ class TerminationActions(VehicleBase):
             HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
+        # The decorator `checks_arguments` has refused every other intent.
         modes = self.autopilot.modes_of_command(MavCmd.DO_FLIGHTTERMINATION, (TERMINATE,))
         self._arm_cleanup.stop()
         order = self._arbiter.order(*modes, ends_flight=True)
@@ -82,14 +83,14 @@ class TerminationActions(VehicleBase):
             timeout: seconds until the vehicle is silent.
 
         Raises:
-            InvalidArgument: the intent is another text (found by its annotation, before this method runs). Nothing was
-                sent.
+            InvalidArgument: the intent is another text. Nothing was sent.
             NotSupported: this firmware cannot be switched off (ArduPilot). Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
             CommandRejected: the vehicle refused, as PX4 does on boards that cannot switch their power off.
             CommandTimeout: there was no acknowledgement; the autopilot may still have switched off.
             OperationTimeout: the autopilot accepted the command, but still sends HEARTBEATs.
         """
+        # The decorator `checks_arguments` has refused every other intent.
         if not self.autopilot.can_shut_down:
             raise NotSupported(f"shutdown: {self.autopilot.firmware} cannot be switched off; nothing was sent")
         self._session.check_disarmed("shutdown")

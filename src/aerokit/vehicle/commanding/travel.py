@@ -179,7 +179,7 @@ class TravelActions(VehicleBase):
         sent_at = started  # when `unacknowledged_target` was last sent
 
         def resend_if_due() -> None:
-            """Send the target once more, unless a takeover is possible or the computer slept since the last time."""
+            """Resend the target if it is due, unless a takeover is possible or the computer has slept since then."""
             nonlocal sent_at
             now = self.connection.now()
             if unacknowledged_target is None or now - sent_at < RESEND_INTERVAL_S:
@@ -210,7 +210,7 @@ class TravelActions(VehicleBase):
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
         ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
-        sets the speed at that time.
+        sets the speed when the vehicle is on its way.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
@@ -247,7 +247,7 @@ class TravelActions(VehicleBase):
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
-            OperationRejected: the mode changed, or the vehicle disarmed meanwhile or hit the ground.
+            OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
         """

@@ -50,8 +50,9 @@ class ComponentStatus(Snapshot):
     """One component of the vehicle's system.
 
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
-    MAV_TYPE in lower case. ``device_id`` is 1 to 6 for a camera or gimbal that has no component id of its own and is
-    attached to this component, otherwise 0. ``received_at`` is the loop time of the component's last message.
+    MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. ``device_id`` is 1 to 6 for a camera or gimbal without
+    a component id of its own, and ``component_id`` is then the component that it is attached to; otherwise 0.
+    ``received_at`` is the loop time of the component's last message.
     """
 
     component_id: int

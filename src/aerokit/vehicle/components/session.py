@@ -138,7 +138,7 @@ async def _read_limited(files: Files, path: str, idle_timeout_s: float) -> bytes
 
 
 class _WebDownload:
-    """A download in a thread, which is aborted from outside if the caller stops waiting."""
+    """Downloads one file from the web in a thread, and aborts the download if the caller stops waiting."""
 
     def __init__(self, uri: str, idle_timeout_s: float) -> None:
         self._uri = uri

@@ -38,10 +38,11 @@ MODE_SETTING = "CAM_MODE"
 
 @checks_arguments
 class Settings:
-    """The settings of one component. Coroutines exchange messages with it; ``table`` is the local copy.
+    """The settings of one component. Coroutines exchange messages with the component; ``table`` is the local copy.
 
-    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations,
-    and is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the table.
+    Every PARAM_EXT_VALUE and PARAM_EXT_ACK of the component updates the table, also after changes by other stations.
+    Each change of a value is published as :class:`aerokit.events.SettingChanged`. A reboot of the vehicle clears the
+    table.
 
     A camera definition file explains the settings: :meth:`fetch_definition` reads it from the camera, :meth:`load`
     from a local file. From then on you can use the names of options, and values that are out of range or excluded by
@@ -226,8 +227,8 @@ class Settings:
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        With a definition, ``value`` may be the name of an option. Unknown settings that restrict this setting are read
-        before, and settings that it may change are read again afterwards.
+        With a definition, ``value`` may be the name of an option. Settings that restrict this setting are read first if
+        their values are unknown. Settings that this setting may change are read again afterwards.
 
         Raises:
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
@@ -259,7 +260,7 @@ class Settings:
     ) -> Setting:
         """Check the value against the definition of the setting, and write it.
 
-        Unknown settings that restrict this setting are read before.
+        Settings that restrict this setting are read first if their values are unknown.
         """
         definition, name = self._definition, setting_definition.name
         assert definition is not None

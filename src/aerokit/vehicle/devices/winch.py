@@ -141,7 +141,7 @@ class Winch(ReadOnly):
         """Wind up all line, and return when WINCH_STATUS reports it fully retracted.
 
         Args:
-            timeout: seconds until it is retracted.
+            timeout: seconds until the line is retracted.
 
         Raises:
             NotSupported: the autopilot has no such order. Nothing was sent.

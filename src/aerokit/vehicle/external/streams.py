@@ -141,8 +141,8 @@ class MeasurementStream(Generic[MeasurementT]):
     def estimator_use(self) -> EstimatorUse:
         """Use of these measurements by the vehicle's estimator: ``"used"``, ``"not used"`` or ``"unknown"``.
 
-        No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from the
-        parameters when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
+        No message reports this, so aerokit derives it from EKF_STATUS_REPORT or ESTIMATOR_STATUS and from parameters
+        that it read when the stream was entered. ``"used"``: the estimator has a position, and its parameters allow no
         other source of it. ``"not used"``: the estimator has no position. ``"unknown"``: all other cases, for example
         if the vehicle also has a GPS, for sensors that supply no position, or without a recent report.
         """

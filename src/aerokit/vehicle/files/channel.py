@@ -309,7 +309,7 @@ class LogChannel:
             raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
 
     def _end(self) -> None:
-        """Send LOG_REQUEST_END. The next operation starts when a background task has confirmed the end."""
+        """Send LOG_REQUEST_END. The next operation waits until a background task has received the confirmation."""
         transfers = self._transfers
         # LOG_REQUEST_END is sent at once. The background task sends it only to repeat it.
         exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)

@@ -52,12 +52,10 @@ class Files:
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
     total; None for no limit). You can cancel any call; the file is then closed on the vehicle.
 
-    Every method raises:
+    Every method but ``is_supported`` raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
         FileError: the vehicle refused; see ``code`` and ``errno``.
         FileTimeout: the operation did not finish; ``missing`` has the missing ranges.
-
-    :meth:`is_supported` raises none of them.
     """
 
     def __init__(self, transfers: Transfers) -> None:
@@ -146,9 +144,8 @@ class Files:
                         entries[entry.name] = entry
                 # A reply is empty if the name of the next entry is too long for a message. That entry is skipped.
                 offset += max(len(listed), 1)
-                replies_without_new_entry += 1
-                if len(entries) > count_before:
-                    replies_without_new_entry = 0
+                has_new_entry = len(entries) > count_before
+                replies_without_new_entry = 0 if has_new_entry else replies_without_new_entry + 1
                 if replies_without_new_entry > MAX_REPLIES_WITHOUT_NEW_ENTRY or offset > MAX_ENTRIES:
                     raise RemoteProtocolError(
                         f"list {path}: the vehicle's listing does not end; the last entry was number {offset}"
@@ -161,7 +158,7 @@ class Files:
         ``zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF`` computes the same value.
 
         Raises:
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         reply = await self._request(MavFtpOpcode.CALCFILECRC, path, idle_timeout_s, timeout)
         return _crc32_in(path, reply)
@@ -183,7 +180,7 @@ class Files:
 
         Raises:
             VerificationFailed: the vehicle acknowledged everything, but the file has other content.
-            RemoteProtocolError: the answer is not a CRC-32.
+            RemoteProtocolError: the vehicle's answer has no CRC-32.
         """
         path_bytes(path)  # Raises InvalidArgument before anything is sent.
         data = bytes(data)

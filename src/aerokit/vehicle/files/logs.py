@@ -61,7 +61,7 @@ class LogEntry(Snapshot):
 
 
 class GrowthReporter:
-    """Forwards the progress of a download, and logs a message if the log is larger than its entry says."""
+    """Forwards the progress of a download, and logs an INFO message if the flight log is larger than listed."""
 
     def __init__(self, entry: LogEntry, on_progress: OnProgress | None) -> None:
         self._entry, self._on_progress = entry, on_progress
@@ -75,7 +75,7 @@ class GrowthReporter:
             self._on_progress(progress)
 
     def log_growth(self) -> None:
-        """Log a message if the log has grown since its entry was listed; called at the end of a download."""
+        """Log an INFO message if the flight log has grown since it was listed; called at the end of a download."""
         if self._present_size > self._entry.size:
             logger.info(
                 "flight log %d was still being written: listed with %d bytes, downloaded with %d",
@@ -138,7 +138,7 @@ class Logs:
             resume: continue an interrupted download of this log to this file. By LOG_* this works only if the vehicle
                 reports the time of the log.
             method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster of the two for this autopilot,
-                then the slower if the faster fails. MAVFTP requires that the file of the log can be identified.
+                or the slower if the faster is not available. MAVFTP requires that the log's file can be identified.
             idle_timeout_s: fail after this many seconds without progress.
             timeout: seconds in total.
             on_progress: called with the bytes so far and in total.
@@ -203,7 +203,8 @@ class Logs:
     async def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
         """Erase all logs and wait until they are gone, which can take minutes on some boards.
 
-        LOG_ERASE is not acknowledged, so the list is polled. A log that was started meanwhile may remain.
+        LOG_ERASE is not acknowledged, so it is repeated until the list of logs shows the effect. A log that was started
+        meanwhile may remain.
 
         Raises:
             FileTimeout: some of the old logs still exist.
@@ -278,8 +279,8 @@ class Logs:
     ) -> LogEntry:
         """Return the current entry of a log.
 
-        For a mere id, the whole list is requested: if there is no log with this id, a request for it alone would make
-        ArduPilot list nonexistent logs endlessly.
+        If only an id is given, the whole list is requested: if there is no log with this id, a request for it alone
+        would make ArduPilot list nonexistent logs endlessly.
         """
         log_id = log if isinstance(log, int) else log.id
         only_id = None if isinstance(log, int) else log.id

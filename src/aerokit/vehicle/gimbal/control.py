@@ -150,8 +150,8 @@ class GimbalControl:
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
     releases control, without waiting if the block exits by an error or cancellation. When another station takes
     control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block then releases nothing; it raises GimbalTaken too, unless your program has
-    already seen the loss. Another station that uses your own system and component id cannot be detected.
+    :class:`GimbalTaken`. Leaving the block after a loss releases nothing, and raises GimbalTaken unless your program
+    has already seen the loss. Another station that uses your own system and component id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -214,7 +214,7 @@ class GimbalControl:
         """Raise GimbalTaken if control was lost.
 
         Raises:
-            GimbalTaken: another station is in control, or none.
+            GimbalTaken: another station has taken control, or the manager reports that no station has it.
         """
         if self._taken is not None:
             self._was_loss_raised = True
@@ -326,7 +326,7 @@ class GimbalControl:
         return controllers.primary if self._is_primary else controllers.secondary
 
     def _release_command(self) -> ReleaseCommand:
-        """Return the command that releases control, unless control was lost or other blocks need it."""
+        """Return the command that releases control. It is not sent if control was lost or other blocks need control."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary, release=True)
         requests = orders.registry.control_requests
@@ -343,7 +343,7 @@ class GimbalControl:
         release.send_soon()
 
     def _end(self) -> None:
-        """Forget the control that this block has requested or has. Sends nothing."""
+        """Forget the control that this block has requested or obtained. Sends nothing."""
         self._is_ended = True
         self._lost.set()  # Calls of `until_lost` end too.
         requests = self._orders.registry.control_requests

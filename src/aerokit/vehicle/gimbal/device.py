@@ -153,7 +153,7 @@ class ControlBlock(Protocol):
 
 
 class GimbalDevice:
-    """One gimbal, addressed by the component that sends its attitude, and a number.
+    """One gimbal, addressed by a number and by the component that sends its attitude.
 
     ``number`` is 1 to 6 for gimbals attached to that component, and 0 if the component itself is the gimbal. Before any
     gimbal is discovered, a placeholder with ``component_id`` 0 stands for the first gimbal.
@@ -178,7 +178,8 @@ class GimbalDevice:
         self.attitude: StateCell[GimbalAttitude] = context.session.connection.new_cell(
             f"{name}.attitude", ATTITUDE_MESSAGES
         )
-        # All other gimbals send their attitude without a request.
+        # Only the autopilot is requested to send the attitude. Gimbals with their own component ids send it by
+        # themselves.
         if component_id in (0, context.session.component_id):
             self.attitude._feed_from(WatchedStream(self.attitude, partial(self._request_attitude, context.session)))
         self.controllers: StateCell[GimbalControllers] = context.session.connection.new_cell(
@@ -245,7 +246,7 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Record a manager, which replaces one of a lower rank or one that is gone."""
+        """Record a manager. It replaces the present manager if that has a lower rank, or ``is_gone``."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_gone:
@@ -273,7 +274,7 @@ class GimbalDevice:
 
 
 class ControlRequest:
-    """Control of a gimbal that an open ``gimbal.control()`` block has requested.
+    """Request for control of a gimbal, made by an open ``gimbal.control()`` block.
 
     A ``gimbal_id_param`` of 0 means all gimbals of the manager.
     """
@@ -295,7 +296,8 @@ class ControlRequest:
     def leave_release_to(self, requests: Iterable[ControlRequest]) -> bool:
         """Leave the release to other blocks of this program that need the same control; return False if there are none.
 
-        Releasing now would take the control from these blocks. Their requests are marked, so that they release it.
+        Releasing now would take the control from these blocks. Their requests are marked, so that these blocks release
+        the control when they end.
         """
         shared = [request for request in requests if request is not self and request.is_released_with(self)]
         for request in shared:

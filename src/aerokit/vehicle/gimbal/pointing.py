@@ -82,7 +82,7 @@ class RestTarget:
         self._moved_at = 0.0
 
     def is_reached(self, device: GimbalDevice) -> bool:
-        """Process a new attitude; return True if the gimbal has stood still for STILL_S in its rest position."""
+        """Check a new attitude; return True if the gimbal has stood still for STILL_S in its rest position."""
         attitude, updated_at = device.attitude.value, device.attitude.updated_at
         pitch, roll, yaw = attitude.pitch_deg or 0.0, attitude.roll_deg or 0.0, attitude.yaw_from_nose_deg or 0.0
         if self._has_moved((pitch, roll, yaw)):

@@ -35,8 +35,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
     orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
     no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
-    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. ``set`` and
-    leaving the block then raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
+    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. After a stop,
+    ``set`` and leaving the block raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -169,7 +169,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._stop_error = self._taken
 
     def _zero_rates_command(self) -> ReleaseCommand:
-        """Return the command that stops the gimbal, unless a newer order was given or control was lost."""
+        """Return the command that stops the gimbal. It is not sent if a newer order was given or control was lost."""
         orders, order = self._orders, self._order
         no_angles, zero_rates, reserved = (NAN, NAN), (0.0, 0.0), 0
         params = (*no_angles, *zero_rates, self._flags, reserved, orders.gimbal_id_param)

@@ -131,7 +131,7 @@ class PlanContext:
 
 
 class MissionTracker:
-    """State values and events for mission progress. Item numbers do not count home.
+    """State values and events for mission progress. Items are numbered from 0, without home.
 
     If the mission of an ArduCopter ends with a landing, the vehicle disarms and reports its first item as current, but
     never reports the mission as complete. PX4 reports completion until the next mission has started. It reports an
@@ -237,7 +237,7 @@ class MissionTracker:
             self._is_approached_again = True
 
     def _on_state(self, state: int) -> None:
-        """Process MISSION_STATE: the mission is being flown, or was flown to its end."""
+        """Record from MISSION_STATE whether the mission is being flown, or was flown to its end."""
         if state != MissionState.COMPLETE:
             self._stale_until = -math.inf
             if state == MissionState.ACTIVE and self.is_in_mission_mode and self._session.telemetry.is_armed:
@@ -254,8 +254,7 @@ class MissionTracker:
         """Publish that an item was reached, unless MISSION_ITEM_REACHED is a duplicate or is about home."""
         now = self._session.connection.now()
         item = seq - self._offset  # negative if ArduPilot reports item 0 (home), as it does at a guided target
-        # The vehicle repeats its report, so an item counts as reached again only if it was approached again.
-        if self._repeats_item_reached:
+        if self._repeats_item_reached:  # An item counts as reached again only if it was approached again.
             is_duplicate = item == self.reached and not self._is_approached_again
         else:
             is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S

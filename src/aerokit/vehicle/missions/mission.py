@@ -51,9 +51,9 @@ class MissionEndDetector:
 
     A mission has ended when the vehicle reports the mission as complete, or has landed and disarmed at its last item.
     If the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the
-    ground, because PX4 reports completion when the return starts, and returns in another mode. A return without a
-    landing ends at home. If a vehicle reports no mission state, the mission has ended when the last item is reached. If
-    the items are unknown, the mode after the completion shows whether the vehicle lands.
+    ground. PX4 reports completion when the return starts, and then changes the mode. A return without a landing ends at
+    home. If a vehicle reports no mission state, the mission has ended when the last item is reached. If the items are
+    unknown, the mode after the completion shows whether the vehicle lands.
 
     After a failsafe in the last item, a vehicle may land elsewhere, in another mode than that of the item: then the
     mission has failed.
@@ -408,9 +408,9 @@ class MissionControl(VehiclePlan["Mission"]):
             else:
                 return
         # The vehicle supports only the older MISSION_SET_CURRENT.
-        with vehicle_context.arbiter.sending(order) as sending:
+        with vehicle_context.arbiter.sending(order) as sent:
             try:
-                await self._set_current_by_message(seq, timeout, sending)
+                await self._set_current_by_message(seq, timeout, sent)
             except OperationTimeout as error:
                 if order.end:
                     raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
@@ -422,7 +422,7 @@ class MissionControl(VehiclePlan["Mission"]):
 
         transfers = self._context.transfers
         target = (transfers.system_id, transfers.component_id)
-        async with self._context.lock:  # PX4 ignores the command during a transfer.
+        async with self._context.lock:  # PX4 ignores MISSION_SET_CURRENT during a transfer.
             if order_status is not None:
                 self._vehicle_context.sender.raise_if_ended(order_status.order)
                 await self._vehicle_context.sender.await_recent_state(order_status.order)

@@ -30,7 +30,8 @@ PlanMethod = Literal["auto", "ftp", "items"]
 class VehiclePlan(ReadOnly, Generic[PlanT]):
     """A mission, a fence or rally points on a vehicle.
 
-    Transfers with one vehicle run one at a time. You can cancel any call; aerokit then tells the vehicle to stop.
+    Transfers with one vehicle run one at a time. You can cancel any call;
+    aerokit then ends the transfer on the vehicle.
     """
 
     def __init__(self, context: PlanContext) -> None:

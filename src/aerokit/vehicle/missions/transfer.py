@@ -282,7 +282,10 @@ class PlanTransfer(Generic[PlanT]):
         return received.items
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
-        """Return True if the plan is to be transferred as a file."""
+        """Return True if the plan is to be transferred as a file.
+
+        Raises NotSupported if ``method`` is ``"ftp"`` and the vehicle has no MAVFTP.
+        """
         if method == "items":
             return False
         has_ftp = await self._channel.has_ftp()
@@ -304,7 +307,7 @@ class PlanTransfer(Generic[PlanT]):
         """Send all items; read them back to verify them, or if the vehicle's answers to the upload were ambiguous."""
         result = await self._channel.send(items)
         self._cache.set(items, self._context.now())
-        if (result.is_confirmed and not verify) or await self._has_checksum_of(items):
+        if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
         received = await self._read(method)
         try:
@@ -339,7 +342,8 @@ class PlanTransfer(Generic[PlanT]):
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
         """Send only the differences; return True if the vehicle has the plan now.
 
-        Returns False if the vehicle's plan is unknown or differs in too many items.
+        Returns False if the vehicle's plan is unknown or differs in too many items, or if the vehicle does not support
+        partial uploads.
         """
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
@@ -393,7 +397,7 @@ class PlanTransfer(Generic[PlanT]):
         parts = list(_consecutive_ranges(changed_seqs))
         return not parts or len(changed_seqs) + PART_OVERHEAD_ITEMS * len(parts) < count
 
-    async def _has_checksum_of(self, items: Sequence[MissionItem]) -> bool:
+    async def _receives_checksum_of(self, items: Sequence[MissionItem]) -> bool:
         """Wait for the checksum of these items if that is faster than reading them back; return True if it arrives."""
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0

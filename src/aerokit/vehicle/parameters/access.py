@@ -115,7 +115,7 @@ class ParameterAccess:
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
         """Download the list as a file if possible, otherwise as one message for each parameter."""
         if method == "ftp" or (method == "auto" and await self.has_pack()):
-            # With "auto", the probe ends the attempt early, so that the list can be downloaded instead.
+            # With "auto", the probe ends the attempt if MAVFTP does not answer, and the list is downloaded instead.
             probe = nullcontext() if method == "ftp" else self._ftp_probe()
             try:
                 with probe:

@@ -40,10 +40,10 @@ ParameterSource = ParameterTable | Mapping[str, float] | str | os.PathLike[str]
 
 @checks_arguments
 class Parameters(ReadOnly):
-    """The parameters of one autopilot. Coroutines exchange messages with it; ``table`` is the local copy.
+    """The parameters of one autopilot. Coroutines exchange messages with the autopilot; ``table`` is the local copy.
 
-    Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations, and is published as
-    :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
+    Every PARAM_VALUE of the autopilot updates the table, also after changes by other stations. Each change of a value
+    is published as :class:`aerokit.events.ParameterChanged`. A reboot clears the table.
 
     ArduPilot 4.7 renamed parameters and changed their units (``WPNAV_SPEED`` in cm/s became ``WP_SPD`` in m/s). Every
     method accepts the old and the new name with either firmware, and converts the value. An old name that the vehicle
@@ -280,13 +280,13 @@ class Parameters(ReadOnly):
         The vehicle's parameters are downloaded if they are not known. Only names in ``parameters`` are compared;
         ``before`` is None for a name that the vehicle does not have. Names and units in the result are the vehicle's.
         """
-        from aerokit.parameters import diff
+        from aerokit.parameters import diff as compare
 
         values = _values_of(parameters)
         check_values(values)
         table = await self.download(idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=on_progress)
         translated = self._names.translated(values, table)
-        return diff(table, translated, names=translated)
+        return compare(table, translated, names=translated)
 
     async def changed_from_default(
         self,

@@ -18,7 +18,7 @@ MAX_RETURN_ALTITUDE_M = 3000
 
 async def read_return_altitude(parameters: Parameters, session: VehicleSession) -> float:
     """Read the altitude; see :meth:`aerokit.Vehicle.return_altitude`."""
-    _, value, scale = await _find("return_altitude", parameters, session)
+    _, value, scale = await _find_parameter("return_altitude", parameters, session)
     return round(value / scale, 3)
 
 
@@ -33,11 +33,11 @@ def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vt
 async def write_return_altitude(parameters: Parameters, session: VehicleSession, altitude_m: float) -> None:
     """Write the altitude; see :meth:`aerokit.Vehicle.set_return_altitude`."""
     check_range("altitude_m", altitude_m, 0, MAX_RETURN_ALTITUDE_M, above=True)
-    name, _, scale = await _find("set_return_altitude", parameters, session)
+    name, _, scale = await _find_parameter("set_return_altitude", parameters, session)
     await parameters.set(name, altitude_m if scale == 1 else round(altitude_m * scale))
 
 
-async def _find(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
+async def _find_parameter(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
     """Return name, value and scale of the altitude parameter that the vehicle has."""
     autopilot = session.autopilot
     names_and_scales = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)

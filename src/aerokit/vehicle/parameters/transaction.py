@@ -74,7 +74,8 @@ class _Block:
             if not isinstance(answer, Parameter):
                 raise answer
             if name not in self._saved:
-                # Prefer the value in the store, because a value that was read as a float may lack its last bits.
+                # The read has updated the store. Its value is preferred, because an answer may be a float that lacks
+                # the last bits.
                 self._saved[name] = self._access.store.get(name) or answer
                 self._registry.add(name, self)
 

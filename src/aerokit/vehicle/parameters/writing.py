@@ -199,7 +199,10 @@ def _failed_write(name: str, requested: float, known: Parameter | None, error: A
 
 
 def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
-    """Compare the vehicle's answer with the value that was sent, and with the old value."""
+    """Return the outcome of a write, from the value that was sent, the old value, and the vehicle's answer.
+
+    If the write failed, the result is the error.
+    """
     if not isinstance(answer, Parameter):
         return answer
     is_old_value = old is not None and same_value(old.value, answer.value)
@@ -242,7 +245,7 @@ class _PlannedWrite(Snapshot):
 
 
 class ParameterWriter:
-    """Writes values for programs and reports the results."""
+    """Writes parameters by the names and in the units that the program uses, and reports the results."""
 
     def __init__(self, access: ParameterAccess, names: NameResolver, note_of: NoteOf) -> None:
         self._access = access

@@ -85,7 +85,7 @@ class Caster:
         return cls(host, port or DEFAULT_PORT, mount, credentials, parts.scheme == "ntrips")
 
     def request(self, mount: str, position: bytes | None = None) -> bytes:
-        """Return the request for a mount point, or for the source table if ``mount`` is empty."""
+        """Return the HTTP request for a mount point, or for the source table if ``mount`` is empty."""
         lines = [
             f"GET /{mount} HTTP/1.1",
             f"Host: {self.host}:{self.port}",
@@ -140,7 +140,7 @@ class _Response:
         while line := await self._reader.readline():
             size_text, _, _ = line.partition(b";")  # Extensions of the chunk may follow the size.
             chunk_size = int(size_text or b"0", 16)
-            if not 0 < chunk_size <= MAX_CHUNK_SIZE:  # A chunk of size 0 ends the body.
+            if not 0 < chunk_size <= MAX_CHUNK_SIZE:  # Size 0 ends the body; a greater size is invalid.
                 return
             yield await self._reader.readexactly(chunk_size)
             await self._reader.readline()  # Skip the line break after the chunk.
@@ -268,7 +268,7 @@ class NtripClient:
             self._ended.set()
 
     async def _forward(self, response: _Response) -> int:
-        """Send the corrections from one connection to the vehicle; return the number of messages."""
+        """Send the corrections from one connection to the vehicle; return the number of messages received."""
         reader = RtcmReader()
         message_count = 0
         reason = "the caster closed the connection"
@@ -304,7 +304,7 @@ class NtripClient:
     # -------------------------------------------------------------------------------------- caster
 
     async def _open(self, mount: str) -> _Response:
-        """Request a mount point, and keep the connection open in ``_writer``."""
+        """Request a mount point, and keep the connection open in ``_writer``; raise if the caster refuses."""
         response = await self._request(mount)
         if response.is_stream:
             return response

@@ -27,7 +27,7 @@ MAX_RECENT = 64
 
 
 class _SentMessages:
-    """RTCM messages that all vehicles of one connection have sent recently."""
+    """RTCM messages that were recently sent to any vehicle of one connection."""
 
     def __init__(self) -> None:
         self.sequence = 0

@@ -192,7 +192,7 @@ class CommandSender:
         order_status: OrderStatus | None,
         was_just_sent: bool = False,
     ) -> CommandAck:
-        """Send a command after the earlier commands with the same key, and return its ACCEPTED ack."""
+        """Send a command and return its ACCEPTED ack. Earlier calls with the same component and MAV_CMD end first."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_if_ended(key)

@@ -327,7 +327,7 @@ class MessageRates:
         received_messages = achieved_hz * window_s
         was_slow = stream.is_slow
         stream.is_slow = received_messages < min_messages
-        if achieved_hz == 0 and stream.is_optional:  # An optional stream may be missing altogether.
+        if achieved_hz == 0 and stream.is_optional:  # An optional stream need not exist.
             return
         if stream.is_slow and not was_slow:
             self._connection.bus.publish(

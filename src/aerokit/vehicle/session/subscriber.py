@@ -102,7 +102,7 @@ class ComponentSubscriber:
     def cell(self, message_type: type[MessageT], rate_hz: float | None) -> StateCell[MessageT]:
         """Return the cell with the latest message of a type.
 
-        All calls return the same cell. A call with ``rate_hz`` replaces the rate of earlier calls.
+        All calls for a type return the same cell. A call with ``rate_hz`` replaces the rate of earlier calls.
         """
         cell = self._cells.get(message_type)
         if cell is None:
@@ -162,7 +162,7 @@ class ComponentSubscriber:
 
 
 class WatchedStream:
-    """Requests the message of a state cell, only while the program waits for the cell or iterates over its values.
+    """Requests the message of a state cell only while the program waits for the cell or iterates over its values.
 
     The object is one of the feeds of the cell. ``request`` returns None if the message need not be requested now.
     """

@@ -149,10 +149,10 @@ class VehicleWatch:
             self._expects_reboot = False
 
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
-        """Process the time since boot from an answer to our TIMESYNC request.
+        """Detect a reboot by the time since boot in an answer to our TIMESYNC request.
 
         If the request was sent after the previous answer had been processed, its answer cannot be a late message. A
-        lower time then proves a reboot, without confirmation by a second message.
+        lower time than before then proves a reboot, without confirmation by a second message.
         """
         answered_at, milliseconds_before = self._last_answer
         if requested_at <= answered_at:
@@ -316,7 +316,7 @@ class LinkWatch:
         self._connection.send(Timesync(tc1=0, ts1=sent_at_ns), to=self._system_id)  # tc1 = 0 marks a request.
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Process the autopilot's answer to our request.
+        """Measure the round trip by the autopilot's answer to our request, and pass the answer on.
 
         All other TIMESYNC messages are ignored, for example the answer of a companion computer to the same request.
         """

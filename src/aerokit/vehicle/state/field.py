@@ -209,7 +209,10 @@ class StreamedMessage:
         """The latest frame of each instance, until it is decoded (or its message, until that is applied)."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
-        """Process a frame of the vehicle's system. ``message`` is the decoded frame, if it was decoded already."""
+        """Keep a frame until a cell is read. Apply it now if a cell has observers, or the last decoding was long ago.
+
+        ``message`` is the decoded frame, if it was decoded already.
+        """
         if frame.component_id != self._component_id:
             return
         if self._is_watched or frame.received_at >= self._decode_from:

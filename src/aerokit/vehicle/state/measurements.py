@@ -248,7 +248,7 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None
 
-    others = [other for other in context.before or () if other.icao != message.ICAO_address]
+    earlier = [entry for entry in context.before or () if entry.icao != message.ICAO_address]
     reported = Aircraft(
         icao=message.ICAO_address,
         callsign=message.callsign.strip() if message.flags & AdsbFlags.VALID_CALLSIGN else "",
@@ -263,7 +263,7 @@ def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft,
         emitter=enum_member(AdsbEmitterType, message.emitter_type),
         silent_for_s=message.tslc,
     )
-    return (*others[-(MAX_AIRCRAFT - 1) :], reported)
+    return (*earlier[-(MAX_AIRCRAFT - 1) :], reported)
 
 
 def winch(message: messages.WinchStatus) -> WinchStatus:

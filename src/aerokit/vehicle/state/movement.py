@@ -194,7 +194,7 @@ def throttle_percent(message: messages.VfrHud) -> float:
 
 
 def attitude(message: messages.Attitude) -> Attitude:
-    """Return the attitude in ATTITUDE as Euler angles and rates in degrees."""
+    """Return the attitude from ATTITUDE as Euler angles and rates in degrees."""
     degrees = math.degrees
     return Attitude(
         roll_deg=degrees(message.roll),
@@ -207,7 +207,7 @@ def attitude(message: messages.Attitude) -> Attitude:
 
 
 def attitude_of_quaternion(message: messages.AttitudeQuaternion) -> Attitude:
-    """Return the attitude in ATTITUDE_QUATERNION as Euler angles and rates in degrees."""
+    """Return the attitude from ATTITUDE_QUATERNION as Euler angles and rates in degrees."""
     rates = (
         math.degrees(message.rollspeed),
         math.degrees(message.pitchspeed),

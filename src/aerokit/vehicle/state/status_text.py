@@ -42,7 +42,7 @@ class StatusTextAssembler:
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
     def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
-        """Process one message. Return the texts that it completes, and truncated texts whose next chunk is overdue.
+        """Add one message. Return the texts that it completes, and truncated texts whose next chunk is overdue.
 
         By the standard, a text with the id 0 is not chunked. With ``joins_id_0``, it is treated like other texts.
         """

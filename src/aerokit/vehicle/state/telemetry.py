@@ -194,7 +194,7 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        """Process a message. Its values get the time at which its frame arrived, which may be long before this call."""
+        """Update the cells from a message, with the time at which its frame arrived, perhaps long before this call."""
         # Calls may be nested, because a handler may read a cell, which then decodes another message.
         outer_arrived_at = self._arrived_at
         self._arrived_at = None if frame is None else frame.received_at
@@ -281,7 +281,7 @@ class Telemetry(States):
     # --------------------------------------------------------- messages with special handling
 
     def _accept_heartbeat(self, heartbeat: messages.Heartbeat) -> bool:
-        """Learn from a heartbeat; return False if a ground station or companion sent it with the autopilot's ids."""
+        """Record autopilot and base mode; return False if a ground station or companion sent the heartbeat instead."""
         if not is_autopilot(heartbeat):
             return False
         if not self._knows_autopilot:
