@@ -370,7 +370,7 @@ def test_unanswered_parameter_waits_for_list(fc: FlightController) -> None:
     with connected(fc) as vehicle:
         assert vehicle.parameters["THR_MIN"] == 130.0
         assert "NOPE" not in vehicle.parameters
-        assert vehicle.parameters._download.is_complete
+        assert vehicle.parameters.known_values().keys() == {"FOO", "BAR", "THR_MIN"}
 
 
 def test_parameters_added_later_are_found(vehicle: dronekit.Vehicle, fc: FlightController) -> None:

@@ -3401,7 +3401,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
 
         Raises:
-            NotSupported: the capture has another URL, or none. Nothing was sent.
+            NotSupported: the capture has another URL, or none. No file was requested.
             FileError: the camera has no such file.
             OperationTimeout: the transfer stopped, or no camera was found.
         """

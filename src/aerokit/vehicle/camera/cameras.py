@@ -154,7 +154,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         """Read the file of a picture by MAVFTP, if its ``file_url`` begins with ``mftp:`` or ``/``; at most 16 MB.
 
         Raises:
-            NotSupported: the capture has another URL, or none. Nothing was sent.
+            NotSupported: the capture has another URL, or none. No file was requested.
             FileError: the camera has no such file.
             OperationTimeout: the transfer stopped, or no camera was found.
         """
@@ -166,14 +166,14 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         try:
             return await self._link.component.fetch(f"mftp://{url}" if url.startswith("/") else url)
         except InvalidArgument as error:
-            raise NotSupported(f"read_picture: {error}; nothing was sent") from None
+            raise NotSupported(f"read_picture: {error}; no file was requested") from None
 
     def __repr__(self) -> str:
         return f"<Camera {self._link.describe().removeprefix('camera ')}>"
 
 
 CAMERA_COMPONENT_IDS = range(100, 106)
-MAX_EARLY_CAPTURES = 99
+MAX_EARLY_CAPTURES = 100
 
 
 class Cameras:
@@ -261,7 +261,8 @@ class Cameras:
         if self._first_link.number is None:
             if not self._early_captures:
                 self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early_captures)
-            del self._early_captures[MAX_EARLY_CAPTURES:]  # If the list is full, a new capture replaces the last one.
+            # If the list is full, a new capture replaces the last one.
+            del self._early_captures[MAX_EARLY_CAPTURES - 1 :]
             self._early_captures.append((number, message))
         else:
             self.at(number)._log.record(message)
