@@ -237,7 +237,7 @@ async def test_capture_urls_name_the_component() -> None:
             "[",
             "",
         ):
-            with pytest.raises(NotSupported, match="nothing was sent|no file was requested"):
+            with pytest.raises(NotSupported, match=r"nothing was sent|no file was requested"):
                 await vehicle.camera.read_picture(capture.replace(file_url=url))
 
 
