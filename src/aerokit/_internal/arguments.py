@@ -150,8 +150,8 @@ def _is_time(parameter: inspect.Parameter) -> bool:
 def _error(rule: Rule, name: str, value: object, vehicle_parameter: object) -> InvalidArgument:
     """Create the error for an invalid argument.
 
-    ``vehicle_parameter`` is the argument called ``name`` of the same call, if there is one, as in
-    ``set(name="RTL_ALT", value="abc")``.
+    ``name`` is the name of the argument. ``vehicle_parameter`` names the vehicle parameter whose value is invalid, if
+    the call has one: "RTL_ALT" for ``set(name="RTL_ALT", value="abc")``.
     """
     check, allowed = rule
     hint = _hint(check, value)

@@ -205,7 +205,7 @@ class _TopicChannels:
             message_type = type(message)
             name = topics.raw_topic_name(system_id, component_id, message_type)
             make_topic = partial(topics.raw_topic, system_id, component_id, message_type)
-            if self._open_if_newer(name, received_at, make_topic):
+            if self._open_topic_if_newer(name, received_at, make_topic):
                 self._send(name, received_at, topics.raw_fields(message))
 
     def close(self) -> None:
@@ -220,13 +220,13 @@ class _TopicChannels:
             value, name = cell.latest, topics.vehicle_topic(system_id, state)
             if value is None:
                 continue
-            if self._open_if_newer(name, cell.updated_at, partial(topics.state_topic, system_id, state, value)):
+            if self._open_topic_if_newer(name, cell.updated_at, partial(topics.state_topic, system_id, state, value)):
                 self._send(name, cell.updated_at, topics.state_fields(value))
         # The link's statistics change with every frame, so they are sent at an interval.
         name, now = topics.vehicle_topic(system_id, "link"), self._connection.now()
         if now - self._sent_at.get(name, -_LINK_INTERVAL_S) >= _LINK_INTERVAL_S:
             link = overview(vehicle)["link"]
-            if self._open_if_newer(name, now, lambda: topics.state_topic(system_id, "link", link)):
+            if self._open_topic_if_newer(name, now, lambda: topics.state_topic(system_id, "link", link)):
                 self._send(name, now, link)
 
     def _publish_pose(self, system_id: int, vehicle: Vehicle) -> None:
@@ -239,27 +239,27 @@ class _TopicChannels:
         location, transform, pose = (
             topics.vehicle_topic(system_id, name) for name in ("location", "transform", "pose")
         )
-        if self._open_if_newer(location, position_at, lambda: Topic(location, topics.LOCATION_FIX)):
+        if self._open_topic_if_newer(location, position_at, lambda: Topic(location, topics.LOCATION_FIX)):
             heading, velocity = vehicle.heading_deg.latest, vehicle.velocity.latest
             unix_s = self._to_unix_time(position_at)
             self._send(location, position_at, topics.location_fix(unix_s, system_id, position, heading, velocity))
         map_position, unix_s = self._map_frame.east_north_up_m(position), self._to_unix_time(pose_at)
-        if self._open_if_newer(transform, pose_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
+        if self._open_topic_if_newer(transform, pose_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
             self._send(transform, pose_at, topics.frame_transform(unix_s, system_id, map_position, attitude))
-        if self._open_if_newer(pose, pose_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
+        if self._open_topic_if_newer(pose, pose_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
             self._send(pose, pose_at, topics.pose_in_frame(unix_s, map_position, attitude))
 
     def _publish_texts(self, system_id: int, vehicle: Vehicle) -> None:
         name = topics.vehicle_topic(system_id, "log")
         sent_at = self._sent_at.get(name, -math.inf)
         for text in vehicle.telemetry.texts_since(sent_at):
-            if text.at > sent_at and self._open_if_newer(name, text.at, lambda: Topic(name, topics.LOG)):
+            if text.at > sent_at and self._open_topic_if_newer(name, text.at, lambda: Topic(name, topics.LOG)):
                 self._send(name, text.at, topics.log_entry(self._to_unix_time(text.at), system_id, text))
 
-    def _open_if_newer(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
-        """Open the channel of a topic at its first value, because the type of the channel depends on the value.
+    def _open_topic_if_newer(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
+        """Return True if a viewer subscribes to the topic, and the value is newer than the last value sent.
 
-        Return True if a viewer subscribes to the topic and the value is newer than the last value sent.
+        Opens the channel of the topic at its first value, because the type of the channel depends on the value.
         """
         channel = self._channels.get(name)
         if channel is None:

@@ -166,20 +166,20 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
     _check_distinct(addresses, targets)
     factories: list[Callable[[], Link]] = []
     costly: set[int] = set()
-    for index, address in enumerate(addresses):
-        if isinstance(address, Link):
-            factories.append(partial(_return_link, address))
+    for index, (address, target) in enumerate(zip(addresses, targets)):  # noqa: B905 - equal lengths
+        if isinstance(target, Link):
+            factories.append(partial(_return_link, target))
             continue
-        parsed = parse_address(address)
-        if parsed.option("costly") == "1":
+        if target.option("costly") == "1":
             costly.add(index)
-        if parsed.kind == "replay":
+        if target.kind == "replay":
             raise InvalidArgument(
                 f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
             )
         # Only listening links get the filter, because other kinds of links refuse the argument.
-        peer_filter = peers if parsed.kind in ("udpin", "udpbcast", "tcpin") else None
-        factories.append(partial(ReconnectingLink, partial(create_link, parsed, baud=baud, peers=peer_filter)))
+        peer_filter = peers if target.kind in ("udpin", "udpbcast", "tcpin") else None
+        # A lost link is reopened while another one works, even without ``reconnect``.
+        factories.append(partial(ReconnectingLink, partial(create_link, target, baud=baud, peers=peer_filter)))
     return MultiLink(factories, costly=costly, survives_loss=reconnect)
 
 

@@ -109,7 +109,7 @@ class Channels(_ChannelDict):
 
     # --------------------------------------------------------------------------------- private
 
-    # The class dict declares the methods below with other types, so the assignments are hidden from type checkers.
+    # The base class declares the methods below with other types, so the assignments are hidden from type checkers.
     if not TYPE_CHECKING:
         __setitem__, __delitem__, __ior__ = map(_unsupported, ("__setitem__", "__delitem__", "__ior__"))
         clear, pop, popitem = map(_unsupported, ("clear", "pop", "popitem"))

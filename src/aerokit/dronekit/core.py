@@ -97,7 +97,7 @@ class LatestMessage(Generic[MessageT]):
         self._announced_names: set[str] = set()
         self._handlers: list[Callable[[MessageT], object]] = []
         self._latest: Frame | MessageT | None = None  # a Frame if the latest message was not decoded on arrival
-        self._decoded: MessageT | None = None  # the last message that `message` decoded, perhaps of an older frame
+        self._decoded: MessageT | None = None  # cache of the property `message`; may be older than `_latest`
         self.component_id = 0
         """Component id of the autopilot; messages of other components are ignored."""
 

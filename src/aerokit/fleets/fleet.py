@@ -56,13 +56,13 @@ class Selection(Actions, Missions, Formations, Shows):
         """
         return self._select("role", name)
 
-    def _select(self, attribute: str, name: str) -> Selection:
+    def _select(self, attribute: str, value: str) -> Selection:
         """Select the members whose attribute (``group`` or ``role``) has this value."""
-        selected = tuple(member.name for member in self if getattr(member, attribute) == name)
+        selected = tuple(member.name for member in self if getattr(member, attribute) == value)
         if not selected:
             existing = dict.fromkeys(getattr(member, attribute) for member in self if getattr(member, attribute))
             allowed = f"the {attribute}s are {', '.join(existing)}" if existing else f"there are no {attribute}s"
-            raise InvalidArgument(f"{attribute} = {short_repr(name)} is not allowed: {allowed}")
+            raise InvalidArgument(f"{attribute} = {short_repr(value)} is not allowed: {allowed}")
         return Selection(self._context, selected)
 
     def __repr__(self) -> str:

@@ -136,7 +136,7 @@ class Switch:
             if port.gateway is not None or len(frames) != received_count:
                 data = None  # The bytes as received are no longer those of the frames to forward.
         if now - arrived_at > ORDER_MAX_AGE_S:
-            frames = self._without_orders(port, frames, arrived_at)
+            frames = self._without_commands(port, frames, arrived_at)
             data = None
         plans = self.router.route_all(node, frames, arrived_at, late)
         if data is None or self.recording is not None or not self._forward_together(plans, data):
@@ -182,8 +182,8 @@ class Switch:
                 late.append(frame)
         return admitted, late
 
-    def _without_orders(self, port: Port, frames: list[Frame], arrived_at: float) -> list[Frame]:
-        """Drop commands, and return the other frames."""
+    def _without_commands(self, port: Port, frames: list[Frame], arrived_at: float) -> list[Frame]:
+        """Count the commands among the frames as dropped, and return the other frames."""
         remaining = []
         for frame in frames:
             if self._targets.is_order(frame.message_id):

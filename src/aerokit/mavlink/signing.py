@@ -235,7 +235,7 @@ class Signing:
         return sum(self.refused.values())
 
     def has_signed(self, frame: Frame) -> bool:
-        """Return True if a frame was signed with this key, at any time. Has no side effects."""
+        """Return True if a frame was signed with this key, whatever its timestamp. Has no side effects."""
         raw = frame.raw
         return bool(frame.incompat_flags & SIGNED) and compare_digest(
             self._hash(raw[:-_HASH_LENGTH]), raw[-_HASH_LENGTH:]

@@ -165,7 +165,8 @@ class SourceStatistics(SourceFields):
         is_direct_succession = follows and self._late_count == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
-        # A link may repeat two or three recent frames, which are no reboot. It hardly ever repeats old frames.
+        # A link may repeat two or three recent frames, so a longer run of recent numbers is required. It hardly ever
+        # repeats old frames, so two of them in succession show a reboot.
         min_run = 3 if is_near else 1
         if self._late_run >= min_run:
             self._begin_stream(now)
@@ -207,7 +208,7 @@ class SourceStatistics(SourceFields):
             self._swap(sequence, now, current_count, other_count)
             return IN_ORDER
         if is_other_longer and self._consume_missing((self.expected - sequence) & 0xFF or 256):
-            # The frame is in the gap before the current stream, which was counted as lost.
+            # The frame is in the gap before the current stream. The frames of this gap were counted as lost.
             self.lost -= 1
             self._skipped_over -= 1
         self._other_expected = (sequence + 1) & 0xFF

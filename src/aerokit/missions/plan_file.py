@@ -237,7 +237,7 @@ def _read_polygon(value: JsonValue) -> FencePolygon:
     corners = value["polygon"]
     places = [_required_place(corner) for corner in corners.elements()]
     if len(places) < 3:
-        raise corners.error(f"an array of at least 3 positions; it has {len(places)}")
+        raise corners.expected(f"an array of at least 3 positions; it has {len(places)}")
     return FencePolygon(places, value["inclusion"].boolean())
 
 
@@ -249,7 +249,7 @@ def _read_circle(value: JsonValue) -> FenceCircle:
     try:
         return FenceCircle(center, radius.number(), value["inclusion"].boolean())
     except InvalidArgument as error:
-        raise radius.error("a number of metres above 0") from error
+        raise radius.expected("a number of metres above 0") from error
 
 
 def _read_rally(value: JsonValue) -> RallyPoints:

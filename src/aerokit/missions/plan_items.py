@@ -177,7 +177,7 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
     body = entry.child("TransectStyleComplexItem")
     items = body.child("Items") if body is not None else None
     if items is None or not items.elements():
-        raise entry.error(
+        raise entry.expected(
             f"a complex item with TransectStyleComplexItem.Items; this is a {complex_type!r}, for which the file has"
             " only settings and no items"
         )
@@ -223,7 +223,7 @@ def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:
 def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
     number = param.number()
     if number not in ids:
-        raise param.error("the doJumpId of an item")
+        raise param.expected("the doJumpId of an item")
     return float(ids[int(number)])
 
 
@@ -286,7 +286,7 @@ class JsonValue:
         self.name: str = name
         self.path: str = path
 
-    def error(self, expected: str) -> FileFormatError:
+    def expected(self, expected: str) -> FileFormatError:
         """Create an error that says what was expected instead of this value."""
         # Encode only the beginning of the value, because a large value would take long and is shortened anyway.
         text = "".join(islice(json.JSONEncoder().iterencode(self.value), 41))
@@ -310,15 +310,15 @@ class JsonValue:
     def members(self) -> dict[str, Any]:
         """Return the value as an object."""
         if not isinstance(self.value, dict):
-            raise self.error("an object")
+            raise self.expected("an object")
         return self.value
 
     def elements(self, *sizes: int) -> list[JsonValue]:
         """Return the elements of an array. If ``sizes`` are given, the array must have one of these lengths."""
         if not isinstance(self.value, list):
-            raise self.error("an array")
+            raise self.expected("an array")
         if sizes and len(self.value) not in sizes:
-            raise self.error(f"an array of {' or '.join(map(str, sizes))} values; it has {len(self.value)}")
+            raise self.expected(f"an array of {' or '.join(map(str, sizes))} values; it has {len(self.value)}")
         return list(self._elements())
 
     def _elements(self) -> Iterator[JsonValue]:
@@ -337,26 +337,26 @@ class JsonValue:
             elif low == 0:
                 bounds = " from 0 on"
             or_null = ", or null" if null else ""
-            raise self.error(f"a number{bounds}{or_null}")
+            raise self.expected(f"a number{bounds}{or_null}")
         return value
 
     def integer(self, low: int, high: int) -> int:
         """Return a whole number in the range. 3.0 counts as a whole number."""
         value = self.number()
         if not value.is_integer() or not low <= value <= high:
-            raise self.error(f"a whole number from {low} to {high}")
+            raise self.expected(f"a whole number from {low} to {high}")
         return int(value)
 
     def boolean(self) -> bool:
         """Return true or false."""
         if not isinstance(self.value, bool):
-            raise self.error("true or false")
+            raise self.expected("true or false")
         return self.value
 
     def one_of(self, *choices: object) -> None:
         """Raise unless the value is one of ``choices``."""
         if self.value not in choices or isinstance(self.value, bool):
-            raise self.error(" or ".join(json.dumps(choice) for choice in choices))
+            raise self.expected(" or ".join(json.dumps(choice) for choice in choices))
 
     def _as_float(self) -> float:
         # A value that is not a number becomes infinity, which every caller rejects.

@@ -144,7 +144,7 @@ class ComponentCommands:
         self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server that call the program's code. Its exceptions become results."""
+        """Register handlers that call the program's code. An exception of this code is answered as a MAV_RESULT."""
 
         def guard(handler: CommandHandler) -> CommandHandler:
             def guarded(command: ReceivedCommand) -> int | CommandProgress | None:
@@ -164,7 +164,7 @@ class ComponentCommands:
         return await result if inspect.isawaitable(result) else result
 
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Start a call like `call`: return the result if it is known at once, otherwise an awaitable for it."""
+        """Begin what `call` does, without waiting: return the result, or an awaitable for it."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
             return function(*arguments)
         return self._call_in_thread(function, *arguments)

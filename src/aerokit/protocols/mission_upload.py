@@ -302,7 +302,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
-        """Repeat the unconfirmed items that are not in flight, and send ``ahead`` more: requests may have been lost."""
+        """Call `_send` for all unconfirmed items, except those in flight, and for ``ahead`` items after them.
+
+        The vehicle's requests for these items may have been lost.
+        """
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
             # PX4 takes any repeated item for the mission's last item and confirms the upload. This confirmation does
             # not prove that PX4 has all items.

@@ -123,8 +123,8 @@ def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
     """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
 
     Bit 0 of the flags is set if the message is split, bits 1 and 2 are the fragment number, bits 3 to 7 ``sequence``. A
-    receiver considers a message complete after four fragments, or after a fragment that is not full. If a message has
-    fewer than four fragments and the last one is full, an empty fragment follows.
+    receiver considers a split message complete after four fragments, or after a fragment that is not full. If a split
+    message has fewer than four fragments and the last one is full, an empty fragment follows.
     """
     from aerokit.mavlink.messages import GpsRtcmData
 

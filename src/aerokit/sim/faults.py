@@ -84,15 +84,18 @@ class Faults:
     def refuse(
         self, command: int, result: int = MavResult.DENIED, text: str | None = None, *, times: int | None = None
     ) -> None:
-        """Do not execute a MAV_CMD, but answer with this MAV_RESULT and an optional status text."""
+        """Answer the next ``times`` commands of this MAV_CMD (None: all) with a MAV_RESULT, without executing them.
+
+        ``text`` is sent as a status text before the answer.
+        """
         self.commands[command] = CommandFault(times, refuse_with=result, text=text)
 
     def ignore(self, command: int, *, times: int | None = None) -> None:
-        """Neither execute nor acknowledge a MAV_CMD."""
+        """Neither execute nor acknowledge the next ``times`` commands of this MAV_CMD. None: all."""
         self.commands[command] = CommandFault(times, ignore=True)
 
     def lose_ack(self, command: int, *, times: int | None = 1) -> None:
-        """Execute a MAV_CMD, but lose its acknowledgement."""
+        """Execute the next ``times`` commands of this MAV_CMD (None: all), but lose their acknowledgements."""
         self.commands[command] = CommandFault(times, acks=0)
 
     def lose(self, message_type: type[Message], *, times: int = 1) -> None:

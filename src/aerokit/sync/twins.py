@@ -3337,7 +3337,8 @@ class Camera(TwinOf["AsyncCamera"]):
 
         Raises:
             CommandRejected: the camera refused to identify itself.
-            OperationTimeout: no camera was found, or the camera did not identify itself. PX4's trigger never does.
+            OperationTimeout: no camera was found, or the camera did not identify itself. PX4's camera trigger never
+                identifies itself.
         """
         return self._loop.run(self.aio.wait_found, timeout=timeout)
 

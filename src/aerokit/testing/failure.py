@@ -79,16 +79,16 @@ def _write_picture(flights: Sequence[Flight | ServedFlight], test: str, director
 
 
 def _write_recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
-    """Save a recording of each link and a report on each vehicle. Return the lines about these files."""
+    """Save each recording, and a report on each vehicle that has a recording. Return the lines about these files."""
     # The vehicles of a fleet share one recording.
     by_recording: dict[int, list[Flight | ServedFlight]] = {}
     for flight in flights:
-        by_recording.setdefault(id(flight.recording), []).append(flight)
+        if flight.recording is not None:
+            by_recording.setdefault(id(flight.recording), []).append(flight)
     lines: list[str] = []
     for number, group in enumerate(by_recording.values()):
         recording = group[0].recording
-        if recording is None:
-            continue
+        assert recording is not None
         is_first = number == 0  # Only further recordings have a number in their names.
         path = _path(test, directory, ".tlog" if is_first else f"-{number + 1}.tlog")
         try:
@@ -96,7 +96,7 @@ def _write_recordings(flights: Sequence[Flight | ServedFlight], test: str, direc
             lines.append(f"recording in {path}")
             lines += [_write_report(path, flight, shares_recording=len(group) > 1) for flight in group]
         except Exception as error:  # For example, the recording is empty or the disk is full.
-            lines.append(f"no report: {error}")
+            lines.append(f"no recording or report: {error}")
     return lines
 
 

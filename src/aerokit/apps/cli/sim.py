@@ -90,8 +90,9 @@ def simulated_fleet(
 ) -> list[SimulatedVehicle]:
     """Create ``count`` vehicles with consecutive system ids and seeds, in a row eastwards from ``home``.
 
-    The default home is `aerokit.sim.HOME`. ``components`` makes the components of one vehicle. If ``name`` is a .tlog
-    file, the result is the single vehicle of that recording; other options do not apply.
+    The default home is `aerokit.sim.HOME`. ``components`` makes the components of one vehicle. ``name`` is the kind of
+    vehicle, or the path of a .tlog file. A recording has one vehicle: ``count`` must be 1, and the other arguments are
+    ignored.
     """
     from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 
@@ -374,7 +375,7 @@ def _client_address(address: str, argument: str) -> str:
 
 def _zenoh_options(address: str) -> str:
     """Return the query part of the zenoh address with which a client connects to the simulator."""
-    parsed = parse_address(expand_address(address, 0, 1))
+    parsed = parse_address(expand_address(address, number=0, system_id=1))
     endpoints = parsed.option("listen") or parsed.option("connect")
     config = parsed.option("config")
     options = []

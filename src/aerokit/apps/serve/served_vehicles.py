@@ -118,7 +118,7 @@ class ServedVehicles:
         return [(position.latitude_deg, position.longitude_deg, is_after_gap) for position, is_after_gap in points]
 
     def snapshot(self) -> str:
-        """Return the message ``state`` of the stream as JSON: all vehicles, at most `SNAPSHOT_MAX_AGE_S` ago."""
+        """Return the stream's message ``state`` with all vehicles as JSON. It is at most `SNAPSHOT_MAX_AGE_S` old."""
         now = asyncio.get_running_loop().time()
         if now - self._snapshot_at > SNAPSHOT_MAX_AGE_S:
             vehicles = [self._state_of(vehicle) for vehicle in self.vehicles.values()]

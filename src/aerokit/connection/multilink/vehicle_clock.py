@@ -40,11 +40,12 @@ class VehicleClock:
         A clock that was paused for a moment counts as continuing, although it is late.
         """
         continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
-        self.is_steady = continues and self._fits(at, vehicle_s, round_trip_s) is not False
+        is_unexpected = self._fits(at, vehicle_s, round_trip_s) is False  # None: the speed is not known yet
+        self.is_steady = continues and not is_unexpected
         if not self.is_steady:
             if (speed := self._measured_speed) is not None:
                 self._previous_speed = speed, at
-            self._samples.clear()  # The pause would make the clock rate measured over older samples too small.
+            self._samples.clear()  # A speed that is measured across a pause or reboot would be wrong.
         self._samples.append((at, vehicle_s))
         return continues
 

@@ -166,7 +166,8 @@ def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
         return [value.split(b"\0", 1)[0].decode("utf-8", "replace") for value in values]
     if scale is None:
         return list(values)
-    if 0 < scale < 1:  # Dividing by 100 is more exact than multiplying by 0.01.
+    # Scales below 1 are powers of ten (MULT records). Dividing by 100 is more exact than multiplying by 0.01.
+    if 0 < scale < 1:
         divisor = round(1 / scale)
         return [value / divisor for value in values]
     return [value * scale for value in values]

@@ -28,7 +28,7 @@ _HIGH_THROTTLE_PERCENT, _HIGH_ATTITUDE_ERROR_DEG = 90.0, 20.0
 # If the throttle or current in a descent is below this share of its value before the descent, the motors have less
 # power than a controlled descent needs.
 _LOW_POWER_SHARE = 0.5
-_STOPPED = ", so look at what stopped the motors: ESCs, their supply, a command"
+_STOPPED_MOTORS_ADVICE = ", so look at what stopped the motors: ESCs, their supply, a command"
 # If the pulse of an output is _MOTOR_RAISED_US longer in flight than before arming, the output drives a motor. If the
 # motors' pulses in a descent differ by _UNEQUAL_US, the autopilot tried to lift one side.
 _MOTOR_RAISED_US, _UNEQUAL_US = 200.0, 300.0
@@ -225,21 +225,22 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
     throttle = _descent_values(flight.air, "throttle_percent", begin_s, end_s)
     if throttle is not None:
         advice = ", so look at motors, propellers and battery" if throttle.maximum >= _HIGH_THROTTLE_PERCENT else ""
-        if throttle.is_low and not any(current.is_low for current in currents.values()):
-            advice = _STOPPED
+        is_current_low = any(current.is_low for current in currents.values())
+        if throttle.is_low and not is_current_low:  # A low current gets the same advice below.
+            advice = _STOPPED_MOTORS_ADVICE
         texts.append(f"throttle {throttle.text('%')}{advice}")
     tilt = _max([abs(angle) for name in angles for angle in flight.attitude.between(name, begin_s, end_s)])
     if tilt is not None:
         texts.append(f"tilt up to {tilt:.0f}°")
-    error = _max([abs(error) for name in angles for error in _attitude_errors(flight, name, begin_s, end_s)])
-    if error is not None:
-        advice = ", so look at the attitude charts" if error >= _HIGH_ATTITUDE_ERROR_DEG else ""
-        texts.append(f"attitude up to {error:.0f}° off its set-point{advice}")
+    max_error = _max([abs(error) for name in angles for error in _attitude_errors(flight, name, begin_s, end_s)])
+    if max_error is not None:
+        advice = ", so look at the attitude charts" if max_error >= _HIGH_ATTITUDE_ERROR_DEG else ""
+        texts.append(f"attitude up to {max_error:.0f}° off its set-point{advice}")
     motors = _motor_outputs(flight, begin_s, end_s)
     if motors:
         texts.append(motors)
     for name, current in currents.items():
-        advice = _STOPPED if current.is_low else ""
+        advice = _STOPPED_MOTORS_ADVICE if current.is_low else ""
         texts.append(f"{name} {current.text('A')}{advice}")
     return texts
 

@@ -259,7 +259,7 @@ class MissionRun:
                 self._running_nav = command.item
                 self._state = MissionState.NOT_STARTED
                 return True
-            # Store the first "do" command before the navigation command, because the mission resumes there.
+            # Remember the first of the "do" commands that precede the navigation command: the mission resumes at it.
             if self._running_do is None:
                 self._running_do = command
                 self._last_do_index = command.seq

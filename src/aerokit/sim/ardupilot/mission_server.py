@@ -73,7 +73,8 @@ class ArduPilotMissionServer(MissionServer):
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
         """Store a list of items, as the upload of a file does, and return the MAV_MISSION_RESULT.
 
-        Only a mission can be replaced from the index ``start`` on, or keep its other items (``clear`` is False).
+        ``start`` is the index of the first item in a mission; other lists are replaced as a whole. Without ``clear``, a
+        mission keeps its other items; for other lists, the result is ERROR.
         """
         if mission_type == MavMissionType.MISSION:
             if clear:

@@ -190,7 +190,7 @@ class SubGuided(_Mode):
         self._heading = wrap_pi(heading)
 
     def update(self, dt: float) -> None:
-        """Move to the place or with the velocity that was commanded last; otherwise stop."""
+        """Follow the last command: move to its place, or with its velocity. Without a valid command, stop."""
         motion, target = self.vehicle.motion, self._target
         if target is not None and self.vehicle.now - self._target_at > target.timeout_s:
             target = None  # An expired target stops the vehicle.

@@ -198,13 +198,14 @@ class Px4Arming:
         return modes.MODES[mode].can_arm and self._px4.can_run(mode)
 
     def arm(self, by: str = "external command") -> bool:
-        """Arm and return True. If a check fails, report the failure and return False."""
+        """Arm and return True. If a check fails, report the failure (except while booting) and return False."""
         px4 = self._px4
         if px4.is_armed:
             return True
-        has_simulated_failures = bool(px4.faults.prearm_failures)
-        if not px4.is_ready and not has_simulated_failures:
-            return False  # During the boot, PX4 refuses without a text.
+        # Simulated failures also make `is_ready` False.
+        is_booting = not px4.is_ready and not px4.faults.prearm_failures
+        if is_booting:  # PX4 refuses without a text.
+            return False
         if self._calibration.is_running:
             px4.send_text(MavSeverity.CRITICAL, "Arming denied: calibrating")
             return False

@@ -63,7 +63,7 @@ class CalibrationRun:
         self._cannot_cancel_reason = ""  # why the calibration cannot be cancelled, for the user; empty if it can be
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
-        # The arbiter keeps the order to cancel, and its command, until this stack is closed.
+        # Holds the order that cancels the calibration. The arbiter keeps this order until the stack is closed.
         self._cancel_order_stack = ExitStack()
         self._sent_cancel: SentCommand | None = None
         self._has_rebooted = False

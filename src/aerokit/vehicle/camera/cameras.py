@@ -64,7 +64,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
 
         Raises:
             CommandRejected: the camera refused to identify itself.
-            OperationTimeout: no camera was found, or the camera did not identify itself. PX4's trigger never does.
+            OperationTimeout: no camera was found, or the camera did not identify itself. PX4's camera trigger never
+                identifies itself.
         """
         information: CameraInformation | None = None
         with anyio.move_on_after(timeout):

@@ -158,11 +158,12 @@ class FlightCleanup:
     def hold_in_background(self, order: Order) -> bool:
         """Hold after an order was abandoned, without waiting. For use at the ends of blocks and in cancelled calls.
 
-        If the last HEARTBEAT is recent, one command is sent at once. Otherwise it is sent after the next HEARTBEAT,
-        unless a failsafe or a pilot has taken over by then. A background task waits for the confirmation while the
-        connection is open. Nothing is sent if the order has ended, if the vehicle is disarmed, or if another party
-        flies the vehicle and no command of the order was sent. Returns True if the command was sent, or may be sent
-        later.
+        Return False if nothing is sent: the order cannot have moved the vehicle, no hold can be sent, the vehicle is
+        disarmed, or the order has ended, for example because a pilot took over.
+
+        Otherwise return True. If the last HEARTBEAT is recent, one command is sent at once. If not, it is sent after
+        the next HEARTBEAT, unless a failsafe or a pilot has taken over by then. A background task waits for the
+        confirmation while the connection is open.
         """
         if not order.may_move:
             return False
@@ -375,8 +376,10 @@ class ArmCleanup:
         """
         if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
             return False
+        # This method is called when a HEARTBEAT has reported armed.
         armed_after_s = self._session.telemetry.armed.updated_at - order.given_at
-        if not order.end and armed_after_s <= ARM_HEARTBEAT_DELAY_S:
+        was_taken_over = bool(order.end)
+        if not was_taken_over and armed_after_s <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)

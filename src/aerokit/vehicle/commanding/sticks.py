@@ -92,7 +92,7 @@ class StickStream(SteeringStream[StickInput]):
         super().__init__(context, self._message_of, initial or StickInput(), rate_hz, valid_for_s, max_lag_s)
         self._rules = context.session.autopilot.sticks
         self._probe = probe
-        # True while the vehicle may execute stick positions that were not released yet.
+        # True from the first stick position sent until the sticks are released.
         self._has_sent = False
         telemetry = context.session.telemetry
         self._chosen_mode = None if mode is None else self._session.autopilot.find_mode(mode, telemetry.mode_names)

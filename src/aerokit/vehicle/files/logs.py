@@ -305,7 +305,9 @@ class Logs:
                 logs = await request_list(idle_timeout_s, only_id, max_unanswered=MAX_UNANSWERED_REQUESTS)
             except FileTimeout:
                 logs = await listed_logs(self._files, autopilot.log_directories, idle_timeout_s)
-                max_unanswered = None  # If `logs` is None, there are logs but no list file, so PX4 must answer.
+                # If `logs` is None, there are logs but no list file. PX4 then answers sooner or later, so the number of
+                # unanswered requests is not limited.
+                max_unanswered = None
         if logs is None:
             logs = await request_list(idle_timeout_s, only_id, max_unanswered=max_unanswered)
         return tuple(_entry_of(log) for log in logs if log.size)

@@ -130,10 +130,9 @@ class ComponentSubscriber:
 
     def _new_cell(self, message_type: type[Message]) -> StateCell[Any]:
         """Return a cell that is updated by each message of this type, with the time of its arrival."""
-        arrived_at = math.nan  # Time of the message in the cell. `store` sets it right before the message.
-        cell: StateCell[Any] = StateCell(
-            message_type.NAME, self._connection.now, message_type.NAME, stamp=lambda: arrived_at
-        )
+        arrived_at = math.nan  # Time of the message in the cell. `store` sets this variable first, and then the cell.
+        name = message_type.NAME
+        cell: StateCell[Any] = StateCell(name, self._connection.now, waits_for=name, stamp=lambda: arrived_at)
         source = Source(self._system_id, self._component_id, message_type.NAME)
 
         def store(message: Message) -> None:

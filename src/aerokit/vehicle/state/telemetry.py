@@ -182,7 +182,10 @@ class Telemetry(States):
         return Source(self.system_id, self.component_id, message_type(class_name).NAME)
 
     def _receiver(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
-        """Return a function that passes only the messages of the vehicle's autopilot to ``handler``."""
+        """Return a function that passes the messages of the vehicle's autopilot to ``handler``, and no others.
+
+        A message without a frame was not received from a link, but given by a program or a log; it is passed, too.
+        """
         source = self._source(class_name)
 
         def on_message(message: Message) -> None:
