@@ -118,6 +118,6 @@ PX4_EXTERNAL = ExternalRules(
     has_mocap=False,  # EKF2.hpp subscribes only to vehicle_visual_odometry.
     has_vision_speed=False,
     flow_in_radians=True,
-    constant_position_at_rest=True,  # Measured in flight. ArduPilot sets the flag only if no sensor supplies positions.
+    constant_position_at_rest=True,  # PX4 sets CONST_POS_MODE at rest, ArduPilot only if no sensor supplies positions.
     target_is_local=True,  # mavlink_receiver.cpp, handle_message_landing_target refuses positions in other frames.
 )

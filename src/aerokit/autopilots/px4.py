@@ -121,8 +121,8 @@ class Px4(Autopilot):
     prearm_depends_on_mode = True
     # Commander.cpp repeats the failing checks as texts (measured with 1.17 in simulation).
     runs_prearm_checks = True
-    # Modes that need an RC receiver (mode_requirements.cpp). The receiver's health bit is about these modes, whatever
-    # the present mode is (modeCheck.cpp).
+    # Modes that need an RC receiver (mode_requirements.cpp). The receiver's health bit says whether these modes can be
+    # used, even if another mode is active (modeCheck.cpp).
     modes_with_rc: frozenset[str] | None = frozenset(
         ("MANUAL", "ALTCTL", "POSCTL", "POSITION_SLOW", "ALTITUDE_CRUISE", "ACRO", "STABILIZED", "RATTITUDE", "SIMPLE")
     )

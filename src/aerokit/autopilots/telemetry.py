@@ -133,7 +133,7 @@ _ALSO_STREAMED = (
     "WheelDistance",
 )  # fmt: skip
 
-# Class names of messages that any autopilot sends as a stream. Other messages are sent when needed.
+# Class names of messages that at least one autopilot sends as a stream. Other messages are sent when needed.
 STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
 
 # Lowest type byte that counts as each FIRMWARE_VERSION_TYPE, and the suffix of its version texts.

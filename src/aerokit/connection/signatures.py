@@ -144,7 +144,7 @@ class SignatureGate:
 
 
 def _has_key(frame: Frame) -> bool:
-    from aerokit.mavlink.signing import is_signed_with_a_key  # This module imports hashlib, which few programs need.
+    from aerokit.mavlink.signing import is_signed_with_a_key  # imports hashlib, which few programs need
 
     return is_signed_with_a_key(frame)
 

@@ -159,7 +159,7 @@ class ChannelsOverride(_ChannelDict):
         self.count = MIN_CHANNELS
         """Number of channels that can be overridden."""
         self._released: set[str] = set()  # channels above 8 in this set are released again with every message
-        self._changing = threading.RLock()  # held from the check of a change to its message
+        self._changing = threading.RLock()  # held while a change is checked and its message is sent
 
     def __setitem__(self, channel: str | int, value: float | None) -> None:
         self._change({channel: value})

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from aerokit.transport.link import Peer
 
 MAX_MESSAGES = 1000
-MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program that reads rarely gets recent ones.
+MESSAGE_MAX_AGE_S = 5.0  # Older messages are dropped, so that a program with long pauses between reads gets new ones.
 # Messages are stored from the first access on. Until this long after the first access, a look-up waits for its message.
 FIRST_LOOKUP_TIMEOUT_S = 1.0
 SIGNAL_CHECK_INTERVAL_S = 0.2  # Ctrl-C and a closed connection end a wait after this time.

@@ -321,8 +321,8 @@ class FleetAction:
         )
 
     def _hold_finished_members(self) -> None:
-        # Only members that have finished the action get an order to hold. The others still execute the action, and its
-        # cancellation makes them hold.
+        # Members that have finished the action get an order to hold. Members that still execute it hold because it is
+        # cancelled. Failed and stopped members get no order.
         for member in self._members:
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
             if has_finished and member.is_flown_by_program:

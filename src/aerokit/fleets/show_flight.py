@@ -48,7 +48,7 @@ __all__ = [
 # Speed of the correction towards the track, per metre of deviation, in 1/s.
 TRACK_GAIN = 0.8
 
-# The speed limit is the larger of CATCH_UP_M_S and CATCH_UP_FACTOR times the track's speed, plus CATCH_UP_M_S.
+# The speed limit is max(CATCH_UP_M_S, CATCH_UP_FACTOR * speed of the track) + CATCH_UP_M_S.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _MIN_VALUE, _MAX_VALUE = -(1 << 63), (1 << 64) - 1
 
-# Names of attributes that message classes already have. A field with one of these names gets a trailing
+# Names that message classes or their generated code already use. A field with one of these names gets a trailing
 # underscore. Only private dialects have such fields.
 _RESERVED = frozenset(
     (

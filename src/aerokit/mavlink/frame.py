@@ -41,7 +41,7 @@ class Frame(FrameFields):
     """System id of the sender, 0..255 (0 is invalid)."""
     component_id: int
     """Component id of the sender, 0..255."""
-    _raw: bytes  # set only if `raw` cannot be computed from the rest: for MAVLink 1, signed frames and parsed frames
+    _raw: bytes  # set only if `raw` cannot be computed: for MAVLink 1, signed frames and frames of `Frame.parse`
     received_at: float
     """Time in seconds that was passed to the framer with the data."""
 

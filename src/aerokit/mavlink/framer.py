@@ -41,7 +41,7 @@ _find_magics = re.compile(rb"\xfe|\xfd(?=\Z|.\Z|.[\x00\x01])", re.DOTALL).findit
 # Verdicts about a position in the data.
 _GOOD = 0  # a whole frame with a valid checksum
 _WAIT = 1  # the beginning of a plausible frame
-_IMPLAUSIBLE = 2  # the beginning of an unlikely frame: wait for the rest, but also examine the bytes that follow
+_IMPLAUSIBLE = 2  # the beginning of an unlikely frame: wait for its rest, but also look for frames that begin inside it
 _UNKNOWN = 3  # looks like a whole frame of an unknown message
 _BAD_CRC = 4
 _NOISE = 5

@@ -53,7 +53,7 @@ class SourceStatistics(SourceFields):
         "system_id",
     )
 
-    _late_run: int  # number of repeated frames so far whose numbers follow each other
+    _late_run: int  # length of the current run of repeated frames with consecutive sequence numbers
     # The following are set when a second stream with the same ids begins.
     _other_count: int  # number of frames of the second stream
     _other_at: float

@@ -278,7 +278,7 @@ def _different_fields(
 
 
 def _drops_autocontinue(actual: MissionItem, storage: ItemStorage) -> bool:
-    # ArduPilot reports True for items of missions, False for items of fences and rally points.
+    # ArduPilot reports autocontinue as 1 for all mission items, and as 0 for all fence and rally items.
     if actual.command in FENCE_COMMANDS | RALLY_COMMANDS:
         return True
     return storage in (ItemStorage.ARDUPILOT, ItemStorage.ANY) and actual.autocontinue

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aerokit.protocols.exchange import RoundTrip
 
-# Answers arrive in the order of the requests. A request counts as lost if the answered request was sent this many
-# transmissions after it.
+# Answers arrive in the order of the requests. A request counts as lost once a request that was sent this many
+# transmissions later has been answered.
 OVERTAKEN = 3
 
 # Number of requests that are sent at once. ArduPilot queues at most five, processes one every 2 ms, and drops the rest.

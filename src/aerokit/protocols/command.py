@@ -87,7 +87,7 @@ FLOAT32_MAX = 3.4028234663852886e38
 
 ATTEMPT_TIMEOUT_S = 1.0
 
-# An order is sent again only after a new HEARTBEAT. While it waits for the HEARTBEAT, it checks at this interval.
+# An order is sent again only after a new HEARTBEAT. The exchange checks at this interval whether one has arrived.
 POLL_INTERVAL_S = 0.05
 
 MAX_HEARTBEAT_AGE_S = 2.5

@@ -47,8 +47,8 @@ BUSY_RETRY_INTERVAL_S = 1.0
 # attempts, and then grows again.
 GROWING_ATTEMPTS, CONSTANT_ATTEMPTS = 5, 7
 
-# After this many seconds without messages, the vehicle may have dropped the transfer. PX4 drops it after 5 s, ArduPilot
-# after 8 s.
+# PX4 drops a transfer after 5 s without messages, ArduPilot after 8 s. After this slightly shorter time, we treat it as
+# dropped.
 TRANSFER_EXPIRY_S = 4.5
 
 NAMES: dict[int, str] = {

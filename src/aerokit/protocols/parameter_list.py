@@ -41,8 +41,8 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
 # Maximum seconds between two parts of a list. ArduPilot sends parts ten times a second, or once a second (MAV1_PARAMS).
 MAX_TICK_S = 1.1
 
-# Once at most this many values are missing, they are requested at once rather than after the rest of the list, because
-# a few repeated values cost little.
+# Once at most this many values are missing, they are requested immediately, without waiting for the end of the stream.
+# A few values may then arrive twice, which costs little.
 NEAR_END = 20
 
 # The list's stream counts as started once it has sent this many values. The list is then not requested again.

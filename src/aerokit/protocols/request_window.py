@@ -25,8 +25,8 @@ FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
 FEW_LEFT_TIMEOUT_S = 0.5
 # Maximum seconds to wait for an answer. A queue that delayed the answers may be empty by then.
 MAX_TIMEOUT_S = 2.0
-# Answers arrive in the order of the requests. A request counts as lost if the answered request was sent this many
-# transmissions after it.
+# Answers arrive in the order of the requests. A request counts as lost once a request that was sent this many
+# transmissions later has been answered.
 OVERTAKEN = 3
 
 

@@ -136,7 +136,7 @@ FILES = {name: Path(__file__).with_name(f"{name}.py") for name in ("twins", "fle
 
 FILE = FILES["twins"]
 
-# Base classes of twins that are generic in the asynchronous class.
+# Base classes of twins whose type parameter is the asynchronous class, such as ``TwinOf[Vehicle]``.
 GENERIC_BASES = ("TwinOf", "BlockTwin", "SelectionTwin")
 
 # Maps each generated file (page) to the asynchronous functions that open a context, such as ``connect``.
@@ -182,7 +182,9 @@ class Page:
     for_types: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self._import_sources: dict[str, tuple[str, str]] = {}  # imported name → (module, name in this module)
+        self._import_sources: dict[
+            str, tuple[str, str]
+        ] = {}  # imported name → (source module, name in the source module)
         self._twins = {twin.name for twin in TWINS}
         self._page_of_other_twins = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 _MARKER = "simulated"
 _PICTURES_OPTION = "--flight-pictures"
-# Name of an attribute of a test function that pytest-asyncio will run. The value of the attribute is a version of the
-# test that opens the flights.
+# Attribute of a test function that pytest-asyncio runs. It holds a function that opens the flights and calls the test.
 _OPENING_TEST = "_aerokit_opening_test"
 # The plugin compares names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")

@@ -195,7 +195,7 @@ class _SerialProtocol(asyncio.Protocol):
             with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._link._loop.call_soon(self._link._outbox.resume)
 
-    # The replaced methods report their errors themselves. This method is called for all other errors.
+    # Our replacements of the transport's methods report their errors themselves. This method gets all other errors.
     def connection_lost(self, exc: Exception | None) -> None:
         self._link._lose(f"the device failed: {exc}", exc)
 

@@ -65,7 +65,7 @@ class SupervisedFlight(ABC):
     It never commands a vehicle that was armed before the flight, or that another party has put into another mode.
     """
 
-    _prints_reasons = True  # False if the command prints the error with its reasons when it ends
+    _prints_reasons = True  # False if the reasons are part of the error that the command prints at its end
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
         self._vehicle = vehicle

@@ -131,7 +131,7 @@ _BITS = {
         "ESTIMATOR_STATUS": EstimatorStatusFlags,
     }.items()
 }
-# With wait=false, the response is sent after this time. If the library refuses the order sooner, it has the reason.
+# With wait=false, the response is sent after this time, or sooner with the reason if the order is refused.
 _REFUSAL_TIMEOUT_S = 0.2
 
 

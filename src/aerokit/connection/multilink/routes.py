@@ -115,7 +115,7 @@ COMMANDS = frozenset(
     )
 )  # fmt: skip
 
-# Broadcasts that a vehicle may receive several times without effect. They go to every peer on every link.
+# Broadcasts that do no harm if a vehicle receives them several times. They go to every peer on every link.
 BROADCASTS = frozenset(message_type.ID for message_type in (m.Heartbeat, m.Timesync, m.Ping))
 
 

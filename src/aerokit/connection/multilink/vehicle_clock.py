@@ -16,7 +16,8 @@ MAX_SAMPLES = 20
 MIN_TOLERANCE_S = 0.1
 MAX_SPEED_ERROR = 0.02  # Simulations do not keep their nominal speed exactly.
 MAX_DRIFT_S = 0.5  # Without this limit, any clock would match after a long enough silence.
-# A measured clock rate of 1 ± this value counts as 1. Otherwise its error would grow with the length of a silence.
+# A measured clock rate of 1 ± this value counts as 1. Otherwise the error of the rate would add up to a large error of
+# the clock during a long silence.
 REAL_TIME_TOLERANCE = 0.05
 MIN_SPAN_S = 1.0
 MAX_SPEED = 200.0  # maximum speed of a simulation, relative to real time
@@ -32,7 +33,9 @@ class VehicleClock:
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
         """True if the last sample was as expected from the speed; False after a pause or reboot."""
-        self._previous_speed: tuple[float, float] | None = None  # clock rate before the last pause or reboot, and when
+        self._previous_speed: tuple[float, float] | None = (
+            None  # clock rate before the last pause or reboot, and our time then
+        )
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.

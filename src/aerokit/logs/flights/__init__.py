@@ -54,7 +54,7 @@ LOG_READERS: dict[str, Callable[[FlightLog, int | None, Callable[[int], object]]
 """Maps the suffix of a log to the function that reads it."""
 # A vehicle less than `_FLYING_HEIGHT_M` above home may be on the ground. A sink rate below `_SINKING_M_S` is noise.
 _FLYING_HEIGHT_M, _SINKING_M_S = 1.0, 0.3
-_SAME_ALTITUDE_M = 5.0  # maximum difference of two logged altitudes that are the same value
+_SAME_ALTITUDE_M = 5.0  # Two logged altitudes that differ by at most this count as the same altitude.
 
 
 def check_log_name(path: Path) -> None:

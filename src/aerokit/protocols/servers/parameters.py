@@ -38,7 +38,7 @@ class ParameterLists:
         self._host = host
         self._listed = parameters
         self._lists: dict[Channel, int] = {}  # channel → number of the list that is being sent on it
-        self._list_number = 0  # Each list gets a new number, by which a restarted list ends the earlier one.
+        self._list_number = 0  # number of the latest list; a list ends early if its channel has a newer number
 
     @property
     def running_lists(self) -> int:

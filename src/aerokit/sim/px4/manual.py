@@ -111,7 +111,7 @@ class Px4ManualFlight:
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
         self._place: tuple[float, float] | None = None  # place to hold; None while the vehicle moves
-        self._down: float | None = None  # height to hold; None while the vehicle moves vertically
+        self._down: float | None = None  # down coordinate to hold; None while the vehicle moves vertically
         self._turn_rate_rad_s = px4.motion.limits.turn_rate_rad_s
 
     def enter(self) -> None:

@@ -68,7 +68,7 @@ class CalibrationStep(Snapshot):
     result: CalibrationResult | None = None
 
 
-# PX4's name is the side that points down, except for "up" and "down" (calibration_routines.cpp,
+# PX4 names the side that points down: "down" is the bottom, "up" the top, "back" the tail (calibration_routines.cpp,
 # detect_orientation_str).
 SIDES = {
     "back": CalibrationPose.NOSE_UP,

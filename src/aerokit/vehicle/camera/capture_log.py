@@ -36,7 +36,7 @@ DUPLICATE_WINDOW_S = 10.0
 # If a status has a lower time stamp than the newest one, it arrived late. If it is lower by this many milliseconds or
 # more, the camera has restarted instead.
 REORDER_WINDOW_MS = 5000
-# If an index exceeds the reported count by more than this, the camera does not count as the standard says.
+# If an index exceeds the reported count by more than this, the camera's numbering does not follow the standard.
 MAX_COUNT_LEAD = 100
 # If an index is higher than the highest one by more than this, it counts as corrupt until the next picture confirms it.
 MAX_INDEX_GAP = 1000

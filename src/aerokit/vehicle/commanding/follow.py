@@ -32,7 +32,7 @@ __all__ = ["FollowStream"]
 
 # The rate of set-points in Hz, and the delay of the event loop in seconds above which the stream stops.
 RATE_HZ, MAX_LAG_S = 10.0, 1.0
-# The vehicle can be ordered to keep at most this distance from the target, and at most this height above or below it.
+# Largest distance from the target, and largest height above or below it, at which the vehicle can be ordered to follow.
 MAX_DISTANCE_M = 1000.0
 MIN_COURSE_SPEED_M_S = 0.5
 """Minimum ground speed at which the course of the target is used."""

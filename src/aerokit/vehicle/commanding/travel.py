@@ -104,7 +104,7 @@ class TravelActions(VehicleBase):
                 # ArduPilot applies the speed only once the vehicle is on its way.
                 change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
                 await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, *change)
-            if heading_deg is not None and math.isnan(yaw):  # MAV_CMD_DO_REPOSITION cannot set the heading.
+            if heading_deg is not None and math.isnan(yaw):  # On this autopilot, MAV_CMD_DO_REPOSITION does not set it.
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             with self._flight_cleanup.flying(order):
                 await self._await_arrival(

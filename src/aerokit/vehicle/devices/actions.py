@@ -30,7 +30,7 @@ FailureKind = Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed
 Severity = Literal["emergency", "alert", "critical", "error", "warning", "notice", "info", "debug"]
 # fmt: on
 FailureIntent = Literal["inject failure"]
-# The part after the prefix is the name: FAILURE_UNIT_SENSOR_GYRO becomes "gyro".
+# The name without its first word: SENSOR_GYRO becomes "gyro".
 UNITS: dict[str, FailureUnit] = {unit.name.partition("_")[2].lower(): unit for unit in FailureUnit}
 INJECT_FAILURE = SimpleOrder(
     "inject_failure",

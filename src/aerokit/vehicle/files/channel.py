@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# The vehicle may close a file at any time. A transfer then opens it again, up to this many times in total.
+# The vehicle may close a file at any time. A transfer opens it at most this many times, including the first time.
 MAX_OPEN_ATTEMPTS = 3
 # Error codes with which vehicles refuse to open a file while another file is open.
 SESSION_IN_USE = (MavFtpErr.FAIL, MavFtpErr.INVALIDSESSION, MavFtpErr.NOSESSIONSAVAILABLE)

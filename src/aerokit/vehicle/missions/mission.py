@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["MissionControl"]
 
 MAX_ITEM = 0xFFFF - 1
-# Maps each last item with which a mission ends by landing to the purpose of the mode in which the vehicle may land.
+# Maps each last item that lands the vehicle to the purpose of the mode that the vehicle may use for this landing.
 LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
     MavCmd.NAV_RETURN_TO_LAUNCH: "return",
     MavCmd.NAV_LAND: "land",

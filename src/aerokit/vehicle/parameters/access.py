@@ -42,8 +42,8 @@ DEFAULT_INTERVAL = 0
 ECHO_WINDOW_S = 3.0
 # ArduPilot answers this many reads at once. Further reads wait until it handles parameters again.
 MAX_READS_UNBOOSTED = 5
-# If reading a few parameters takes longer than this many seconds, the vehicle probably lacks one of them. The missing
-# one is then requested several times, so ArduPilot's rate of answers is raised.
+# If reading a few parameters takes longer than this many seconds, the vehicle probably lacks one of them. ArduPilot's
+# rate of answers is then raised, so that the repeated requests for the missing one take less time.
 BOOST_DELAY_S = 0.5
 # Fewer changes than this are set one by one, which is as fast as a file. The vehicle then confirms each value.
 MIN_PACK_SIZE = 10
