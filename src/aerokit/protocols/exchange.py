@@ -323,9 +323,7 @@ class StaleAnswerFilter:
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
-        self._early_requests: dict[
-            str, set[float]
-        ] = {}  # by name: send times of the requests whose answers came too early
+        self._early_requests: dict[str, set[float]] = {}  # by name: send times of requests answered too early
 
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
         """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``."""

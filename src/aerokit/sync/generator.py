@@ -182,9 +182,7 @@ class Page:
     for_types: set[tuple[str, str]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self._import_sources: dict[
-            str, tuple[str, str]
-        ] = {}  # imported name → (source module, name in the source module)
+        self._import_sources: dict[str, tuple[str, str]] = {}  # imported name → (source module, name in it)
         self._twins = {twin.name for twin in TWINS}
         self._page_of_other_twins = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 

@@ -33,9 +33,8 @@ class VehicleClock:
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
         """True if the last sample was as expected from the speed; False after a pause or reboot."""
-        self._previous_speed: tuple[float, float] | None = (
-            None  # clock rate before the last pause or reboot, and our time then
-        )
+        # Clock rate before the last pause or reboot, and our time then.
+        self._previous_speed: tuple[float, float] | None = None
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
