@@ -156,20 +156,15 @@ def test_folder_has_table_per_message_type(tmp_path: Path, kind: str) -> None:
 
 def test_csv_cells_of_rare_values(tmp_path: Path) -> None:
     table = CsvTable(tmp_path / "values.csv", [])
-    for values in ((1, math.inf), (math.inf, -math.inf), (2, math.nan), (None, 3), ("=1+1", 4), ("a\r\nb", math.nan)):
+    for values in ((None, 3), ("=1+1", 4), ("a\r\nb", math.nan)):
         table.add(0.0, values)
+    for add in (table.add, table.add_numbers):
+        for numbers in ((1, math.inf), (math.inf, -math.inf), (2, math.nan), (-0.0, 0.1)):
+            add(0.0, numbers)
     table.close()
     time = "1970-01-01T00:00:00.000000+00:00"
-    rows = [
-        "",
-        f"{time},1,inf",
-        f"{time},inf,-inf",
-        f"{time},2,",
-        f"{time},,3",
-        f"{time},'=1+1,4",
-        f'{time},"a\r\nb",',
-        "",
-    ]
+    of_numbers = [f"{time},{row}" for row in ("1,inf", "inf,-inf", "2,", "-0.0,0.1")]
+    rows = ["", f"{time},,3", f"{time},'=1+1,4", f'{time},"a\r\nb",', *of_numbers, *of_numbers, ""]
     assert (tmp_path / "values.csv").read_bytes().decode() == "\n".join(rows)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections.abc import Callable, Sequence
 from datetime import datetime, timezone
 from functools import lru_cache
 from importlib import import_module
@@ -15,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from aerokit.logs.flights.records import TableColumn
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from aerokit.logs.flights.records import LogReader, LogRecord
@@ -58,6 +58,9 @@ FLIGHT = (
 _FORMULA = re.compile(r"(^|[;\t])(?=[\s\0]*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n\0])")
 
 
+_NUMBER_TYPES = (float, int)
+
+
 def _csv_cell(value: Any) -> Any:
     if isinstance(value, str):
         return _FORMULA.sub(r"\1'", value)
@@ -82,14 +85,19 @@ class CsvTable:
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row. The time is written as ISO 8601 in UTC with microseconds."""
-        # Most rows have only numbers, which need no conversion. Their sum is NaN, and not equal to itself, if a number
-        # is NaN; it cannot be computed if a value is a text or None.
-        try:
-            total = sum(values)
-        except TypeError:
-            total = math.nan
-        cells = values if total == total else [_csv_cell(value) for value in values]
+        # Most values are numbers, for which a call of _csv_cell would be slow. `value == value` is False for NaN.
+        cells = [value if type(value) in _NUMBER_TYPES and value == value else _csv_cell(value) for value in values]
         self._writer.writerow([_iso_time(unix_s), *cells])
+        if len(self._lines) >= _LINES_PER_FLUSH:
+            self._flush()
+
+    def add_numbers(self, unix_s: float, numbers: Sequence[float]) -> None:
+        """Add a row of ints and floats. The result is that of :meth:`add`, in half of its time."""
+        total = sum(numbers)
+        if total != total:  # A number is NaN, which becomes an empty cell.
+            self.add(unix_s, numbers)
+            return
+        self._lines.append(f"{_iso_time(unix_s)},{','.join(map(repr, numbers))}\r\n")
         if len(self._lines) >= _LINES_PER_FLUSH:
             self._flush()
 
@@ -134,6 +142,8 @@ class ParquetTable:
         if len(self._rows) >= _ROWS_PER_FLUSH:
             self._flush()
 
+    add_numbers = add
+
     def close(self) -> None:
         self._flush()
         self._writer.close()
@@ -152,6 +162,10 @@ class ParquetTable:
 
 
 Table = CsvTable | ParquetTable
+_AddRow = Callable[[float, Sequence[Any]], None]
+"""Adds a row to a table: its time, and the values of its other columns."""
+_MakeRow = Callable[["LogRecord"], Sequence[Any]]
+"""Returns the values of the columns for the fields of a record."""
 
 
 class FlightTableWriter:
@@ -190,33 +204,38 @@ class MessageTablesWriter:
     def __init__(self, path: Path, log: LogReader, kind: type[Table]) -> None:
         self._path, self._log, self._kind = path, log, kind
         log.needs_states = False
-        # Maps each record type to its table and to the function that converts a record to a row.
-        self._tables: dict[str, tuple[Table, Callable[[LogRecord], Sequence[Any]]]] = {}
+        self._tables: list[Table] = []
+        # Maps each record type to the function that adds a row to its table, and the one that makes a record's row.
+        self._converters: dict[str, tuple[_AddRow, _MakeRow]] = {}
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
         """Add a row to the table of a record."""
-        table, make_row = self._tables.get(record.table) or self._open_table(record)
-        table.add(record.unix_s, (record.system_id, record.component_id, *make_row(record)))
+        add_row, make_row = self._converters.get(record.table) or self._open_table(record)
+        add_row(record.unix_s, (record.system_id, record.component_id, *make_row(record)))
         self.written += 1
 
-    def _open_table(self, record: LogRecord) -> tuple[Table, Callable[[LogRecord], Sequence[Any]]]:
-        """Create the table for records of this type. Return it with the function that converts a record to a row."""
+    def _open_table(self, record: LogRecord) -> tuple[_AddRow, _MakeRow]:
+        """Create the table for records of this type, and return its two functions."""
         columns = self._log.columns(record)
         # The name becomes a file name, but the log is untrusted input, so other characters are replaced.
         name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
         if (self._path / name).exists():
             name = f"{len(self._tables)}_{name}"
         table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
-        self._tables[record.table] = table, _row_maker(columns, record)
-        return self._tables[record.table]
+        self._tables.append(table)
+        # Fields of messages that are no texts are Python's own numbers; a flight controller's log may have NumPy's.
+        has_only_numbers = record.message is not None and all(column.kind != "str" for column in columns)
+        add_row = table.add_numbers if has_only_numbers else table.add
+        self._converters[record.table] = add_row, _row_maker(columns, record)
+        return self._converters[record.table]
 
     def close(self) -> None:
-        for table, _ in self._tables.values():
+        for table in self._tables:
             table.close()
 
     def discard(self) -> None:
-        for table, _ in self._tables.values():
+        for table in self._tables:
             table.discard()
 
 
@@ -233,7 +252,7 @@ def _iso_second(unix_s: float) -> str:
     return datetime.fromtimestamp(unix_s, timezone.utc).isoformat()[:19]
 
 
-def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> Callable[[LogRecord], Sequence[Any]]:
+def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
     """Return a function that converts records of the same type as ``record`` to table rows."""
     if record.message is None:
         names = [column.field for column in columns]
