@@ -315,6 +315,7 @@ class FrameReceiver:
         if not is_foreign and frame not in framer.late:
             return False
         counters = framer.counters_of(frame)
+        # The counters prove that there are two senders, whichever of them has sent this frame.
         if counters is not None and counters.has_duplicates(frame.received_at):
             self._routes.record_duplicate_sender(frame)
             if is_foreign:
