@@ -224,7 +224,7 @@ async def test_one_key_handover_at_a_time() -> None:
         copter.faults.drop_incoming = 1
         tasks.start_soon(vehicle.setup_signing, Signing(KEY))
         await anyio.wait_all_tasks_blocked()
-        with pytest.raises(BusyError, match="setup_signing"):
+        with pytest.raises(BusyError, match="setup_signing: another key handover on this connection"):
             await vehicle.setup_signing(Signing(WRONG))
     assert copter.signing.key == KEY
 

@@ -71,7 +71,7 @@ async def test_go_to_refused_separation_sends_nothing() -> None:
         await stage.take_off()
         plan = stage.fleet.plan_separation(swapped(stage), by="refuse")
         assert plan.decision == "refused"
-        with pytest.raises(OperationRejected, match="nothing was sent"):
+        with pytest.raises(OperationRejected, match=r"^go_to: .* come too close; nothing was sent$"):
             await stage.fleet.go_to(swapped(stage), separation=plan)
         onto = {"north/1": stage.fleet.vehicles["north/2"].position.value}
         with pytest.raises(OperationRejected, match="north/2"):
@@ -79,6 +79,17 @@ async def test_go_to_refused_separation_sends_nothing() -> None:
         assert not stage.orders_to("north/1")
         with pytest.raises(InvalidArgument, match="speed_m_s"):
             stage.fleet.plan_separation(onto, by="corridors")
+
+
+async def test_go_to_after_release_of_planned_member_sends_nothing() -> None:
+    async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
+        await stage.take_off()
+        targets = swapped(stage)
+        plan = stage.fleet.plan_separation(targets)
+        stage.fleet.release("north/2", "it films")
+        with pytest.raises(OperationRejected, match=r"north/2 became unavailable after .* planned; nothing was sent"):
+            await stage.fleet.go_to(targets, separation=plan)
+        assert not stage.orders_to("north/1")
 
 
 async def test_go_to_with_corridors_delays_starts() -> None:
@@ -171,7 +182,7 @@ async def test_start_missions_after_failed_upload_starts_none() -> None:
         with pytest.raises(FleetError, match="north/2"):
             await stage.fleet.upload(changed)
         stage.copters["north/2"].faults.silent = False
-        with pytest.raises(OperationRejected, match=r"call upload\(\) first"):
+        with pytest.raises(OperationRejected, match=r"the last upload failed, .* call upload\(\) first"):
             await stage.fleet.start_missions()
         assert all(copter.motion.is_on_ground for copter in stage.copters.values())
 
@@ -183,6 +194,14 @@ async def test_upload_conflicting_missions_is_rejected() -> None:
             await stage.fleet.upload({"north/1": mission_of(10), "north/2": mission_of(10)})
         (received,) = stage.events(PathsCompared)
         assert received.deconfliction.conflicts[0].distance_m == pytest.approx(0, abs=0.1)
+
+
+async def test_compare_missions_counts_unlisted_conflicts() -> None:
+    async with open_stage(4, min_distance_m=5.0) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        deconfliction = stage.fleet.compare_missions(dict.fromkeys(stage.copters, mission_of(10)))
+        assert len(deconfliction.conflicts) == 6
+        assert "and 3 more pairs come too close" in deconfliction.reason
 
 
 async def test_formation_is_formed_and_kept_while_leader_moves() -> None:

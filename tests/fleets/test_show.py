@@ -194,6 +194,7 @@ def test_show_file_round_trip(tmp_path: FilePath) -> None:
         ("name,t_s,north_m,east_m,up_m\n", "a show needs at least one"),
         ("{", "not JSON"),
         ('{"format": "other"}', "not a show"),
+        ('{"format": "aerokit show", "version": 1}', 'the "tracks" of the show must be a JSON object'),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": [[0, 1]]}}', "track 'a'"),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": 5}}', "track 'a'"),
     ],

@@ -457,7 +457,7 @@ def test_plan_file_error_names_invalid_value(path: tuple[str | int, ...], value:
 def test_plan_file_error_names_missing_value(path: tuple[str | int, ...]) -> None:
     document = samples.full_document()
     del at(document, *path[:-1])[path[-1]]
-    with pytest.raises(FileFormatError, match=f"^test.plan: .* has no '{path[-1]}', which is required"):
+    with pytest.raises(FileFormatError, match=f"^test.plan: .* has no '{path[-1]}'"):
         read(document)
 
 
@@ -469,8 +469,8 @@ def test_plan_file_error_names_all_missing_values() -> None:
     with pytest.raises(FileFormatError) as caught:
         read(document)
     assert str(caught.value) == (
-        "test.plan: the document has no 'version'; mission.items[0] has no 'command' and 'params';"
-        " geoFence.circles[0].circle has no 'center', which are required"
+        "test.plan: required fields are missing: the document has no 'version'; mission.items[0] has no 'command' and"
+        " 'params'; geoFence.circles[0].circle has no 'center'"
     )
 
 

@@ -154,6 +154,7 @@ def test_damaged_waypoint_file_raises_only_our_errors(junk: str, start: int, len
     ("old", "new", "message"),
     [
         ("QGC WPL 110", "QGC WPL 100", "line 1: expected 'QGC WPL 110', found 'QGC WPL 100'"),
+        ("QGC WPL 110", "# survey\n\nQGC WPL 100", "line 3: expected 'QGC WPL 110', found 'QGC WPL 100'"),
         ("\n2\t0", "\n3\t0", "line 4: index = 3: expected 2; lines are missing"),
         ("\t0.000000\t0\n", "\t0\n", "line 7: expected 12 columns, found 11"),
         ("-35.36180530", "91.0", "line 4: latitude = '91.0': expected a number from -90 to 90"),

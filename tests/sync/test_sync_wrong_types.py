@@ -79,3 +79,8 @@ def test_fleet_checks_literals_by_value() -> None:
         aerokit.sync.fleet("udp:127.0.0.1:0", count=0, min_distance_m=5, on_too_close="report", **options)
     with pytest.raises(InvalidArgument, match="on_error = 'land' is not allowed: it must be one of hold_others,"):
         aerokit.sync.fleet("udp:127.0.0.1:0", on_error="land")  # type: ignore[arg-type]
+
+
+def test_mapping_with_wrong_key_error_names_allowed_keys() -> None:
+    with pytest.raises(InvalidArgument, match="must be a mapping from a class of Message to a number"):
+        aerokit.sync.fleet("udp:127.0.0.1:0", rates={"ATTITUDE": 10.0})  # type: ignore[dict-item]

@@ -122,8 +122,9 @@ class _Rules:
                 continue
             is_allowed, _ = rules[name]
             if not is_allowed(value):
-                vehicle_parameter = {**dict(zip(names, args)), **kwargs}.get("name")  # noqa: B905 - as above
-                raise _error(rules[name], name, value, vehicle_parameter)
+                call_arguments = {**dict(zip(names, args)), **kwargs}  # noqa: B905 - as above
+                # In set(name=…, value=…), the argument `name` is a vehicle parameter, which the error should name.
+                raise _error(rules[name], name, value, vehicle_parameter=call_arguments.get("name"))
 
     def _compute(self) -> dict[str, Rule]:
         """Compute the rules from the signature of the function."""
@@ -147,19 +148,19 @@ def _is_time(parameter: inspect.Parameter) -> bool:
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
 
 
-def _error(rule: Rule, name: str, value: object, vehicle_parameter: object) -> InvalidArgument:
+def _error(rule: Rule, argument: str, value: object, vehicle_parameter: object) -> InvalidArgument:
     """Create the error for an invalid argument.
 
-    ``name`` is the name of the argument. ``vehicle_parameter`` names the vehicle parameter whose value is invalid, if
-    the call has one: "RTL_ALT" for ``set(name="RTL_ALT", value="abc")``.
+    ``argument`` is its name. ``vehicle_parameter`` is the vehicle parameter whose value is invalid, if the call has
+    one: "RTL_ALT" for ``set(name="RTL_ALT", value="abc")``.
     """
     check, allowed = rule
     hint = _hint(check, value)
-    if name == "value" and isinstance(vehicle_parameter, str):
+    if argument == "value" and isinstance(vehicle_parameter, str):
         return InvalidArgument(
             f"value = {short_repr(value)} of {vehicle_parameter[:40]} is not allowed: it must be {allowed}{hint}"
         )
-    return InvalidArgument(f"{name} = {short_repr(value)} is not allowed: it must be {allowed}{hint}")
+    return InvalidArgument(f"{argument} = {short_repr(value)} is not allowed: it must be {allowed}{hint}")
 
 
 def _hint(check: Check, value: object) -> str:
@@ -220,8 +221,8 @@ def _generic_rule(name: str, inner: ast.expr, module_globals: Mapping[str, Any])
         class_names = _class_names(_name_of(parts[0]), module_globals)
         return partial(_is_class, class_names), f"a class{' of ' if class_names else ''}{' or '.join(class_names)}"
     if name == "Mapping":
-        (is_key, _), (is_value, description) = rules
-        return partial(_is_mapping, is_key, is_value), f"a mapping whose values are each {description}"
+        (is_key, key_text), (is_value, value_text) = rules
+        return partial(_is_mapping, is_key, is_value), f"a mapping from {key_text} to {value_text}"
     if name in ("Iterable", "Sequence", "list", "tuple"):
         is_item, description = rules[0]
         return partial(_are_items, is_item), f"an iterable whose items are each {description}"

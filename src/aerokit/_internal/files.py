@@ -78,7 +78,7 @@ def decompress(data: bytes, name: str) -> bytes:
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Read a text file, with Unix line ends.
+    """Read a text file. Line ends are converted to those of Unix.
 
     Raises:
         FileFormatError: the file is not UTF-8, or too large.

@@ -6,7 +6,7 @@ import math
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return the quaternion of a rotation by yaw, then pitch, then roll (radians)."""
+    """Return the quaternion (w, x, y, z) of a rotation by yaw, then pitch, then roll (radians)."""
     # Cosines and sines of half of the roll, pitch and yaw angles.
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)

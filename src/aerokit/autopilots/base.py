@@ -347,7 +347,7 @@ class Autopilot:
     ) -> tuple[Mode, ...]:
         """Return the modes to which a command may change; empty if there are none or they are unknown."""
         if command == MavCmd.DO_SET_MODE:
-            return self._modes_of_order(params, extra)
+            return self._modes_of_do_set_mode(params, extra)
         names = {name for name in NAMES_OF_COMMANDS.get(command, ()) if name in self.modes.names}
         for purpose in PURPOSES_OF_COMMANDS.get(command, ()):
             for is_vtol in (False, True):
@@ -356,7 +356,7 @@ class Autopilot:
                     names.add(name)
         return tuple(self.modes.find(name) for name in sorted(names))
 
-    def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+    def _modes_of_do_set_mode(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
         """Return the mode that a DO_SET_MODE with these parameters sets; nothing without a custom mode."""
         base_mode, custom_mode = mode_numbers((*params, 0.0, 0.0)[:2])  # Missing parameters are 0.
         return (self.mode(custom_mode, base_mode, extra),) if base_mode & CUSTOM_MODE_ENABLED else ()

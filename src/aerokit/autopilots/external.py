@@ -28,8 +28,8 @@ ExternalKind: TypeAlias = Literal[
 class ExternalRule(Snapshot):
     """Parameters that decide whether the autopilot uses one kind of measurement.
 
-    - ``required``: for each parameter, its alternative names, and the values with which the autopilot reads the
-      messages
+    - ``required``: for each parameter, its alternative names, and the values with which the autopilot uses messages
+      with this measurement
     - ``sole_source``: for each parameter, its name, and the values with which the measurement is the estimator's only
       source of position or velocity; parameters that the vehicle does not have are ignored
     """

@@ -60,10 +60,11 @@ navigator parameters of PX4.
 
 
 def gcs_failsafe(firmware: str, value_of: Callable[[str], float | None]) -> tuple[str | None, str | None]:
-    """Return the parameter that decides on the action after the loss of the ground station, and the action as a clause.
+    """Return the parameter that decides on the action after the loss of the ground station, and the action.
 
-    ``value_of`` returns the value of a parameter, or None if it is unknown. The action is None if it is unknown; the
-    parameter is then the one whose value is needed, or None if no value would help.
+    ``value_of`` returns the value of a parameter, or None if it is unknown. The action is a part of a sentence, such as
+    ``lands``. It is None if the value of the returned parameter is unknown. Both results are None if the table has no
+    action for the values. A parameter without an action for its value leaves the decision to the next parameter.
     """
     for name, actions in GCS_FAILSAFE_ACTIONS.get(firmware, {}).items():
         value = value_of(name)

@@ -204,7 +204,7 @@ class Px4(Autopilot):
         sub = mode.custom_mode >> 24
         return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
 
-    def _modes_of_order(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
+    def _modes_of_do_set_mode(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
         """Return the mode that a DO_SET_MODE with these parameters sets; nothing without a custom mode."""
         base_mode, main, sub = mode_numbers((*params, 0.0, 0.0, 0.0)[:3])  # Missing parameters are 0.
         if not base_mode & CUSTOM_MODE_ENABLED:
@@ -227,7 +227,7 @@ class Px4(Autopilot):
     def take_off(
         self, altitude_relative_m: float, home_altitude_amsl_m: float | None, *, is_vtol: bool
     ) -> TakeOff | None:
-        """Return the procedure: NAV_TAKEOFF at the current position and heading to the altitude, then LOITER.
+        """Return the procedure: NAV_TAKEOFF to the altitude, at the current position and heading, then LOITER.
 
         None for vehicles that cannot fly.
 

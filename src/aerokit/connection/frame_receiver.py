@@ -221,7 +221,7 @@ class FrameReceiver:
                 observers.recording.write(frame.raw, self._clock())
             if is_other_peer and not self._claims_route(framer, frame, peer):
                 continue
-            if may_be_stale and self._is_stale(framer, frame):
+            if may_be_stale and self._must_be_dropped(framer, frame):
                 continue
             if multilink is not None:
                 if not multilink.accepts(frame, peer, framer.counters_of(frame)):
@@ -294,6 +294,7 @@ class FrameReceiver:
         Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
         it as a replay.
         """
+        # `copies` still refers to this frame, because `is_copy` was just called for it.
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
@@ -304,16 +305,17 @@ class FrameReceiver:
     def _claims_route(self, framer: Framer, frame: Frame, peer: Peer) -> bool:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
-    def _is_stale(self, framer: Framer, frame: Frame) -> bool:
+    def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:
         """Return True if a frame must be dropped.
 
         Frames of a second sender with the same ids are dropped, if it is known that there are two. A heartbeat is also
-        dropped if it is outdated, or if only its sequence number suggests a second sender.
+        dropped if it is outdated, or if only its sequence number suggests a second sender. Two senders are reported.
         """
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False
         counters = framer.counters_of(frame)
+        # The counters prove that there are two senders, whichever of them has sent this frame.
         if counters is not None and counters.has_duplicates(frame.received_at):
             self._routes.record_duplicate_sender(frame)
             if is_foreign:

@@ -55,8 +55,8 @@ class LoopWatch:
     Data may arrive during a pause and wait. Until all of this data has been read, its receive time is the time at which
     the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
     ages may be too small by up to this time. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``,
-    ``on_slept`` the time that the computer was suspended. ``on_caught_up`` gets the length of a pause once all waiting
-    data was read.
+    ``on_slept`` the time that the computer was suspended. ``on_caught_up`` gets the length of a pause, and of the time
+    after it in which waiting data was read, once all of this data was read.
     """
 
     def __init__(
@@ -101,10 +101,10 @@ class LoopWatch:
             self._has_read = True
             return self.oldest_arrival
         self._check_sleep_at = now + CHECK_INTERVAL_S / 2
-        # Data that is read in time proves that the loop runs, so the timer is postponed. A timer that wakes an idle
-        # process would cost as much as processing a few messages.
         has_slept = self._detect_sleep()
         if self.oldest_arrival == math.inf and not has_slept and now <= self._due + LATE_THRESHOLD_S:
+            # Data that is read in time proves that the loop runs, so the timer need not fire. Postponing it costs less
+            # than waking the process only for the timer.
             if self._timer is not None:
                 self._timer.cancel()
             self._set_timer(now)
@@ -174,9 +174,10 @@ class LoopWatch:
         if self._idle_iterations < MIN_IDLE_ITERATIONS:
             self._loop.call_soon(self._end_assumption_when_idle)
         else:
-            paused_s = self._loop.time() - self.oldest_arrival
+            caught_up_after_s = self._loop.time() - self.oldest_arrival
             self.oldest_arrival = math.inf
-            self._on_caught_up(paused_s)
+            self._on_caught_up(caught_up_after_s)
+            # As in `_set_timer`: data that is read before this time has not waited.
             self.late_after = self._ran_at + CHECK_INTERVAL_S / 2
 
 

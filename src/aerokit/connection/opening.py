@@ -219,7 +219,7 @@ def _return_link(link: Link) -> Link:
 
 # Noise of this many bytes contains a pattern that looks like a damaged frame with a probability of about 10 %. Damaged
 # frames are therefore only diagnosed if there is more than one in this many bytes.
-NOISE_BYTES = 500
+NOISE_BYTES_PER_BAD_CRC = 500
 
 MAX_LISTED_IDS = 5
 
@@ -267,7 +267,7 @@ class _Diagnosis:
                 f"{received}, with {self._unknown_frames} frames of an unknown dialect (messages {numbers}) and no"
                 " known message: pass dialect=Dialect.from_xml(...)"
             )
-        if self._bad_crcs * NOISE_BYTES > self._bytes:
+        if self._bad_crcs * NOISE_BYTES_PER_BAD_CRC > self._bytes:
             return f"{received}, with {self._bad_crcs} damaged frames and no valid one: noisy link, or another dialect?"
         return f"{received}, but no MAVLink frame: wrong baud rate, or another protocol?"
 

@@ -70,6 +70,7 @@ class RouteClaim:
             self._expected = expected
             self._frames = 0
             self.is_refusal_reported = False
+            # Only the first frame's sequence number counts. Otherwise a peer could try until a number matches.
             self._sequence_matches = sequence_matches
             self._clock_matches = None
             self._claimed_at = frame.received_at
@@ -143,7 +144,7 @@ class _Route:
 
 
 class Routes:
-    """Routing table: maps each (system id, component id) to the peer it was last received from.
+    """Routing table: maps each (system id, component id) to the peer that owns the route.
 
     The first peer that sends a HEARTBEAT under these ids owns the route; frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer takes over the route (``RouteChanged``)
@@ -158,8 +159,8 @@ class Routes:
     A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. The route of a
     system with a vehicle object never expires.
 
-    ``attached`` has the system ids with a vehicle object. ``boot_clocks`` maps components to functions from
-    ``received_at`` to their time since boot in milliseconds. ``publish`` publishes events.
+    ``attached`` has the system ids with a vehicle object. ``boot_clocks[component](received_at)`` returns the expected
+    time since boot of a component in milliseconds. ``publish`` publishes events.
     """
 
     def __init__(
@@ -223,7 +224,7 @@ class Routes:
             return peers or EVERY_PEER
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
-        """Return True if the route of the frame's sender leads to another peer."""
+        """Return True if the frame arrived on another peer than the one that owns the route of its sender."""
         route = self._routes.get((frame.system_id, frame.component_id))
         return route is not None and route.peer != peer
 

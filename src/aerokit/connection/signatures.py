@@ -41,7 +41,7 @@ class SignatureGate:
         self._reported: set[Refusal] = set()  # reasons that were already logged
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True until the `with` block of key_handover() ends
-        self._logged_keep_error: OSError | None = None  # error of the last check; None if the file could be written
+        self._logged_keep_error: OSError | None = None  # None if the file of ``Signing(keep=…)`` could be written
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = lambda: None
@@ -66,7 +66,7 @@ class SignatureGate:
         """
         check_signing(signing, self._encoder.version)
         if self._is_handing_over:
-            raise BusyError("setup_signing: a key handover to another vehicle on this connection is in progress")
+            raise BusyError("setup_signing: another key handover on this connection is in progress")
         self._is_handing_over = True
         switched = asyncio.Event()
         self._handover = _Handover(signing, (system_id, component_id), switched)
@@ -96,7 +96,7 @@ class SignatureGate:
         if signing is None:
             return True
         try:
-            if is_of_handover and not _has_key(frame):
+            if is_of_handover and not _is_signed_with_a_key(frame):
                 # During the handover, the vehicle may remove its key as requested. Its unsigned frames are therefore
                 # neither reported nor counted as refused.
                 return signing.may_be_unsigned(frame)
@@ -114,7 +114,7 @@ class SignatureGate:
         return self._encoder.signing is not None and bool(frame.incompat_flags & SIGNED)
 
     def _report(self, frame: Frame, signing: Signing, refusal: Refusal) -> None:
-        """Log the first refusal for a reason, and publish it as an event."""
+        """Log a refusal and publish it as an event. Called for the first refusal of each reason."""
         source = frame.system_id, frame.component_id
         logger.warning(
             "a frame of %d/%d was refused: %s (%r); further refused frames are counted, but not logged",
@@ -133,17 +133,20 @@ class SignatureGate:
         self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Return why signatures block communication with these senders, for error texts; "" if they do not."""
+        """Return how signatures may block communication, for error texts; "" if there is no sign of it.
+
+        With a key, these are the refusals of all senders. Without a key, it is that these senders sign their frames.
+        """
         signing = self._encoder.signing
         if signing is not None:
             refused = "; ".join(f"{count}: {reason.value}" for reason, count in signing.refused.items() if count)
             return f"frames were refused ({refused}) by {signing.key!r}" if refused else ""
         frames = (heartbeat.received_frame for heartbeat in heartbeats)
-        is_signed = any(frame is not None and _has_key(frame) for frame in frames)
+        is_signed = any(frame is not None and _is_signed_with_a_key(frame) for frame in frames)
         return "its frames are signed and no key was given (signing=…)" if is_signed else ""
 
 
-def _has_key(frame: Frame) -> bool:
+def _is_signed_with_a_key(frame: Frame) -> bool:
     from aerokit.mavlink.signing import is_signed_with_a_key  # imports hashlib, which few programs need
 
     return is_signed_with_a_key(frame)
@@ -165,7 +168,7 @@ class _Handover:
         """Return True once the frames up to this one show that the component uses the new key, or no key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
-        if _has_key(frame):
+        if _is_signed_with_a_key(frame):
             self._unsigned_count = 0
             return False
         self._unsigned_count += 1

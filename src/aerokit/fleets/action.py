@@ -268,7 +268,7 @@ class FleetAction:
                 )
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
-        # The actions of skipped members are cancelled, too.
+        # The actions of available members whose order is skipped are cancelled, too.
         stopping = [member for member in available if member.name in orders]
         asyncio.get_running_loop().call_soon(self._cancel_tasks_of, stopping)
         if not self._policy_orders:

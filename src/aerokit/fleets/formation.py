@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Following", "Formation", "Formations", "Offset", "follow_velocity"]
 
-LEADER_MAX_AGE_S = 1.5
+# Maximum age of the positions of leader and follower.
+FOLLOWING_MAX_AGE_S = 1.5
 
 # Speed of a follower towards its place in the formation, per metre of its distance from the place, in 1/s.
 FOLLOW_GAIN = 0.6
@@ -256,7 +257,7 @@ class Following:
         if not self._stopped.is_set():
             try:
                 self._check_leader()
-                position_of(self._leader, LEADER_MAX_AGE_S)
+                position_of(self._leader, FOLLOWING_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
                 # The active members hold, because `_tasks.cancel()` below ends their streams.
                 holding = self._action.active
@@ -286,8 +287,8 @@ class Following:
         The positions of the member and the leader are extrapolated to the present by their velocities.
         """
         leader, vehicle = self._leader.vehicle, member.vehicle
-        leader_position = position_of(self._leader, LEADER_MAX_AGE_S)
-        position = position_of(member, LEADER_MAX_AGE_S)
+        leader_position = position_of(self._leader, FOLLOWING_MAX_AGE_S)
+        position = position_of(member, FOLLOWING_MAX_AGE_S)
         points = to_local_points(
             {
                 "leader": (

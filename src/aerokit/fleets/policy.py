@@ -117,7 +117,7 @@ class FleetResult(Mapping[str, Any]):
         self.stopped: dict[str, Exception] = dict(stopped)
         """Members that the policy stopped because another member failed."""
         self.skipped: dict[str, str] = dict(skipped)
-        """Unavailable members, which got no order, with the reason. The mapping does not contain them."""
+        """Unavailable members, which got no order, with the reason. They are no keys of the FleetResult."""
         self._outcomes = dict(outcomes)
 
     @property

@@ -120,7 +120,7 @@ def separate_by_altitude(
     if highest > max_altitude_m:
         reason = f"the paths cross, and the layers would reach {highest:.0f} m, above {max_altitude_m:.0f} m"
         return Deconfliction("refused", reason, min_distance_m, conflicts)
-    reason = f"{_describe_pairs(conflicts)} come too close; they cross in {len(set(heights.values()))} layers"
+    reason = f"{describe_pairs(conflicts)} come too close; they cross in {len(set(heights.values()))} layers"
     return Deconfliction("layers", reason, min_distance_m, conflicts, heights_m=heights)
 
 
@@ -172,7 +172,7 @@ def separate_by_time(
         if blocked_route is None:
             delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
             max_s = max(delays.values())
-            reason = f"{_describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
+            reason = f"{describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
             return Deconfliction("corridors", reason, min_distance_m, conflicts, delays_s=delays, slack_s=slack_s)
         refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
         # A route waits only for routes before it in the sequence, so the next try begins with the blocked route.
@@ -275,7 +275,8 @@ def _find_blocker(path: Path, others: Sequence[Path], min_distance_m: float, sla
     return None
 
 
-def _describe_pairs(conflicts: Sequence[Conflict]) -> str:
+def describe_pairs(conflicts: Sequence[Conflict]) -> str:
+    """Return the names and distances of the first conflicts, and the number of the others, for texts."""
     texts = [f"{conflict.name} and {conflict.other} ({conflict.distance_m:.1f} m)" for conflict in conflicts[:3]]
     more = len(conflicts) - len(texts)
     more_text = f" and {more} more pairs" if more else ""
@@ -321,9 +322,10 @@ def pairs_within(points: Mapping[str, LocalPoint], max_distance_m: float) -> lis
 
 
 def to_local_points(positions: Mapping[str, tuple[float, float, float]]) -> dict[str, LocalPoint]:
-    """Convert latitude, longitude (degrees) and altitude (metres) to metres around the first position.
+    """Convert latitude, longitude (degrees) and altitude (metres) to metres.
 
-    Accurate to 0.1 % within a few kilometres.
+    North and east are relative to the first position, accurate to 0.1 % within a few kilometres. The altitude is
+    unchanged.
     """
     if not positions:
         return {}

@@ -129,17 +129,19 @@ class Show(Snapshot):
         """Parse a show in JSON, in the format that the module describes.
 
         Raises:
-            InvalidArgument: the text is not in this format. The error names the track.
+            InvalidArgument: the text is not in this format. If a track is wrong, the error names it.
         """
         try:
             data = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise InvalidArgument(f"the text is not JSON: {error}") from None
-        tracks = data.get("tracks") if isinstance(data, dict) else None
-        if not isinstance(tracks, dict) or (data.get("format"), data.get("version")) != (FORMAT, VERSION):
+        if not isinstance(data, dict) or (data.get("format"), data.get("version")) != (FORMAT, VERSION):
             raise InvalidArgument(
                 f'the JSON text is not a show: its "format" must be "{FORMAT}", its "version" {VERSION}'
             )
+        tracks = data.get("tracks")
+        if not isinstance(tracks, dict):
+            raise InvalidArgument('the "tracks" of the show must be a JSON object with the names of the tracks')
         return cls.from_points(tracks)
 
     def to_csv(self) -> str:

@@ -224,7 +224,8 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 class TrackRecorder:
     """Records a vehicle's positions (GLOBAL_POSITION_INT) in its ``with`` block, in seconds and metres of the show.
 
-    Times are from the vehicle's clock (``time_boot_ms``), or those of arrival if the measured offset does not fit it.
+    Times are from the vehicle's clock (``time_boot_ms``). If TIMESYNC has measured another clock of the vehicle, they
+    are the times of arrival.
     """
 
     def __init__(
@@ -423,8 +424,9 @@ async def _fly_track(
     with vehicle._session.streaming("position"):
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
             while (at_s := vehicle.connection.now() - begin_at) < path.ends_at_s:
+                # Before the start, a member waits for its first position. Later, a missing position is an error.
                 if at_s < 0 and not recorder.has_position:
-                    stream.set(VelocitySetpoint())  # a velocity of 0, until the first position arrives
+                    stream.set(VelocitySetpoint())
                 else:
                     stream.set(_setpoint(path, at_s, lead_s, recorder.extrapolated_position()))
                 await anyio.sleep(period_s)

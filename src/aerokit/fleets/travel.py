@@ -21,6 +21,7 @@ from aerokit.fleets.separation import (
     SLACK_S,
     Deconfliction,
     Route,
+    describe_pairs,
     find_conflicts,
     separate_by_altitude,
     separate_by_time,
@@ -66,7 +67,8 @@ class Travel(SelectionBase):
                 corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
-                unavailable after a leg, and the other members stay in their layers.
+                unavailable after the separation was planned. Then nothing was sent, or after a leg the others stay in
+                their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -127,7 +129,8 @@ class Travel(SelectionBase):
             max_m = math.inf if max_altitude_m is None else max_altitude_m
             deconfliction = separate_by_altitude(routes, stationary, min_m, max_altitude_m=max_m)
             if by == "refuse" and deconfliction.decision == "layers":  # the paths cross
-                deconfliction = deconfliction.replace(decision="refused", heights_m={})
+                reason = f"{describe_pairs(deconfliction.conflicts)} come too close"
+                deconfliction = deconfliction.replace(decision="refused", reason=reason, heights_m={})
         self._context.publish(
             PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
         )
@@ -147,7 +150,10 @@ class Travel(SelectionBase):
         names: tuple[str, ...] = (),
         max_distance_m: float = MAX_DISTANCE_M,
     ) -> FleetResult:
-        """Fly members to their targets, directly or with the planned separation."""
+        """Fly members to their targets, directly or with the planned separation.
+
+        ``names`` are all members of the result, which has those without a target as skipped; by default those with one.
+        """
         if separation is None and self._context.min_distance_m is not None:
             separation = self.plan_separation(targets, speed_m_s=speed_m_s)
         if separation is None or separation.decision == "clear":
@@ -176,7 +182,7 @@ class Travel(SelectionBase):
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]
     ) -> dict[str, Position]:
-        """Return the targets by member name. A function of targets is called for available members only."""
+        """Return the targets by member name. If ``targets`` is a function, it is called for available members only."""
         for member in self:
             member.refresh()
         if callable(targets):
@@ -257,8 +263,8 @@ class Travel(SelectionBase):
             missing = [name for name in leg if not self.members[name].is_available]
             if missing:  # an unavailable member may be in the way of the others, so the flight ends
                 raise OperationRejected(
-                    f"{action}: {', '.join(missing)} became unavailable between two legs; the others stay in their"
-                    " layers"
+                    f"{action}: {', '.join(missing)} became unavailable after the separation was planned; "
+                    + ("nothing was sent" if result is None else "the others stay in their layers")
                 )
             result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m=max_distance_m)
             if not result.is_complete:
@@ -341,12 +347,14 @@ class Missions(SelectionBase):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: the last upload failed for a member, or a member is unavailable or not armed. Nothing was
-                sent.
+            OperationRejected: the last upload failed for a member, or had no mission for these members, or a member is
+                unavailable or not armed. Nothing was sent.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         if not names:
-            raise OperationRejected("start_missions: no upload has succeeded for every member; call upload() first")
+            raise OperationRejected(
+                "start_missions: the last upload failed, or had no mission for these members; call upload() first"
+            )
         members = self._require_available(dict.fromkeys(names))
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:
@@ -374,7 +382,8 @@ class Missions(SelectionBase):
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Ignores items without a position, terrain altitudes and jumps.
+        Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced by the
+        member's present altitude.
 
         Args:
             missions: maps names of members to missions.
@@ -395,10 +404,7 @@ class Missions(SelectionBase):
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
         conflicts = find_conflicts([path for path in paths if path is not None], min_m)
-        pairs = ", ".join(
-            f"{conflict.name} and {conflict.other} ({conflict.distance_m:.1f} m)" for conflict in conflicts[:3]
-        )
-        reason = f"{pairs} come too close" if conflicts else "no paths come too close"
+        reason = f"{describe_pairs(conflicts)} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
         self._context.publish(
             PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)

@@ -275,8 +275,8 @@ class Hub:
         ids = f"{source & 0xFF}/{source >> 8}"
         other = "a removed endpoint" if other_port is None else other_port.endpoint
         text = {
-            "duplicate_sender": f"{ids} is received here and at {other}, where its messages are sent: two links to one"
-            " vehicle, or two vehicles with the same ids",
+            "duplicate_sender": f"{ids} is received here and at {other}; messages for it go to {other}: two links to"
+            " one vehicle, or two vehicles with the same ids",
             "route_changed": f"messages for {ids} are sent here now, because it is no longer received at {other}",
             "loop": f"frames of {ids} from {other} come back here: both endpoints lead to the same network; returning"
             " frames are dropped",

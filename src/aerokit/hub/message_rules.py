@@ -40,7 +40,7 @@ class Filters:
     """Selects the messages that an endpoint sends: those that match ``only``, if it is not empty, and not ``block``.
 
     Patterns may contain wildcards: ``"GPS_*"``. ``rates`` maps patterns to the maximum rate per sender in Hz; the first
-    matching pattern applies. Wildcards do not limit `ANSWERS`.
+    matching pattern applies. In ``rates``, a pattern with a wildcard does not apply to `ANSWERS`.
 
     Raises:
         InvalidArgument: a pattern matches no message of the dialect, or a rate is not above 0 and at most 1000.

@@ -135,8 +135,8 @@ class Router(Generic[PortT]):
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
         """Called with the kind of event, the sender, the port of the frame, and another port of this sender.
 
-        If the sender has moved, the other port is the one it came from; if it is received at two ports, the second one;
-        None if that port was removed since.
+        If the sender has moved, the other port is the one it came from; if it is received at two ports, the one that
+        its messages go to; in a loop, the one at which its frames arrive first; None if that port was removed since.
         """
 
     def add(self, port: PortT) -> RouterPort[PortT]:
@@ -173,14 +173,14 @@ class Router(Generic[PortT]):
     def route_all(
         self, node: RouterPort[PortT], frames: list[Frame], now: float, late: list[Frame]
     ) -> list[ForwardingPlan[PortT]]:
-        """Return the plans for frames received together at ``node``. Frames in ``late`` have a number out of order."""
+        """Return the plans for frames received together at ``node``. Those in ``late`` are out of order."""
         # This is the hot path for new frames of known streams. `route` processes frames that are out of order or may
         # return in a loop, and all frames while the tables of recent frames are full or have expired.
-        recent, streams, number = self._recent, node.streams, node.number
+        recent, streams, port_number = self._recent, node.streams, node.number
         if late or node.echoes or now >= recent.ends_at or len(recent.newer) + len(frames) > MAX_RECENT_FRAMES:
             return [self.route(node, frame, now, frame in late) for frame in frames]
         newer, older, plans = recent.newer, recent.older, []
-        record = number, self._port_count, now  # value for `RecentFrames.newer`
+        record = port_number, self._port_count, now  # value for `RecentFrames.newer`
         for frame in frames:
             body = frame.body
             plan = streams.get(body[4:9])  # system id, component id and message id
@@ -188,8 +188,8 @@ class Router(Generic[PortT]):
                 identity = plan.identity | body[3] << 16 | frame.checksum
                 is_new = identity not in newer and identity not in older
                 # If an earlier frame with this identity arrived at the same port (item 0 of its record), this frame is
-                # no copy: its number and checksum are equal by chance.
-                if is_new or (newer.get(identity) or older[identity])[0] == number:
+                # no copy: its sequence number and checksum are equal by chance.
+                if is_new or (newer.get(identity) or older[identity])[0] == port_number:
                     newer[identity] = record
                     plan.sender.received_at = now
                     plans.append(plan)
@@ -202,7 +202,7 @@ class Router(Generic[PortT]):
         return plans
 
     def route(self, node: RouterPort[PortT], frame: Frame, now: float, is_late: bool = False) -> ForwardingPlan[PortT]:
-        """Return the plan for a frame received at ``node``. ``is_late`` is True if its number is out of order."""
+        """Return the plan for a frame received at ``node``. ``is_late``: its sequence number is out of order."""
         # Hot path. Sender and target are numbers: system id + 256 · component id.
         body, message_id = frame.body, frame.message_id
         source = body[4] | body[5] << 8
@@ -346,16 +346,16 @@ class Router(Generic[PortT]):
         message_id, target, source = key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF
         target_system, target_component = target & 0xFF, target >> 8
         ids = target_system, target_component
-        plan_key = message_id << 16 | source
+        stream_key = message_id << 16 | source
         if message_id == _SETUP_SIGNING:
-            return ForwardingPlan(plan_key, message_id, ids, reason="secret")
+            return ForwardingPlan(stream_key, message_id, ids, reason="secret")
         has_target = target_system != 0
         # The keys of the dictionary are used as a set that keeps its order.
         if has_target:
             numbers = self._ports_to(target_system, target_component, source, node.number)
             if not numbers:
                 # This plan is not cached, because a sender could fill the cache with unknown targets.
-                return ForwardingPlan(plan_key, message_id, ids, reason="no_route")
+                return ForwardingPlan(stream_key, message_id, ids, reason="no_route")
         else:
             numbers = dict.fromkeys(self._nodes)
             if self._targets.is_order(message_id):  # An autopilot that is received at two ports gets an order once.
@@ -379,7 +379,7 @@ class Router(Generic[PortT]):
         # Equal tuples become the same object, so that plans can be compared by identity.
         shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))
         sender = self._senders.get(source, _UNKNOWN_SENDER)
-        plan = ForwardingPlan(plan_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
+        plan = ForwardingPlan(stream_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
         node.plans[key] = plan
         # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
         # sender's, may change the data about the sender, so `route` must process them.
@@ -390,7 +390,8 @@ class Router(Generic[PortT]):
     def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
         """Return the numbers of the ports by which a component or system is reached, for a frame of ``source``.
 
-        A sender never gets its own frame (received at port ``here``), even if another port reaches the sender.
+        If the sender itself is a target, the result has only ``here`` for it, even if another port reaches the sender.
+        The caller removes ``here``, the port of the frame, so that no sender gets its own frame.
         """
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None

@@ -208,7 +208,8 @@ class PythonFramer:
         """Sort the frames that were out of order into :attr:`late` and :attr:`foreign`.
 
         ``out_of_order`` has (position in ``frames``, result of `SourceStatistics.out_of_order`, sequence and sender).
-        Frames of unwanted messages are not in ``frames``, so there may be a different frame at that position.
+        A frame of an unwanted message is not in ``frames``. Its position belongs to the next wanted frame, which is
+        recognized by its sequence or sender.
         """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
@@ -230,6 +231,7 @@ class PythonFramer:
         examined_to, candidates, bad_crcs = scan
         pending: list[tuple[int, int, int]] = []
         bad_crcs = list(bad_crcs)
+        # A new candidate is examined at once, because its end is 0. Until then it counts as noise.
         new_candidates = ((match.start(), _NOISE, 0) for match in _find_magics(data, max(begin, examined_to)))
         examined_to = size
         end_of_data = (size, _NOISE, size)

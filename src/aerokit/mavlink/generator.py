@@ -66,7 +66,7 @@ def with_added_messages(
 def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]) -> list[EnumDefinition]:
     """Return pymavlink's enums, supplemented by the additions, followed by the new enums of the additions.
 
-    If a value has several names, the standard's name comes first. New entries do not change the Python names of
+    If a value has several names, that of the additions comes first. New entries do not change the Python names of
     existing entries.
     """
     merged = {enum.name: enum for enum in enums}
@@ -101,7 +101,7 @@ def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tup
 
 
 def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
-    """Return the entries of both enums, sorted by value. An added entry replaces one with the same name."""
+    """Return the entries of both enums, sorted by value. Entries with the same name are merged."""
     by_name = {entry.name: entry for entry in existing.entries}
     merged = {entry.name: _merged_entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
@@ -379,7 +379,7 @@ def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
     head = _MESSAGES_HEAD.format(name=stems[0], more=_other_files(stems), helpers=helpers)
     if "Sequence[" not in text:
         head = head.replace("    from collections.abc import Sequence\n\n", "")
-    return head + _render_all(message.class_name for message in messages) + "\n" + text
+    return head + _render_dunder_all(message.class_name for message in messages) + "\n" + text
 
 
 def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
@@ -401,7 +401,7 @@ def _enums_module(module: str, stems: Sequence[str], enums: Sequence[EnumDefinit
 def _enums_stub(module: str, enums: Sequence[EnumDefinition]) -> str:
     bases = sorted({"IntFlag" if enum.bitmask else "IntEnum" for enum in enums})
     head = f"from enum import {', '.join(bases)}\n\n" if bases else ""
-    return head + _render_all(enum.class_name for enum in enums) + "\n" + "\n".join(map(render_enum_stub, enums))
+    return head + _render_dunder_all(enum.class_name for enum in enums) + "\n" + "\n".join(map(render_enum_stub, enums))
 
 
 def _enums_init(enums: Sequence[EnumDefinition]) -> tuple[str, str]:
@@ -417,10 +417,10 @@ def _reexports(package: str, names: dict[str, str]) -> str:
     for module in sorted(set(names.values())):
         imports = "".join(f"    {name} as {name},\n" for name in sorted(names) if names[name] == module)
         stub += f"from aerokit.mavlink.{package}.{module} import (\n{imports})\n"
-    return stub + "\n" + _render_all(sorted(names))
+    return stub + "\n" + _render_dunder_all(sorted(names))
 
 
-def _render_all(names: Iterable[str]) -> str:
+def _render_dunder_all(names: Iterable[str]) -> str:
     return "__all__ = [\n" + "".join(f'    "{name}",\n' for name in names) + "]\n"
 
 

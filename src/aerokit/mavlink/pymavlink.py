@@ -251,7 +251,7 @@ def _dialects(preferred: ModuleType | None) -> Any:
 
 def _decoder_for(message_class: Any) -> Decoder:
     """Return the function that decodes frames of one message to objects of pymavlink. Made once for each message."""
-    received = _received_class(message_class)
+    received_class = _received_class(message_class)
     unpack = message_class.unpacker.unpack_from
     length = HEADER_LENGTH + message_class.unpacker.size
     layout = _Layout(message_class)
@@ -261,7 +261,7 @@ def _decoder_for(message_class: Any) -> Decoder:
     def decode(frame: Frame, timestamp: float) -> Any:
         body = frame.body
         values = unpack(body if len(body) >= length else body.ljust(length, b"\0"), HEADER_LENGTH)
-        message = new(received)
+        message = new(received_class)
         fields = message.__dict__
         fields["_frame"] = frame
         fields["_timestamp"] = timestamp

@@ -36,7 +36,6 @@ class SourceStatistics(SourceFields):
         "_alternated_at",
         "_alternations",
         "_last_expected",
-        "_late_count",
         "_late_run",
         "_late_sequence",
         "_missing",
@@ -44,6 +43,7 @@ class SourceStatistics(SourceFields):
         "_other_at",
         "_other_count",
         "_other_expected",
+        "_received_at_late",
         "_returns",
         "_skipped_over",
         "_stream_start",
@@ -73,7 +73,7 @@ class SourceStatistics(SourceFields):
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_base` is missing
         self._missing_base = sequence  # value of `expected` to which `_missing` refers
         self._late_sequence = -1  # sequence number of the last repeated frame
-        self._late_count = -1  # value of `received` when that frame arrived
+        self._received_at_late = -1  # value of `received` when that frame arrived
         self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations = 0  # how often the two streams have alternated
@@ -162,7 +162,7 @@ class SourceStatistics(SourceFields):
         A single old number is a repetition. Several in direct succession show that the sender rebooted.
         """
         follows = sequence == (self._late_sequence + 1) & 0xFF
-        is_direct_succession = follows and self._late_count == self.received
+        is_direct_succession = follows and self._received_at_late == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
         # A link may repeat two or three recent frames, so a longer run of recent numbers is required. It hardly ever
@@ -181,7 +181,7 @@ class SourceStatistics(SourceFields):
             self._alternated_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._late_sequence = sequence
-        self._late_count = self.received
+        self._received_at_late = self.received
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
@@ -194,8 +194,8 @@ class SourceStatistics(SourceFields):
     def _continue_other(self, sequence: int, now: float) -> int:
         """Process a frame that continues the other stream. Return a result of :meth:`out_of_order`.
 
-        Of the two streams, the one with more frames counts as the sender's. If the current stream has timed out, the
-        other stream counts as the sender's.
+        The other stream becomes the sender's at once if the current stream has timed out, and after `_MIN_RETURNS`
+        frames if it has more frames than the current stream.
         """
         current_count = self.received - self._stream_start
         is_other_longer = self._other_count > current_count
@@ -204,6 +204,7 @@ class SourceStatistics(SourceFields):
         if is_other_longer:
             self._returns += 1
         if is_over or self._returns >= _MIN_RETURNS:
+            # A shorter stream takes over only because the current one has ended. Its frames are then counted anew.
             other_count = self._other_count if is_other_longer else 0
             self._swap(sequence, now, current_count, other_count)
             return IN_ORDER

@@ -179,11 +179,11 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
-    """Like `_convert`, for finite values and for letters other than those of integers with a range."""
+    """Yield the stored value for the letters that `_convert` does not handle itself; ``value`` is finite."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float
         yield struct.unpack("<f", struct.pack("<f", value))[0]
-    elif letter == "c":  # 0 to 255
+    elif letter == "c":  # limited to 0..255
         yield float(max(0, min(255, whole)))
     elif letter == "U":  # 16 bits that wrap
         yield float(whole & 0xFFFF)

@@ -47,8 +47,8 @@ class _ItemSequence(Snapshot):
         """Check that all items can be sent.
 
         NaN is accepted where the standard defines it as "not given": headings and reserved parameters. If you know the
-        autopilot, pass ``home_is_item_0`` to check more: True for missions of ArduPilot, where home takes the place of
-        one item; False for other autopilots, for which 0°, 0° does not mean "the current position".
+        autopilot, pass ``home_is_item_0`` to check more: True for missions of ArduPilot, which stores home as item 0,
+        so that one item fewer fits; False for other autopilots, for which 0°, 0° does not mean "the current position".
 
         Raises:
             InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.
@@ -227,7 +227,11 @@ def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
     item = items[first]
     count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0  # A polygon has at least 3 vertices.
     vertices = items[first : first + count]
-    if not count or len(vertices) < count or any(vertex.command != item.command for vertex in vertices):
+    if not count:
+        raise RemoteProtocolError(
+            f"item {first} ({item.name}) begins a polygon of {item.param1:g} vertices, but 3 to 65535 are possible"
+        )
+    if len(vertices) < count or any(vertex.command != item.command for vertex in vertices):
         raise RemoteProtocolError(
             f"item {first} ({item.name}) begins a polygon of {item.param1:g} vertices, but some of them are missing"
         )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aerokit.position import Home, Position
 
 _MAX_DURATION_S = 65_535.0  # ArduPilot stores seconds in 16 bits
-_MAX_RADIUS_M = 65_535.0  # ArduPilot stores metres in 16 bits
+_MAX_METRES = 65_535.0  # ArduPilot stores metres in 16 bits
 # Value of parameters that have no meaning in a command, or that the functions below leave at their default.
 _UNSET = 0.0
 
@@ -68,9 +68,10 @@ def waypoint(
     """Fly to a place and hold there for ``hold_s`` seconds.
 
     ``hold_s`` is 0 to 65,535; ArduPilot stores whole seconds, and ArduPlane does not support it. A place counts as
-    reached at a distance of ``acceptance_radius_m`` (0: the vehicle's parameter); ArduCopter ignores this distance. A
-    plane may pass the place at a distance of ``pass_by_m``, negative for the other side. ArduPlane stores both
-    distances in whole metres up to 255.
+    reached at a distance of ``acceptance_radius_m`` (0: the vehicle's parameter); ArduCopter ignores this distance. By
+    the standard, a plane passes the place at a distance of ``pass_by_m``, clockwise if positive, counter-clockwise if
+    negative. ArduPlane instead flies on this far beyond the place; PX4 ignores it. ArduPlane stores both distances in
+    whole metres up to 255.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
     """
     return place_item(
@@ -79,8 +80,8 @@ def waypoint(
         longitude_deg,
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("hold_s", hold_s, 0, _MAX_DURATION_S),
-        in_range("acceptance_radius_m", acceptance_radius_m, 0, _MAX_RADIUS_M),
-        in_range("pass_by_m", pass_by_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
+        in_range("acceptance_radius_m", acceptance_radius_m, 0, _MAX_METRES),
+        in_range("pass_by_m", pass_by_m, -_MAX_METRES, _MAX_METRES),
         heading("yaw_deg", yaw_deg),
         is_needed=True,
     )
@@ -283,7 +284,7 @@ def land(
         latitude_deg,
         longitude_deg,
         _altitudes_or_home(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
-        in_range("abort_altitude_m", abort_altitude_m, 0, _MAX_RADIUS_M),
+        in_range("abort_altitude_m", abort_altitude_m, 0, _MAX_METRES),
         in_range("precision", precision, 0, 2),
         _UNSET,
         heading("yaw_deg", yaw_deg),
@@ -379,7 +380,7 @@ def loiter_unlimited(
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         _UNSET,
         _UNSET,
-        in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
+        in_range("radius_m", radius_m, -_MAX_METRES, _MAX_METRES),
         heading("yaw_deg", yaw_deg),
     )
 
@@ -421,8 +422,8 @@ def loiter_time(
 ) -> MissionItem:
     """Stay at a place for 0 to 65,535 seconds. ArduPilot stores whole seconds, and only the sign of the radius.
 
-    ``leave_tangentially`` makes a plane fly to the next item on the line from its circle, not on the line from the
-    centre. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
+    ``leave_tangentially`` makes a plane fly to the next item from the point at which it leaves its circle. Otherwise it
+    joins the line from the centre of the circle. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
     """
     return place_item(
         MavCmd.NAV_LOITER_TIME,
@@ -431,7 +432,7 @@ def loiter_time(
         (altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("duration_s", duration_s, 0, _MAX_DURATION_S),
         _UNSET,
-        in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
+        in_range("radius_m", radius_m, -_MAX_METRES, _MAX_METRES),
         float(leave_tangentially),
     )
 
@@ -536,7 +537,7 @@ def loiter_to_altitude(
         MavCmd.NAV_LOITER_TO_ALT,
         *_place_or_altitude(latitude_deg, longitude_deg, (altitude_relative_m, altitude_amsl_m, altitude_terrain_m)),
         _UNSET,
-        in_range("radius_m", radius_m, -_MAX_RADIUS_M, _MAX_RADIUS_M),
+        in_range("radius_m", radius_m, -_MAX_METRES, _MAX_METRES),
         _UNSET,
         float(leave_tangentially),
     )

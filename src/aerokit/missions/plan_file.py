@@ -82,7 +82,7 @@ def parse_plan(text: str, name: str = "plan") -> Plan:
 def format_plan(plan: Plan | Mission) -> str:
     """Format a plan or a mission as the text of a .plan file.
 
-    If the plan was read from a file, only the changed parts of that file's text are replaced.
+    If the plan was read from a file, all values of that file that have not changed are kept, also unknown fields.
 
     Raises:
         InvalidArgument: ``plan`` is neither a plan nor a mission, or a .plan file cannot store a value: rally points
@@ -138,10 +138,7 @@ def _check_required(document: JsonValue) -> None:
     unlisted = len(incomplete) - len(texts)
     if unlisted:
         texts.append(f"{unlisted} more objects are incomplete")
-    missing_count = sum(len(keys) for _, keys in incomplete)
-    raise FileFormatError(
-        f"{document.name}: {'; '.join(texts)}, which {'is' if missing_count == 1 else 'are'} required"
-    )
+    raise FileFormatError(f"{document.name}: required fields are missing: {'; '.join(texts)}")
 
 
 def _missing_fields(plan: Any) -> Iterator[tuple[str, list[str]]]:

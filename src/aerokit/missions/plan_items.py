@@ -187,7 +187,10 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
 def _jump_ids(
     entries: Sequence[JsonValue], groups: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
 ) -> dict[int, int]:
-    """Map each doJumpId to the index of its item. Simple items take precedence over those inside surveys."""
+    """Map each doJumpId to the index of its item. Simple items take precedence over those inside surveys.
+
+    ``groups`` has the simple items of each entry (None for a landing pattern), ``sizes`` its number of mission items.
+    """
     ids_of_simple_items: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
     first = 0
@@ -195,7 +198,8 @@ def _jump_ids(
         for index, value in enumerate(group or (), first):
             member = value.child("doJumpId")
             jump_id = index + 1 if member is None else member.integer(-1, 2**31)
-            if value is entry:
+            is_simple_item = value is entry  # A simple item is the only item of its own entry.
+            if is_simple_item:
                 ids_of_simple_items.setdefault(jump_id, index)
             else:
                 ids_in_surveys.setdefault(jump_id, index)
@@ -262,7 +266,7 @@ def _set_jump_ids(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[
 
 
 def load_json(text: str, name: str) -> JsonValue:
-    """Parse a JSON document, or raise :class:`FileFormatError`, which names the line."""
+    """Parse a JSON document, or raise :class:`FileFormatError`, which names the line of a syntax error."""
     try:
         return JsonValue(json.loads(text, parse_constant=_no_constant), name, "")
     except json.JSONDecodeError as error:

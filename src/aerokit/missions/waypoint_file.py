@@ -61,10 +61,10 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     """Parse the text of a ``QGC WPL`` file. Error texts begin with ``name``."""
     numbered_lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     numbered_lines = [(number, line) for number, line in numbered_lines if line and not line.startswith("#")]
-    _, first_line = numbered_lines[0] if numbered_lines else (0, "nothing")
+    first_number, first_line = numbered_lines[0] if numbered_lines else (1, "nothing")
     *file_type, version = first_line.split() or [""]
     if file_type != ["QGC", "WPL"] or version not in ("110", "120"):
-        raise FileFormatError(f"{name}: line 1: expected 'QGC WPL 110', found {first_line[:40]!r}")
+        raise FileFormatError(f"{name}: line {first_number}: expected 'QGC WPL 110', found {first_line[:40]!r}")
     rows = [
         _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(numbered_lines[1:])
     ]

@@ -215,8 +215,8 @@ def pack_items(
 
     A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` only for missions: items from index
     ``first`` on are replaced or appended, all others are kept. Jump targets must then be below the number of items in
-    the file (ArduPilot 4.7). ArduPilot processes a file when it is closed, and first clears the old mission. If it
-    refuses an item, the new mission consists of the items before that item.
+    the file (ArduPilot 4.7). ArduPilot processes a file when it is closed. Without :data:`NO_CLEAR` it first
+    clears the old mission; if it then refuses an item, the new mission consists of the items before that item.
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")
@@ -248,7 +248,7 @@ def read_header(data: bytes) -> PlanHeader:
 
 
 def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
-    """Decode the items of a packed plan, counted as the vehicle counts them.
+    """Decode the items of a packed plan, with the vehicle's numbering: on ArduPilot, item 0 is home.
 
     Raises:
         RemoteProtocolError: the data is not a packed plan, is truncated, or has another ``mission_type``.

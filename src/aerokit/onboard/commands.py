@@ -196,7 +196,7 @@ class ComponentCommands:
         task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
-        # The event loop calls `cancel` after this method has returned. The variables below are then set.
+        # `cancel` is called after this method has returned, when `returned` and `running` below are set.
         def cancel() -> None:
             """Cancel the handler, because the sender of the command or the end of the component requires it."""
             nonlocal is_cancelled
@@ -208,19 +208,19 @@ class ComponentCommands:
                 is_cancelled = True
                 if inspect.iscoroutine(returned):
                     returned.close()
-                self._running.finish(started, Outcome(MavResult.CANCELLED))
+                self._running.finish(running, Outcome(MavResult.CANCELLED))
 
-        running = self._running.start(command, cancel)
-        if running is None:  # start() has answered already: the command is a repetition, or another command is running.
+        started = self._running.start(command, cancel)
+        if started is None:  # start() has answered already: the command is a repetition, or another command is running.
             return
-        started = running  # This name tells type checkers that the value is not None in the closure.
+        running = started  # Unlike `started`, this is never None, which type checkers require in the closures.
         loop = asyncio.get_running_loop() if self.uses_threads else None
 
         def report(percent: int) -> None:
             if loop is None:
-                self._running.report(started, percent)
+                self._running.report(running, percent)
             else:  # The handler runs in a thread, which must not call the event loop's objects directly.
-                loop.call_soon_threadsafe(self._running.report, started, percent)
+                loop.call_soon_threadsafe(self._running.report, running, percent)
 
         request = CommandRequest(command, report)
         try:

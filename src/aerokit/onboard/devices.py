@@ -166,7 +166,8 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
-            # NONE says that the reason is in the status text, GENERIC that there is no specific reason.
+            # After DENIED, the status text has the program's reason, which NONE stands for. Any other result means that
+            # the authorizer itself failed, so there is no specific reason (GENERIC).
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)
         if isinstance(answer, CommandResult):

@@ -65,38 +65,38 @@ class EventSender:
         self._host.send(m.CurrentEventSequence(self._sequence, flags=0))
         self._host.call_later(SEQUENCE_INTERVAL_S, self._send_sequence)
 
-    def _on_request(self, request: m.RequestEvent, channel: Channel) -> None:
+    def _on_request(self, request: m.RequestEvent, sender: Channel) -> None:
         """Send requested events again; answer with an error if none of them is stored any more."""
         # Sequence numbers have 16 bits and wrap around, so `last_sequence` may be below `first_sequence`.
         count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
         requested = {(request.first_sequence + i) & 0xFFFF for i in range(min(count, MAX_STORED_EVENTS))}
         stored = [event for event in self._sent if event.sequence in requested]
         for event in stored:
-            self._host.send(event, channel)
+            self._host.send(event, sender)
         if not stored:
             oldest = self._sent[0].sequence if self._sent else 0
-            system, component = channel
+            system, component = sender
             error = m.ResponseEventError(system, component, request.first_sequence, oldest, reason=_UNAVAILABLE)
-            self._host.send(error, channel)
+            self._host.send(error, sender)
 
 
 def answer_pings(host: ComponentHost) -> None:
     """Answer PING requests and TIMESYNC requests."""
 
-    def on_ping(ping: m.Ping, channel: Channel) -> None:
+    def on_ping(ping: m.Ping, sender: Channel) -> None:
         if ping.target_system == 0 and ping.target_component == 0:  # A PING with a target is an answer.
-            sender_system, sender_component = channel
+            sender_system, sender_component = sender
             answer = m.Ping(ping.time_usec, ping.seq, target_system=sender_system, target_component=sender_component)
-            host.send(answer, channel)
+            host.send(answer, sender)
 
-    def on_timesync(message: m.Timesync, channel: Channel) -> None:
+    def on_timesync(message: m.Timesync, sender: Channel) -> None:
         if message.tc1 == 0:  # A TIMESYNC with another value is an answer.
             own_time_ns = int(host.now * 1e9)
-            sender_system, sender_component = channel
+            sender_system, sender_component = sender
             answer = m.Timesync(
                 tc1=own_time_ns, ts1=message.ts1, target_system=sender_system, target_component=sender_component
             )
-            host.send(answer, channel)
+            host.send(answer, sender)
 
     host.on(m.Ping, on_ping)
     host.on(m.Timesync, on_timesync)

@@ -101,7 +101,10 @@ class ComponentHost:
         return True
 
     def send(self, message: Message, channel: Channel = None) -> None:
-        """Send a message to one system, or to all if ``channel`` is None. Does nothing after the connection ended."""
+        """Send a message. Does nothing after the connection ended.
+
+        ``channel`` has the ids of the receiving component, whose whole system gets the message; None: all systems.
+        """
         if self._is_closed or not self.connection.is_open:
             return
         to = None

@@ -259,7 +259,10 @@ class _Store:
         return self._parameters._rows[name].type
 
     def problem(self, name: str, value: object, type: int) -> tuple[int, int] | None:  # noqa: A002
-        """Return the MAV_PARAM_ERROR and the PARAM_ACK for a value that is refused; None for an allowed value."""
+        """Check a value, and offer it to the program's ``on_set``. Return None if it is accepted.
+
+        Otherwise return its MAV_PARAM_ERROR and PARAM_ACK. An error text is sent as a status text.
+        """
         row = self._parameters._rows[name]
         if row.metadata.read_only:
             return MavParamError.READ_ONLY, ParamAck.FAILED

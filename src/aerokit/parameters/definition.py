@@ -163,7 +163,7 @@ class CameraDefinition(Snapshot):
         return options
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
-        """Return the options that a setting has now, and as texts the selected options of others that restrict them."""
+        """Return the options that a setting has now, and what restricts them, e.g. ``CAM_EXPMODE = Auto``."""
         options = self.settings[name].options if name in self.settings else ()
         reasons: list[str] = []
         for setting, selected in self._selected(values):
@@ -416,7 +416,7 @@ class _Reader:
         )
 
     def _options(self, nodes: Iterable[Element], wire_type: int) -> Iterator[SettingOption]:
-        """Yield the options of a setting whose value is valid for its type."""
+        """Yield those options of a setting whose values are valid for the setting's type."""
         for node in nodes:
             value = _parse_value(node.get("value"), wire_type)
             if value is not None:

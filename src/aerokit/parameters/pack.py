@@ -135,10 +135,10 @@ def pack_for_download(
 ) -> bytes:
     """Encode ``@PARAM/param.pck`` for these parameters, without validating their values.
 
-    ``block_size`` is the number of data bytes per read. ``count`` 0 means all parameters from ``start`` on. No block
-    boundary splits a value or a default. PX4 keeps a value and its default in the same block; ArduPilot
-    (``whole_defaults=False``) may put them into different blocks. InvalidArgument is raised if ``start`` is beyond the
-    list.
+    ``block_size`` is the number of data bytes per read. ``count`` 0 means all parameters from ``start`` on. PX4 keeps a
+    value and its default in the same block. ArduPilot (``whole_defaults=False``) only keeps the last number of an entry
+    in one block: the default, or the value if there is no default (AP_Filesystem_Param.cpp). InvalidArgument is raised
+    if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
@@ -152,7 +152,7 @@ def pack_for_download(
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
-        # The value (and its default) at the end of the entry must not be split between two blocks.
+        # This many bytes at the end of the entry must not be split between two blocks.
         _, value_format = _CODES[code]
         unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size

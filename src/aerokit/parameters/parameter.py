@@ -118,7 +118,9 @@ def check_name(name: str) -> str:
 
 
 def checked_value(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
-    """Convert a value to the form in which a vehicle stores it in this type: an int, or the nearest 32-bit float.
+    """Convert a value to the form in which a vehicle stores it in this type.
+
+    This is an int, the nearest 32-bit float (REAL32), or the float itself (REAL64).
 
     Raises:
         InvalidArgument: the type cannot hold the value: NaN, infinity, 300 as an INT8, 1.5 as an integer.

@@ -41,7 +41,7 @@ _WAYPOINT = "SPEED>SPD SPEED_UP>SPD_UP SPEED_DN>SPD_DN RADIUS>RADIUS_M ACCEL>ACC
 
 _ATTITUDE = "ACCEL_R_MAX>ACC_R_MAX ACCEL_P_MAX>ACC_P_MAX ACCEL_Y_MAX>ACC_Y_MAX SLEW_YAW>RATE_WPY_MAX"
 
-_HORIZONTAL = "P I D FF FLTE FLTD"
+_VELOCITY_CONTROLLER = "P I D FF FLTE FLTD"
 
 _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 
@@ -49,8 +49,8 @@ _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 def _position_controller(prefix: str) -> tuple[tuple[int, str], ...]:
     """Return the pairs of the position controller, which changed from north-east-up in cm to north-east-down in m."""
     moved = (
-        _same(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _HORIZONTAL),
-        _same(f"{prefix}VELZ_", f"{prefix}D_VEL_", _HORIZONTAL),
+        _same(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _VELOCITY_CONTROLLER),
+        _same(f"{prefix}VELZ_", f"{prefix}D_VEL_", _VELOCITY_CONTROLLER),
         _same(f"{prefix}ACCZ_", f"{prefix}D_ACC_", _VERTICAL_ACCELERATION),
         _prefixed(prefix, prefix, "POSXY_P>NE_POS_P POSZ_P>D_POS_P JERK_XY>NE_JERK JERK_Z>D_JERK"),
     )

@@ -18,7 +18,7 @@ from aerokit.parameters.parameter import Parameter, ParameterType, to_float32
 from aerokit.parameters.rename_table import GROUPS, INVERTED, OLDER, ONE_WAY, OTHER_NEW_NAMES, REPLACED
 
 # The value 1 of ARMING_CHECK enables all checks, bits 1 to 20 enable single checks. ARMING_SKIPCHK = -1 skips all.
-_ALL_CHECKS = 1
+_ALL_BIT = 1  # This single bit of ARMING_CHECK enables all checks.
 _SINGLE_CHECKS = 0x1FFFFE
 _SKIP_ALL = -1
 
@@ -200,18 +200,18 @@ def _checks_to_skip(checks: int) -> int:
     If all checks are enabled, none are skipped. If none are enabled, all are skipped, including future checks.
     Otherwise the checks that are not enabled are skipped.
     """
-    if checks & _ALL_CHECKS:
+    if checks & _ALL_BIT:
         return 0
     return ~checks & _SINGLE_CHECKS if checks & _SINGLE_CHECKS else _SKIP_ALL
 
 
 def _checks_to_make(skipped: int) -> int:
-    return _ALL_CHECKS if skipped == 0 else ~skipped & _SINGLE_CHECKS
+    return _ALL_BIT if skipped == 0 else ~skipped & _SINGLE_CHECKS
 
 
 @lru_cache(maxsize=1)
 def _by_name() -> Mapping[str, tuple[Rename, ...]]:
-    """Return the renames of each name, old or new, from the table."""
+    """Map each name, old or new, to its renames; renames in `ONE_WAY` are found only by the old name."""
     two_way: dict[str, Rename] = {}
     for vehicles, divisor, pairs in GROUPS:
         for old, new in _pairs(pairs):

@@ -151,7 +151,8 @@ def diff(
     """Compare parameters. Differences are in the order of ``before``; parameters that only ``after`` has come last.
 
     Numbers that are equal as 32-bit floats, or differ by at most ``tolerance``, count as the same. ``names`` restricts
-    the comparison: ``diff(file, table, names=file)`` ignores parameters that the file does not have.
+    the comparison, and gives the order: ``diff(file, table, names=file)`` ignores parameters that the file does not
+    have.
     """
     old, new = plain_values(before), plain_values(after)
     compared = dict.fromkeys(names) if names is not None else {**dict.fromkeys(old), **dict.fromkeys(new)}
@@ -175,7 +176,7 @@ def _same(left: float | None, right: float | None, tolerance: float) -> bool:
 
 
 def _text(value: float | None) -> str:
-    """Return a value for the text of a difference."""
+    """Return the text of a value in the description of a difference."""
     if value is None:
         return "missing"
     try:

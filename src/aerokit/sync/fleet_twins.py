@@ -128,7 +128,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
-                unavailable after a leg, and the other members stay in their layers.
+                unavailable after the separation was planned. Then nothing was sent, or after a leg the others stay in
+                their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -324,8 +325,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: the last upload failed for a member, or a member is unavailable or not armed. Nothing was
-                sent.
+            OperationRejected: the last upload failed for a member, or had no mission for these members, or a member is
+                unavailable or not armed. Nothing was sent.
         """
         return self._loop.run(self.aio.start_missions, timeout=timeout, stagger_s=stagger_s)
 
@@ -345,7 +346,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Ignores items without a position, terrain altitudes and jumps.
+        Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced by the
+        member's present altitude.
 
         Args:
             missions: maps names of members to missions.

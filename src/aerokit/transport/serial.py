@@ -78,7 +78,7 @@ class SerialLink(BaseLink):
             return
         self._outbox.discard()
         bytes_before = self._waiting_to_be_sent(self._transport)
-        self._transport.flush()
+        self._transport.flush()  # In pyserial-asyncio, flush() discards the transport's buffer.
         with contextlib.suppress(Exception):
             self._port.reset_output_buffer()
         discarded_bytes = bytes_before - self._waiting_to_be_sent(self._transport)
@@ -95,7 +95,7 @@ class SerialLink(BaseLink):
         self._transport = importlib.import_module("serial_asyncio").SerialTransport(
             self._loop, _SerialProtocol(self), port
         )
-        _replace_calls(port, self._device_failed)
+        _replace_port_methods(port, self._device_failed)
         limit = max(4096, int(self._baud / 10 * _MAX_BUFFER_S))
         # The transport must buffer nothing itself: data that the driver does not accept waits in the outbox, where it
         # can be discarded.
@@ -165,9 +165,10 @@ class SerialLink(BaseLink):
         """Close the port without waiting for unsent data."""
         unsent = self._waiting_to_be_sent(transport)
         with contextlib.suppress(RuntimeError):  # The loop may be closed.
-            # `_release` has already called this, but a call before the transport's first loop iteration has no effect.
+            # `_release` has already called pause_reading(), but before the transport's first loop iteration that call
+            # has no effect.
             transport.pause_reading()
-            transport.flush()
+            transport.flush()  # In pyserial-asyncio, flush() discards the transport's buffer.
         if unsent:
             with contextlib.suppress(Exception):
                 # Without this call, close() would wait up to 30 s for the unsent data.
@@ -200,7 +201,7 @@ class _SerialProtocol(asyncio.Protocol):
         self._link._lose(f"the device failed: {exc}", exc)
 
 
-def _replace_calls(port: Any, on_failure: _OnFailure) -> None:
+def _replace_port_methods(port: Any, on_failure: _OnFailure) -> None:
     """Replace methods of a port, so that they never block, and report a lost device to ``on_failure``."""
     port.flush = lambda: None
     if os.name == "posix":

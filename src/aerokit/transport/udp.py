@@ -283,8 +283,9 @@ class UdpBroadcast(_UdpLink):
         elif not self._is_accepted(source):
             return
         elif not self._keeps_peers:
-            self.keep_peer(source)  # From now on, `write` sends to this peer instead of broadcasting.
-        # If the receiver keeps no peers, this link has a single remote end, and its peer is None.
+            # The receiver does not choose peers, so this link does: `write` sends to this peer instead of broadcasting.
+            self.keep_peer(source)
+        # Such a link has a single remote end for its receiver, so its peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:

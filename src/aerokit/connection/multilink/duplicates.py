@@ -54,10 +54,14 @@ class Copies:
         self._counts: dict[int, int] = {}  # sender → number of its frames that were not copies
         self._current: _Seen | None = None  # record of the last checked frame; None before the first
         self.is_late: bool = False
-        """True if the last checked frame equals one that was accepted over another link some seconds ago."""
+        """True if the last checked frame may be a copy of one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int) -> bool:
-        """Return True if an equal frame arrived within `COPY_WINDOW_S` over another link, but not yet over this one."""
+        """Remember a frame. Return True if it is a copy: an equal frame arrived recently, but only over other links.
+
+        Recently means within `COPY_WINDOW_S` and `COPY_WINDOW_FRAMES`. The other methods, and :attr:`is_late`, refer to
+        the last frame for which this method was called.
+        """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
         count = self._counts.get(sender, 0)
@@ -192,6 +196,7 @@ class MergedStreams:
             return False
         if frame.received_at <= choice.fresh_after and frame.message_id not in ANSWERS:
             return False  # This telemetry may be older than the last telemetry that the previous link delivered.
+        # A late frame that equals an accepted one is probably a delayed copy.
         if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
         if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):

@@ -84,7 +84,7 @@ class LinkProbes:
         # depend on the system and the link, because several probes may be sent at the same time.
         ts1 = int(now * 1e9) // 1000 * 1000 + (system_id * len(self._names) + candidate.link) % 1000
         if ts1 <= 0 or ts1 in self._pending:
-            return  # The number is invalid, or belongs to another pending probe. The next call tries again.
+            return  # The number is invalid, or belongs to another pending probe. The next probe is sent as usual.
         if len(self._pending) >= MAX_PENDING:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = system_id, candidate.link, now

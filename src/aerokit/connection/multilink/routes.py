@@ -204,6 +204,7 @@ class MultiLinkRoutes:
 
         A message for an unknown system goes to every peer. A broadcast reaches each known system once if possible, and
         is also sent over links without a known system. Heartbeats and time messages go to all peers of all links.
+        ``message`` is None for raw frames, which count as commands.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
@@ -225,7 +226,8 @@ class MultiLinkRoutes:
     def is_copy(self, frame: Frame, peer: Peer) -> bool:
         """Return True if this frame was already accepted over another link, or is our own.
 
-        PX4 forwards our heartbeats from one of its ports to its other ports.
+        PX4 forwards our heartbeats from one of its ports to its other ports. What a copy proves about its link is
+        recorded.
         """
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
@@ -309,7 +311,10 @@ class MultiLinkRoutes:
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
-        """Return peers that together reach every system. No peer is added for a system that is already reached."""
+        """Return peers that together reach every system, each only once if possible.
+
+        Links over which no system is known are added as well.
+        """
         peers: set[Peer] = set()
         links_with_systems: set[int] = set()
         # Each system has a list of options, one for each usable link: the peers on this link that reach the system. The
@@ -324,7 +329,7 @@ class MultiLinkRoutes:
                     if candidate is not choice.used and choice.may_be_used(candidate) and candidate.is_alive(now)
                 ]
                 options_by_system.append(
-                    [self._peers_on(candidate.link, system_id, 0) for candidate in (choice.used, *usable)]
+                    [self._peers_on(candidate.link, system_id, component_id=0) for candidate in (choice.used, *usable)]
                 )
         # Systems with a single option come first, because their peers must be added in any case. If these peers also
         # reach a system with several options, no peer needs to be added for that system.

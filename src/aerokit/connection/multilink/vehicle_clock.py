@@ -54,8 +54,8 @@ class VehicleClock:
     def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
         """Return True if a sample from another link agrees with this clock; ``at`` is the middle of the round trip.
 
-        Return None while the speed is unknown, because a simulation may run at any speed. The speed from before a pause
-        or reboot can confirm a sample, but not contradict it.
+        While the speed is unknown, a simulation may run at any speed. The result is then None, unless the sample fits
+        the speed from before the last pause or reboot, which can confirm a sample, but not contradict it.
         """
         fits = self._fits(at, vehicle_s, round_trip_s)
         if self._measured_speed is None and not fits:

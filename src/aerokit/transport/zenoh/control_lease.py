@@ -343,7 +343,10 @@ class DelayEstimator:
         self._measured_at = 0.0  # time at which `_min_offset` was measured
 
     def delay(self, sent_s: float, now: float) -> float:
-        """Return the delay in seconds of data sent at ``sent_s`` on the sender's clock and received at ``now``."""
+        """Return how many seconds longer than the fastest data so far this data took; 0 for the first data.
+
+        ``sent_s`` is the send time on the sender's clock, ``now`` the receive time on ours.
+        """
         offset = now - sent_s
         if self._min_offset is not None:
             # The clocks may drift apart, so with time a slightly larger offset counts as no delay.

@@ -223,7 +223,7 @@ def attachment_of(sample: Any) -> bytes:
 
 
 def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
-    """Build zenoh's configuration from the file, the options and aerokit's settings, in this order."""
+    """Build zenoh's configuration from the file or aerokit's default settings, and the options."""
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
     except zenoh.ZError as error:
@@ -233,7 +233,7 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         raise InvalidArgument(f"{address}: zenoh does not accept the options: {_reason(error)}") from error
-    defaults = () if options.config else _DEFAULT_SETTINGS  # A configuration file replaces aerokit's settings.
+    defaults = () if options.config else _DEFAULT_SETTINGS  # A configuration file replaces the default settings.
     for key, value in (_DROP_AT_ONCE, *defaults):
         with contextlib.suppress(zenoh.ZError):  # Some versions of zenoh do not know the option.
             config.insert_json5(key, json.dumps(value))
