@@ -2407,7 +2407,7 @@ class Calibration(CalibrationTwin):
     def cancel(self) -> None:
         """Cancel the calibration, and return when the vehicle has confirmed the end.
 
-        Does nothing if the calibration has not started or has ended.
+        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps.
 
         Raises:
             NotSupported: the vehicle cannot cancel this calibration.
@@ -3333,7 +3333,10 @@ class Camera(TwinOf["AsyncCamera"]):
         return self.aio.number
 
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself. All other calls also wait for this.
+        """Wait until the camera is found and has identified itself.
+
+        All other calls also wait until the camera is found. They request its information unless it is known, and work
+        without it only on a camera that is attached to the autopilot.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
