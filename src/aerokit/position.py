@@ -74,7 +74,7 @@ class Home(Snapshot):
         return Position(self.latitude_deg, self.longitude_deg)
 
 
-def point_at(place: Position | Home) -> Position:
+def position_with_altitude(place: Position | Home) -> Position:
     """Return a place as a Position. A Home is converted with its altitude above mean sea level."""
     return place.position.replace(altitude_amsl_m=place.altitude_amsl_m) if isinstance(place, Home) else place
 

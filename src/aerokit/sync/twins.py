@@ -1438,9 +1438,9 @@ class Files(TwinOf["AsyncFiles"]):
         """Copy a file to this computer. The copy is written to ``<to>.part`` and renamed when it is complete.
 
         With ``resume``, the download continues the ``<to>.part`` of an interrupted download, unless the vehicle's file
-        is shorter than the part. If the vehicle can compute the CRC-32 of its file, aerokit compares it with that of
-        the copy; if they differ, the whole file is read again. Files whose names begin with ``@`` are always read
-        completely.
+        is shorter than the part. After such a resumed download, aerokit compares the CRC-32 of the copy with that of
+        the vehicle's file, if the vehicle can compute it; if they differ, the whole file is read again. Files whose
+        names begin with ``@`` are always read completely.
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
@@ -2407,7 +2407,7 @@ class Calibration(CalibrationTwin):
     def cancel(self) -> None:
         """Cancel the calibration, and return when the vehicle has confirmed the end.
 
-        Does nothing if the calibration has not started or has ended.
+        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps.
 
         Raises:
             NotSupported: the vehicle cannot cancel this calibration.
@@ -2601,10 +2601,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         return self.aio.reached
 
     def set_current(self, item: int, *, timeout: float = 5.0) -> None:
-        """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
+        """Make ``item`` the current item. A vehicle that is flying its mission proceeds to it immediately.
 
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
-        without a position (a DO command) is executed; ``current`` then shows the next item.
+        without a position (a DO command) is executed; ``current`` then shows the item after it.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -2618,7 +2618,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """Fly the mission from ``item`` on; returns when HEARTBEAT reports the mission mode.
 
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
-        a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
+        a take-off as the first item. If you cancel the call, or it raises OperationTimeout, aerokit orders the vehicle
+        to hold.
 
         ArduPilot gets MISSION_START, because a mode change alone does not make it take off. Other autopilots get a mode
         change.
@@ -3333,7 +3334,10 @@ class Camera(TwinOf["AsyncCamera"]):
         return self.aio.number
 
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself. All other calls also wait for this.
+        """Wait until the camera is found and has identified itself.
+
+        All other calls also wait until the camera is found. They request its information unless it is known, and work
+        without it only on a camera that is attached to the autopilot.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -4041,9 +4045,9 @@ class Vehicle(VehicleTwin):
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
             NotSupported: the vehicle runs ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
-            CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
-            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot make this part fail. If an
-                acknowledgement was lost, the part may have failed.
+            CommandRejected: SYS_FAILURE_EN is 0, or PX4 can let this part fail, but not in this way.
+            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot let this part fail in any way. If
+                an acknowledgement was lost, the part may have failed.
         """
         self._loop.run(self.aio.inject_failure, unit, kind, instance=instance, intent=intent)
 
@@ -4154,7 +4158,7 @@ class Vehicle(VehicleTwin):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
-        or their effect is reported. The retries also end when a newer order about the same subject is given, when the
+        or their effect is reported. The retries also end when a newer order about the first subject is given, when the
         vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
         the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
         vehicle hold nor monitors late arming; use the actions for that.
@@ -4421,7 +4425,8 @@ class Vehicle(VehicleTwin):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts. Three seconds before this error, a vehicle whose pre-arm checks fail is asked for its reasons.
+                texts. A mode that does not allow arming is named after this list. Three seconds before this error, a
+                vehicle whose pre-arm checks fail is asked for its reasons.
         """
         self._loop.run(self.aio.wait_ready, timeout=timeout)
 
@@ -4896,20 +4901,20 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait until HOME_POSITION reports the new place.
+        """Move the home position, and wait for the next HOME_POSITION, which has the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
         firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
-            timeout: seconds until HOME_POSITION reports the new place.
+            timeout: seconds to wait for HOME_POSITION after the acknowledgement.
 
         Raises:
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: the vehicle accepted the command, but HOME_POSITION does not report the new place.
+            OperationTimeout: the vehicle accepted the command, but no HOME_POSITION was received.
         """
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 

@@ -212,7 +212,7 @@ async def _attached(
     timeout: float,
     rates: Mapping[type[Message], float] | None,
 ) -> AsyncIterator[Vehicle]:
-    """Find a vehicle on an open connection, and close it at the end of the `async with` block."""
+    """Find a vehicle on an open connection. Its session ends with the `async with` block; the connection stays open."""
     context, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
     was_left_by_exception = False
     try:

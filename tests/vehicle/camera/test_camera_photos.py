@@ -119,6 +119,25 @@ async def test_photo_order_with_lost_ack_is_not_resent() -> None:
         assert len(commands) == camera.image_count == 1
 
 
+async def test_older_photo_order_with_lost_ack_returns_the_capture() -> None:
+    camera = SimulatedCamera(shutter_s=3.0)
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        camera.faults.refuse(START, MavResult.UNSUPPORTED)
+        camera.faults.lose_ack(MavCmd.DO_DIGICAM_CONTROL)
+        assert (await vehicle.camera.take_photo()).index == 0
+        assert camera.image_count == 1
+
+
+async def test_photo_timeout_before_acknowledgement_is_reported() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        camera.faults.ignore(START)
+        with pytest.raises(CommandTimeout, match=r"did not acknowledge the order for a picture within 0\.2 s"):
+            await vehicle.camera.take_photo(timeout=0.2)
+
+
 async def test_photo_order_without_evidence_is_not_resent() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
@@ -340,7 +359,7 @@ async def test_px4_trigger_takes_photos() -> None:
         assert found == [capture.index + 1, capture.index + 2, capture.index + 3]
         with pytest.raises(NotSupported, match="is a trigger output, which only takes pictures; nothing was sent"):
             await vehicle.camera.zoom_to(10)
-        with pytest.raises(OperationTimeout, match="did not identify itself within"):
+        with pytest.raises(OperationTimeout, match="did not identify itself;"):  # without waiting for the time-out
             await vehicle.camera.wait_found(timeout=4.0)
         assert not simulated.camera_trigger.is_running
 

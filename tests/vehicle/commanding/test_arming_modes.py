@@ -178,6 +178,18 @@ async def test_plane_in_autoland_arms_in_passive_mode() -> None:
         assert vehicle.is_armed
 
 
+async def test_wait_ready_names_unarmable_mode_after_the_list() -> None:
+    """The mode is not missing, because arm() changes it."""
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        flight.copter.faults.prearm_failures.append("Compass not healthy")
+        flight.pilot_takes_over(CopterMode.LAND)
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "LAND")
+        await anyio.sleep(2.0)
+        with pytest.raises(OperationTimeout, match=r"still missing:(\n  - .*)+\nArduCopter cannot arm in LAND, only"):
+            await flight.vehicle.wait_ready(timeout=1.0)
+
+
 async def test_missing_for_flight_names_lost_link() -> None:
     """A result that is based on old values contains the lost link."""
     async with open_flight() as flight:

@@ -22,9 +22,15 @@ def exchanged(flight: Flight) -> Position:
 
 async def test_go_to_far_target_sends_nothing(flying: Flight) -> None:
     target = exchanged(flying)
-    with pytest.raises(InvalidArgument, match=r"target = .* km away, more than max_distance_m = 100,000"):
+    with pytest.raises(InvalidArgument, match=r"target = .* m away, more than max_distance_m = 100,000"):
         await flying.vehicle.go_to(target)
     assert flying.wire.sent == [] or all(m.NAME == "HEARTBEAT" for _, m in flying.wire.sent)
+
+
+async def test_error_of_far_place_has_metres(flying: Flight) -> None:
+    target = flying.vehicle.position.value.offset(north_m=400.0)
+    with pytest.raises(InvalidArgument, match=r"the place is 400 m away, more than max_distance_m = 300;"):
+        await flying.vehicle.go_to(target, max_distance_m=300.0)
 
 
 async def test_error_of_far_place_names_the_argument(flying: Flight) -> None:

@@ -164,9 +164,17 @@ async def test_trajectory_with_velocity_lags_less_than_position(flying: Flight) 
 
 
 async def test_actuators_of_new_firmware_raise_not_supported(flying: Flight) -> None:
-    with pytest.raises(NotSupported, match=r"ArduCopter .* ignores SET_ACTUATOR_CONTROL_TARGET"):
+    with pytest.raises(NotSupported, match="ArduCopter ignores SET_ACTUATOR_CONTROL_TARGET"):
         flying.vehicle.guided.actuators(ActuatorSetpoint((0.0,) * 8))
     assert flying.wire.setpoints() == []
+
+
+async def test_px4_actuators_of_unknown_version_raise_not_supported() -> None:
+    px4 = SimulatedPx4(boot_time_s=0.0, version="1.13.3")
+    px4.faults.lose(m.AutopilotVersion, times=1_000)
+    async with open_px4(px4) as flight:
+        with pytest.raises(NotSupported, match="the version of PX4 is not known yet; only PX4"):
+            flight.vehicle.guided.actuators(ActuatorSetpoint((0.0,) * 8))
 
 
 async def test_px4_actuators_of_old_firmware_are_flown() -> None:

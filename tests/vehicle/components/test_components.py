@@ -130,6 +130,15 @@ async def test_commands_and_requests_reach_the_component() -> None:
             await component.request(m.CameraInformation, timeout=2.0)
 
 
+async def test_request_waits_for_a_late_answer_until_timeout() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        camera.faults.lose(m.CameraSettings, times=3)
+        camera.call_later(6.0, lambda: camera.send(m.CameraSettings(time_boot_ms=7, mode_id=0)))
+        answer = await vehicle.component(100).request(m.CameraSettings, timeout=10.0)
+        assert answer.time_boot_ms == 7
+
+
 async def test_lost_answer_is_requested_again() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:

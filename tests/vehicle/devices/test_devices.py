@@ -12,7 +12,9 @@ from test_actuators import on_ground, on_px4, params
 
 from aerokit import messages as m
 from aerokit.errors import CommandRejected, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd as C
+from aerokit.vehicle.commanding.simple_orders import receive_once
 from aerokit.vehicle.files.log_stream import UlogAssembler
 
 pytestmark = pytest.mark.anyio
@@ -54,6 +56,22 @@ async def test_winch_pays_out_length_and_reports_it() -> None:
         status = await winch.status.wait_until(lambda _: True, timeout=2)
         assert status.length_m == pytest.approx(2.0, abs=0.15)
         assert status.is_healthy
+
+
+async def test_receive_once_ends_despite_messages_of_others() -> None:
+    async with on_ground() as flight, anyio.create_task_group() as tasks:
+        flight.copter.faults.lose(m.WinchStatus, times=1_000)
+        other = FrameEncoder(1, 169)
+
+        async def send_status_of_another_component() -> None:
+            while True:
+                flight.wire.deliver(other.encode(m.WinchStatus(0, 1.0, 0.0, 0.0, 0.0, 0.0, 20, 0)))
+                await anyio.sleep(0.5)
+
+        tasks.start_soon(send_status_of_another_component)
+        with anyio.fail_after(5.0):
+            assert await receive_once(flight.vehicle._context, m.WinchStatus) is None
+        tasks.cancel_scope.cancel()
 
 
 async def test_winch_newer_order_ends_wait_for_previous() -> None:

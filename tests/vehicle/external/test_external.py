@@ -339,6 +339,17 @@ async def test_parameter_that_ignores_measurements_raises(kind: str, parameter: 
                 raise AssertionError("entered")
 
 
+async def test_missing_parameters_of_measurements_are_named() -> None:
+    simulated = copter()
+    simulated.parameters._rows.pop("PRX1_TYPE")
+    simulated.parameters._names = None
+    async with open_flight(simulated) as flight:
+        error = "this build of ArduCopter ignores the measurements, because it has no PRX1_TYPE or PRX_TYPE$"
+        with pytest.raises(OperationRejected, match=error):
+            async with flight.vehicle.external.obstacles():
+                raise AssertionError("entered")
+
+
 async def test_px4_without_external_vision_raises() -> None:
     async with open_px4(px4(EKF2_EV_CTRL=3.0)) as flight:
         async with flight.vehicle.external.odometry():

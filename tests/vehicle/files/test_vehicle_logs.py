@@ -252,6 +252,20 @@ async def test_erase_removes_logs(bench: Bench) -> None:
     assert await bench.logs.list() == ()
 
 
+async def test_erase_continues_while_logs_disappear(ardupilot: Bench) -> None:
+    """Each LOG_ERASE removes one log, and together this takes longer than idle_timeout_s."""
+    assert len(ardupilot.server.logs) > 1
+    ardupilot.simulated.on(m.LogErase, lambda *_: ardupilot.server.logs.pop())
+    await ardupilot.logs.erase(idle_timeout_s=1.0)
+    assert await ardupilot.logs.list() == ()
+
+
+async def test_erase_without_effect_times_out(ardupilot: Bench) -> None:
+    ardupilot.simulated.on(m.LogErase, lambda *_: None)
+    with pytest.raises(FileTimeout, match=r"logs still exist, and none has gone for 3 s"):
+        await ardupilot.logs.erase(idle_timeout_s=3.0)
+
+
 @pytest.mark.exhaustive
 async def test_cancellation_at_any_time_ends_the_transfer(bench: Bench) -> None:
     entry = (await bench.logs.list())[0]

@@ -209,6 +209,25 @@ async def test_command_cancelled_releases_lock_and_ignores_late_ack(grounded: Fl
     assert now() - started < 2.1  # the first answer may be that to the cancelled one
 
 
+async def test_ack_for_another_station_leaves_late_ack_expected(grounded: Flight) -> None:
+    question = MavCmd.GET_MESSAGE_INTERVAL
+    grounded.copter.faults.ignore(question)
+    with anyio.move_on_after(0.3):
+        await grounded.vehicle.command(question, m.Attitude.ID)
+    grounded.copter.send(m.CommandAck(question, MavResult.ACCEPTED, 0, 0, 254, 190))
+    await anyio.sleep(0.1)
+
+    async def answer() -> None:
+        for result in (MavResult.ACCEPTED, MavResult.DENIED):  # the late answer, and that to the second question
+            await anyio.sleep(0.1)
+            grounded.copter.send(m.CommandAck(question, result, 0, 0, 255, 190))
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(answer)
+        with pytest.raises(CommandRejected):
+            await grounded.vehicle.command(question, m.HomePosition.ID)
+
+
 async def test_command_connection_ends_raises(grounded: Flight) -> None:
     grounded.copter.faults.ignore(BANNER)
     async with anyio.create_task_group() as tasks:

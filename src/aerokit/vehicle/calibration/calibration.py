@@ -70,7 +70,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
     async def cancel(self) -> None:
         """Cancel the calibration, and return when the vehicle has confirmed the end.
 
-        Does nothing if the calibration has not started or has ended.
+        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps.
 
         Raises:
             NotSupported: the vehicle cannot cancel this calibration.
@@ -116,7 +116,7 @@ class CalibrationControl:
         ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 asks for up to six
         poses, and for a turn about the vertical axis in each.
         """
-        return self._start("compass", procedures.ardupilot_compass, command_param=2)
+        return self._prepare("compass", procedures.ardupilot_compass, command_param=2)
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
@@ -124,27 +124,27 @@ class CalibrationControl:
         ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects the poses itself, in
         any order.
         """
-        return self._start("accelerometer", procedures.ardupilot_accelerometer, command_param=5)
+        return self._prepare("accelerometer", procedures.ardupilot_accelerometer, command_param=5)
 
     def gyroscope(self) -> Calibration:
         """Calibrate the gyroscopes, while the vehicle stands still."""
-        return self._start("gyroscope", _acknowledged("keep the vehicle still"), command_param=1)
+        return self._prepare("gyroscope", _acknowledged("keep the vehicle still"), command_param=1)
 
     def level(self) -> Calibration:
         """Calibrate the level attitude, while the vehicle stands level and still."""
         procedure = _acknowledged("place the vehicle level and keep it still")
-        return self._start("level", procedure, command_param=5, param_value=2)
+        return self._prepare("level", procedure, command_param=5, param_value=2)
 
     def barometer(self) -> Calibration:
         """Calibrate the barometer.
 
         ArduPilot uses the present pressure as the pressure on the ground; PX4 uses the GPS altitude.
         """
-        return self._start("barometer", _acknowledged("shelter the vehicle from wind"), command_param=3)
+        return self._prepare("barometer", _acknowledged("shelter the vehicle from wind"), command_param=3)
 
     def airspeed(self) -> Calibration:
         """Calibrate the airspeed sensors, first sheltered from wind; PX4 then asks a person to blow into the tube."""
-        return self._start("airspeed", procedures.ardupilot_airspeed, command_param=6, param_value=2)
+        return self._prepare("airspeed", procedures.ardupilot_airspeed, command_param=6, param_value=2)
 
     def radio(self) -> Calibration:
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
@@ -152,7 +152,7 @@ class CalibrationControl:
         Two steps need a confirmation: one after all sticks and switches were moved to their ends, one after the sticks
         were centred.
         """
-        return self._start("radio", procedures.radio_by_channels, px4=procedures.radio_by_channels)
+        return self._prepare("radio", procedures.radio_by_channels, px4=procedures.radio_by_channels)
 
     def escs(self, *, intent: EscIntent) -> Calibration:
         """Calibrate the ESCs. **Remove the propellers**, because the motors get full throttle.
@@ -167,9 +167,9 @@ class CalibrationControl:
             InvalidArgument: the intent is another text. Nothing was sent.
         """
         # The decorator `checks_arguments` has refused every other intent.
-        return self._start("escs", procedures.ardupilot_escs, command_param=7)
+        return self._prepare("escs", procedures.ardupilot_escs, command_param=7)
 
-    def _start(
+    def _prepare(
         self,
         sensor: str,
         ardupilot: Procedure,
@@ -178,7 +178,7 @@ class CalibrationControl:
         command_param: int = 0,
         param_value: float = 1,
     ) -> Calibration:
-        """Prepare a calibration.
+        """Return the iterator of a calibration. Nothing is sent before its first step.
 
         Args:
             sensor: name of the public method.

@@ -60,7 +60,10 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         return self._link.number
 
     async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
-        """Wait until the camera is found and has identified itself. All other calls also wait for this.
+        """Wait until the camera is found and has identified itself.
+
+        All other calls also wait until the camera is found. They request its information unless it is known, and work
+        without it only on a camera that is attached to the autopilot.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -68,10 +71,11 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
                 identifies itself.
         """
         information: CameraInformation | None = None
-        with anyio.move_on_after(timeout):
+        with anyio.move_on_after(timeout) as scope:
             information = await self._link.identify()
-        if information is None:
-            raise self._link.timeout_error(f"did not identify itself within {timeout:g} s")
+        if information is None:  # Without a time-out, an autopilot has no information about a camera attached to it.
+            limit = f" within {timeout:g} s" if scope.cancelled_caught else ""
+            raise self._link.timeout_error(f"did not identify itself{limit}")
         return information
 
     async def take_photo(self, *, timeout: float = 10.0) -> Capture:

@@ -246,7 +246,8 @@ class CaptureLog:
         if isinstance(message, m.CameraImageCaptured):
             # A CAMERA_CAPTURE_STATUS that was sent before this picture does not count it, so it is ignored.
             self._count_boot_ms = message.time_boot_ms
-        # An index far above the count shows that the camera does not count as the standard says. The count is then left
+        # Indices begin at 0, so `index` pictures were taken before this one; the camera may count this one later. An
+        # index far above the count shows that the camera does not count as the standard says. The count is then left
         # unchanged.
         if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)

@@ -72,8 +72,9 @@ class CameraLink(CameraOrders):
         self._is_bound = anyio.Event()
         # Time of the camera's last HEARTBEAT.
         self._heartbeat_at = -math.inf
-        # True after a silence until the camera has identified itself again, because another camera may use its id now.
-        self._was_silent = False
+        # True after a silence of an identified camera until it has identified itself again, because another camera may
+        # use its id now.
+        self._must_identify_again = False
         self._session.on_reboot.append(self._on_reboot)
         self.information: StateCell[CameraInformation] = self.new_cell("camera.information", "CAMERA_INFORMATION")
         self.listen(m.CameraInformation, self._on_information)
@@ -157,7 +158,7 @@ class CameraLink(CameraOrders):
         return self.information.latest
 
     def _needs_information(self) -> bool:
-        return not self.information.is_known or self._was_silent
+        return not self.information.is_known or self._must_identify_again
 
     async def _find_first_camera(self) -> None:
         # A camera with its own component id takes precedence over one that is attached to the autopilot, so
@@ -266,8 +267,8 @@ class CameraLink(CameraOrders):
         is_first = previous_at == -math.inf
         if not is_first and self._heartbeat_at - previous_at > MAX_SILENCE_S:
             self._forget_refusals()
-            self._was_silent = self.information._known
-            if self._was_silent:
+            self._must_identify_again = self.information._known
+            if self._must_identify_again:
                 self._session.background.start(self._identify_again, "aerokit camera after silence")
 
     async def _identify_again(self) -> None:
@@ -285,7 +286,7 @@ class CameraLink(CameraOrders):
         self.requests.forget_refusals()
 
     def _on_information(self, message: m.CameraInformation) -> None:
-        self._was_silent = False
+        self._must_identify_again = False
         self.set_cell(self.information, information_of(message, self.number or 0), message)
 
 

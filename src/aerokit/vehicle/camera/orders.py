@@ -175,7 +175,7 @@ class CameraOrders:
         self._session.connection.send(command_long(self._session.system_id, target, command, params))
 
     async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
-        """Send the command that ends a block at once, and retry it in the background until it is acknowledged.
+        """At the end of a block, send its stop command at once, and retry it in the background until acknowledged.
 
         Does nothing if a newer order was given. With ``is_awaited``, raises as :meth:`command`.
         """

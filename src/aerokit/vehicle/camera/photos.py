@@ -76,7 +76,11 @@ class Shutter:
             series = self.link.latest_order("series")
             before = await self.request_status_reliably()
             known_indices = {capture.index for capture in self.log.captures()}
-            error: CommandTimeout | None = None
+            # The error while the last order is not acknowledged; this one, if ``timeout`` ends the first order.
+            error: CommandTimeout | None = CommandTimeout(
+                f"{self.link.describe()} did not acknowledge the order for a picture within {timeout:g} s;"
+                " it may have taken one"
+            )
             with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
                 attempts = 1
                 error = await self.order_photo(before)
@@ -101,7 +105,6 @@ class Shutter:
                     if was_lost and attempts < MAX_ORDER_ATTEMPTS:
                         attempts += 1
                         error = await self.order_photo(before, is_repeated=True)
-            # `error` is set if the last order was not acknowledged.
             raise error or self.link.timeout_error(
                 f"accepted the order, but reported no picture within {timeout:g} s; it may have taken one"
             )
@@ -141,19 +144,24 @@ class Shutter:
             if self.link.is_trigger:
                 await self._send_digicam_control()
             else:
-                interval_s, count = 0, 1  # a single picture
-                params = (self.link.device_id, interval_s, count, self._sequence_number)
-                await self.link.command(START, *params, attempts=1)
+                await self._send_image_start()
         except CommandTimeout as error:
             return error
+        return None
+
+    async def _send_image_start(self) -> None:
+        """Send the order for a single picture. A camera that does not support it gets the older command."""
+        interval_s, count = 0, 1
+        params = (self.link.device_id, interval_s, count, self._sequence_number)
+        try:
+            await self.link.command(START, *params, attempts=1)
         except CommandRejected as error:
-            if error.result != MavResult.UNSUPPORTED or self.link.is_trigger:
+            if error.result != MavResult.UNSUPPORTED:
                 raise
-            try:  # The camera may support the older command.
+            try:
                 await self._send_digicam_control()
             except CommandRejected:
                 raise error from None
-        return None
 
     async def _send_digicam_control(self) -> None:
         """Send the older command, for PX4's trigger and for cameras without MAV_CMD_IMAGE_START_CAPTURE."""
@@ -185,8 +193,8 @@ class Shutter:
 def _is_new(capture: Capture, before: CameraStatus | None, known_indices: set[int]) -> bool:
     """Return True if a capture may be of a picture that was ordered after the status ``before``.
 
-    The camera may use the index of a failed picture again. A low index therefore also belongs to a new picture, unless
-    the log already had a capture with this index.
+    A lower index than the image count of ``before`` usually belongs to an older picture. It may belong to a new one if
+    no capture with this index was known before the order, because a camera may use the index of a failed picture again.
     """
     is_low = before is not None and capture.index < before.image_count
     return not is_low or capture.index not in known_indices
@@ -339,9 +347,9 @@ class PhotoInterval:
             # Without a status, the first capture determines the start. A later capture with a much lower index shows
             # that the first index was corrupt, and then determines the start instead.
             if self._next_index is None or self._contradicts_guess(capture.index):
-                self._is_start_guessed = self._next_index is None
+                self._is_start_guessed = self._next_index is None  # A corrected start is not corrected again.
                 self._next_index = capture.index
-                # One lower than the index of this capture, so that this capture counts as the newest one below.
+                # One less than the index of this capture, so that the comparison at the end of the loop accepts it.
                 self._newest_index = capture.index - 1
             if not self._is_plausible(capture.index):
                 continue

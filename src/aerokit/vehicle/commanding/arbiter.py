@@ -65,10 +65,10 @@ class CommandArbiter:
         self._arming_accepted_at = -math.inf
         # Time of the last HEARTBEAT that reported disarmed.
         self._disarmed_at = -math.inf
-        # Time of the last change from disarmed to armed, and the order with which this program caused it; None if
-        # another party armed the vehicle.
+        # Time of the last change from disarmed to armed, and the order that records that this program caused it; None
+        # if another party armed the vehicle.
         self._armed_at = -math.inf
-        self._armed_by_program: Order | None = None
+        self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
@@ -163,7 +163,7 @@ class CommandArbiter:
             order.on_reboot()
         self._ordered_since_disarmed.clear()
         # Infinity makes `current` ignore all orders from before the reboot until the vehicle arms again.
-        self._armed_by_program = None
+        self._arming_order = None
         self._armed_at = math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
@@ -282,8 +282,8 @@ class CommandArbiter:
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        The program armed the vehicle, or has given a steering order since another party armed it. Since then there was
-        no takeover.
+        This is so if the program armed the vehicle, or has given a steering order since another party armed it; and if
+        neither a takeover nor a failsafe has followed.
         """
         order = self.current
         if order is not None and order.was_refused:  # After a refusal, the vehicle continues its previous task.
@@ -295,11 +295,11 @@ class CommandArbiter:
         """The program's present order to the armed vehicle: the newest steering order, or the order that armed it."""
         newest = self.newest
         # A steering order that was given before the vehicle armed belongs to an earlier flight.
-        return newest if newest is not None and newest.given_at >= self._armed_at else self._armed_by_program
+        return newest if newest is not None and newest.given_at >= self._armed_at else self._arming_order
 
     def clear_failsafe(self) -> None:
         """Ignore a failsafe that has ended, or that was already active when the program gave its new order."""
-        for order in (self.newest, self._armed_by_program):
+        for order in (self.newest, self._arming_order):
             if order is not None:
                 order.clear_failsafe()
 
@@ -311,7 +311,8 @@ class CommandArbiter:
         vehicle, and there was no takeover.
         """
         order, topics = self.newest, self._ordered_since_disarmed
-        # After an order without modes, such as a raw command, a mode change does not prove a takeover.
+        # After an order without modes, such as a raw command, a mode change does not prove a takeover. `newest` is the
+        # newest order of an action or a raw command; `is_newest` is false once a posted order has followed it.
         was_taken_over = order is not None and order.modes and order.takeover_reason and order.is_newest
         if was_taken_over:  # Of the program's orders, only the one that armed the vehicle still has an effect.
             return "arm" in topics
@@ -426,7 +427,7 @@ class CommandArbiter:
             receiver.on_armed(armed, self._telemetry.armed.updated_at)
 
     def _on_arming(self) -> None:
-        """Decide whether the program or another party has armed the vehicle."""
+        """Record whether the program or another party has armed the vehicle."""
         self._armed_at = self._telemetry.armed.updated_at
         is_order_open = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
@@ -434,9 +435,10 @@ class CommandArbiter:
         was_armed_by_program = is_order_open or was_caused_by_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes
-        self._armed_by_program = self._create_order(modes, ()) if was_armed_by_program else None
+        # This order is never sent: it records the arming, so that a later takeover or failsafe is noticed.
+        self._arming_order = self._create_order(modes, ()) if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:
         """Orders that process the reports of the vehicle."""
-        arm_order = () if self._armed_by_program is None else (self._armed_by_program,)
+        arm_order = () if self._arming_order is None else (self._arming_order,)
         return (*arm_order, *self._orders, *self._posted)

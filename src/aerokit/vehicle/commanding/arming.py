@@ -80,7 +80,8 @@ class ArmingActions(VehicleBase):
 
         Raises:
             OperationTimeout: not ready within ``timeout`` seconds; the text lists what is missing, and recent status
-                texts. Three seconds before this error, a vehicle whose pre-arm checks fail is asked for its reasons.
+                texts. A mode that does not allow arming is named after this list. Three seconds before this error, a
+                vehicle whose pre-arm checks fail is asked for its reasons.
         """
         telemetry = self.telemetry
         cells = (telemetry.sensors, telemetry.estimator, telemetry.position, telemetry.home, telemetry.armed)
@@ -104,10 +105,12 @@ class ArmingActions(VehicleBase):
         missing_now = self._health.missing_for_flight()
         # The vehicle may have become ready just after the last check. Nothing is missing then.
         reasons = self._session.deduplicate_reasons(*recent_texts, *missing_now) or ("nothing",)
-        missing = "\n  - ".join([*reasons, *self._health.unarmable_mode()])
+        missing = "".join(f"\n  - {reason}" for reason in reasons)
+        # The mode does not count as missing, because `arm` changes it.
+        mode_text = "".join(f"\n{text}" for text in self._health.unarmable_mode())
         raise OperationTimeout(
-            f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:\n"
-            f"  - {missing}"
+            f"the vehicle was not ready within {timeout:g} s ({self._session.describe_link()}); still missing:"
+            f"{missing}{mode_text}"
         )
 
     async def arm(
@@ -180,7 +183,7 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
-            may_be_forbidden = may_change_mode and not has_computer_slept and self._is_in_optional_mode()
+            may_be_forbidden = may_change_mode and not has_computer_slept and self._is_in_mode_armable_by_option()
             other_mode = self.autopilot.mode_to_arm_in() if may_be_forbidden else None
             if other_mode is None:
                 raise
@@ -280,12 +283,14 @@ class ArmingActions(VehicleBase):
         # change now may be lost.
         is_booting = self.telemetry.system_status.latest in BOOT_STATES
         must_keep_mode = self._flight_cleanup.stop_stream is not None or is_booting
-        may_arm_in_mode = not self._health.unarmable_mode() or self._is_in_optional_mode()
+        # If a parameter decides whether the mode allows arming, try to arm first: `_arm_with_fallback_mode` changes
+        # the mode after a refusal.
+        may_arm_in_mode = not self._health.unarmable_mode() or self._is_in_mode_armable_by_option()
         if must_keep_mode or may_arm_in_mode or not self.telemetry.is_confirmed_disarmed:
             return None
         return self.autopilot.mode_to_arm_in()
 
-    def _is_in_optional_mode(self) -> bool:
+    def _is_in_mode_armable_by_option(self) -> bool:
         """Return True if a parameter of the vehicle decides whether its present mode allows arming."""
         mode = self.telemetry.mode.latest
         is_optional = mode is not None and mode.name in self.autopilot.armable_by_option

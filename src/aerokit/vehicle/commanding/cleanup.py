@@ -230,9 +230,10 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Hold the vehicle if its `async with` block ends while a call awaits the order in this `with` block.
+        """Register the order that a call awaits, so that `end_flights` can hold the vehicle meanwhile.
 
-        The vehicle must also hold after it has hit the ground, because its target may still be in the air.
+        If the vehicle hits the ground, this block orders the hold itself, because the target of the order may still be
+        in the air.
         """
         self._awaited_order = order
         try:
@@ -252,9 +253,10 @@ class FlightCleanup:
 
     @contextmanager
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
-        """Give the order to change to ``mode``. The caller prepares a stream in the `with` block, and may wait there.
+        """Create the order to change to ``mode``, which the caller sends after the `with` block.
 
-        If the block raises, the vehicle is ordered to hold.
+        The caller prepares a stream in the block, and may wait there. If the block raises, the vehicle is ordered to
+        hold.
 
         Raises:
             BusyError: another stream is open.

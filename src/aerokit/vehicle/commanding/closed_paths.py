@@ -207,7 +207,10 @@ class LobeCounter:
         """True while the vehicle is in one of the lobes."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Count half a figure if the vehicle has reached the other lobe. The position is in metres from the centre."""
+        """Count half a figure for the first lobe, and each time the vehicle reaches the other lobe.
+
+        The position is in metres from the centre.
+        """
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._min_along_m
         lobe = 1 if along > 0 else -1

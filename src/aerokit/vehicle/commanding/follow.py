@@ -321,16 +321,16 @@ class FollowStream(SteeringStream[TargetState]):
         reference_deg = self._course_deg if self._place.from_course else 0.0  # 0 is north.
         bearing = math.radians(reference_deg + self._bearing_deg)
         distance_m = self._place.distance_m
-        place = state.position.offset(
+        goal = state.position.offset(
             north_m=distance_m * math.cos(bearing) + north_m_s * moved_for_s,
             east_m=distance_m * math.sin(bearing) + east_m_s * moved_for_s,
             up_m=(self._place.height_m or 0.0) - down_m_s * moved_for_s,
         )
         if self._place.height_m is None:
-            place = place.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)
+            goal = goal.replace(altitude_amsl_m=self._own_altitude_m, altitude_relative_m=None)
             down_m_s = 0.0
-        elif place.altitude_amsl_m is not None:  # The target's relative altitude may refer to another home.
-            place = place.replace(altitude_relative_m=None)
+        elif goal.altitude_amsl_m is not None:  # The target's relative altitude may refer to another home.
+            goal = goal.replace(altitude_relative_m=None)
         bearing_to_target = math.remainder(bearing + math.pi, 2 * math.pi)
         yaw_deg = math.degrees(bearing_to_target) if self._place.face_target else None
-        return self._encode_position(PositionSetpoint(place, yaw_deg), (north_m_s, east_m_s, down_m_s))
+        return self._encode_position(PositionSetpoint(goal, yaw_deg), (north_m_s, east_m_s, down_m_s))

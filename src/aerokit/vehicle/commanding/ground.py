@@ -103,6 +103,8 @@ class ImpactDetector:
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:
                 self._impact_m_s = self._max_sink_m_s
+                # The last known height, even if it is old: without one, no later height could show that the vehicle
+                # flies on.
                 self._impact_height_m = height_above_home(self._telemetry)
         elif _has_changed(self._impact_height_m, height_above_home(self._telemetry), IMPACT_HEIGHT_M):
             # The vehicle flies on, so it did not hit the ground.

@@ -178,14 +178,19 @@ class Guided:
         """
         session = self._context.session
         version = session.telemetry.version.latest
-        supported_before = session.autopilot.actuators_until
-        if supported_before is None or version is None or version.number[:2] >= supported_before:
-            version_text = "of unknown version" if version is None else str(version.firmware)
-            raise NotSupported(
-                f"{session.autopilot.firmware} {version_text} ignores SET_ACTUATOR_CONTROL_TARGET; only PX4 before 1.14"
-                " executes this message. Use vehicle.guided.attitude_rate()"
-            )
-        return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
+        firmware, supported_before = session.autopilot.firmware, session.autopilot.actuators_until
+        if supported_before is None:
+            reason = f"{firmware} ignores SET_ACTUATOR_CONTROL_TARGET"
+        elif version is None:
+            reason = f"the version of {firmware} is not known yet"
+        elif version.number[:2] >= supported_before:
+            reason = f"{firmware} {version.firmware} ignores SET_ACTUATOR_CONTROL_TARGET"
+        else:
+            return SetpointStream(self._context, self._encode.actuators, initial, rate_hz, valid_for_s, max_lag_s)
+        raise NotSupported(
+            f"{reason}; only PX4 before 1.14 executes SET_ACTUATOR_CONTROL_TARGET; nothing was sent."
+            " Use vehicle.guided.attitude_rate()"
+        )
 
     def _stream(
         self, kind: str, encode: Callable[[SetpointT], Message], initial: SetpointT, *timing: float

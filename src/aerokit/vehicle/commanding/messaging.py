@@ -281,7 +281,7 @@ class MessagingActions(VehicleBase):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
-        or their effect is reported. The retries also end when a newer order about the same subject is given, when the
+        or their effect is reported. The retries also end when a newer order about the first subject is given, when the
         vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
         the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
         vehicle hold nor monitors late arming; use the actions for that.

@@ -195,7 +195,7 @@ class Order:
         # The last reports of the vehicle: mode, arming and MAV_STATE. None before the first report.
         self._mode_now = None if mode_before is None else mode_before.custom_mode
         self._armed_now = armed_before
-        self._state_before = state_before
+        self._last_state = state_before
         # An order that ends the flight (land, return, disarm) stays valid during a failsafe.
         self._ends_flight = ends_flight
         self._ends_on_mode_change = ends_on_mode_change
@@ -246,7 +246,8 @@ class Order:
     def on_mode(self, mode: Mode, reported_at: float) -> None:
         """Update the order from a mode reported at this time; the class docstring describes the kinds of modes.
 
-        Once one of the order's own modes was reported, a return to the mode before the order is a takeover.
+        Once the order has taken effect, a return to the mode before the order is a takeover. It has taken effect when
+        one of its own modes is reported; with ``requires_mode_change``, only if the mode has changed to it.
         """
         number = mode.custom_mode
         is_first_report = self._mode_now is None
@@ -276,13 +277,13 @@ class Order:
         self._mode_now = number
 
     def on_system_status(self, state: int) -> None:
-        """Record a failsafe from MAV_STATE, unless it was active already when the program gave the order.
+        """Record a failsafe if MAV_STATE has become worse since the last report; at first, since the order was given.
 
         An order to land, to return or to disarm is not ended by any failsafe.
         """
-        if is_worse_failsafe(state, self._state_before):  # `end` ignores a failsafe if the order ends the flight.
+        if is_worse_failsafe(state, self._last_state):  # `end` ignores a failsafe if the order ends the flight.
             self.failsafe = self.failsafe or failsafe_text(state)
-        self._state_before = state
+        self._last_state = state
 
     def on_armed(self, armed: bool, reported_at: float) -> None:
         """Update the order from the armed state that HEARTBEAT reports."""

@@ -286,8 +286,8 @@ class VehiclePosition:
                 where = f"{name}, item {index}" if are_items else name
                 raise InvalidArgument(
                     f"{where} = {place.latitude_deg:.7f}, {place.longitude_deg:.7f} is not allowed: the place is"
-                    f" {distance_m / 1000:,.0f} km away, more than max_distance_m = {max_distance_m:,.0f}; nothing was"
-                    " sent. Pass a greater max_distance_m to allow this place"
+                    f" {distance_m:,.0f} m away, more than max_distance_m = {max_distance_m:,.0f}; nothing was sent."
+                    " Pass a greater max_distance_m to allow this place"
                 )
 
     def remaining_distance(self, target: Position) -> float:

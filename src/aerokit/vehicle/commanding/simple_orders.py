@@ -11,9 +11,11 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
 
+import anyio
+
 from aerokit._internal.arguments import check_range
 from aerokit._internal.values import Snapshot
-from aerokit.errors import CommandRejected, CommandTimeout, NotSupported, OperationTimeout
+from aerokit.errors import CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd
 from aerokit.vehicle.commanding.order import SUPERSEDED
@@ -55,7 +57,7 @@ class Argument(Snapshot):
 class Effect(Snapshot):
     """Effect of an order: the class name of the message that reports it, and a predicate for the message.
 
-    ``is_reported`` is called with each message and the values of the arguments.
+    ``is_reported(message, *values)`` is called with each message; ``values`` are those passed to `SimpleOrder.send`.
     """
 
     message: str
@@ -138,7 +140,10 @@ class SimpleOrder(Snapshot):
         is_refusal: Callable[[str], bool] = lambda _: False,
         timeout: float,
     ) -> None:
-        """Send the command and wait for a status text that reports its effect: ``is_done(text, seconds since ack)``.
+        """Send the command and wait for a status text that reports its effect.
+
+        ``is_done(text, seconds_since_ack)`` is called repeatedly, with all texts so far. The seconds are from the
+        acknowledgement until now, not until the text arrived.
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """
@@ -235,18 +240,21 @@ async def _has_message(context: VehicleContext, message_id: int, component_id: i
 async def receive_once(
     context: VehicleContext, message_type: type[MessageT], component_id: int | None = None
 ) -> MessageT | None:
-    """Request one message and return it; None if the vehicle refuses or does not send it within a second."""
+    """Request one message and return it; None if the vehicle refuses, or does not send it.
+
+    Waits up to a second for the acknowledgement, and up to another second for the message.
+    """
     session = context.session
     target = session.component_id if component_id is None else component_id
     with (
         session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages,
-        suppress(CommandRejected, CommandTimeout, OperationTimeout),
+        suppress(CommandRejected, CommandTimeout),
     ):
         await session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=1.0
         )
-        while True:  # Other components may send this message, too.
-            message = await messages.get(1.0)
-            if message.received_frame is None or message.received_frame.component_id == target:
-                return message
+        with anyio.move_on_after(1.0):
+            async for message in messages:  # Other components may send this message, too.
+                if message.received_frame is None or message.received_frame.component_id == target:
+                    return message
     return None

@@ -19,7 +19,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavProtocolCapability, MavResult, SpeedType
 from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
-from aerokit.position import Home, Position, point_at, travel_target
+from aerokit.position import Home, Position, position_with_altitude, travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.order import ROI
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, StallDetector, await_progress
@@ -179,7 +179,11 @@ class TravelActions(VehicleBase):
         sent_at = started  # when `unacknowledged_target` was last sent
 
         def resend_if_due() -> None:
-            """Resend the target if it is due, unless a takeover is possible or the computer has slept since then."""
+            """Resend the target if it is due.
+
+            It is not sent if the state is not recent, the order has ended, or the computer has slept since the last
+            transmission.
+            """
             nonlocal sent_at
             now = self.connection.now()
             if unacknowledged_target is None or now - sent_at < RESEND_INTERVAL_S:
@@ -188,7 +192,7 @@ class TravelActions(VehicleBase):
                 sent_at = now
                 self.connection.send(unacknowledged_target)
 
-        def has_arrived() -> bool:
+        def resend_and_check_arrival() -> bool:
             resend_if_due()
             is_known = self._position.is_known_since(started)
             return is_known and self._position.remaining_distance(target) <= arrival_radius_m and not order.end
@@ -197,7 +201,7 @@ class TravelActions(VehicleBase):
             await await_progress(
                 self._session,
                 f"go_to({target.latitude_deg:.7f}, {target.longitude_deg:.7f})",
-                is_done=has_arrived,
+                is_done=resend_and_check_arrival,
                 failure_reason=self._sender.mode_failure(order, mode),
                 describe=lambda: f"the vehicle is {self._position.remaining_distance(target):.1f} m away",
                 timeout=timeout,
@@ -304,20 +308,20 @@ class TravelActions(VehicleBase):
             )
 
     async def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait until HOME_POSITION reports the new place.
+        """Move the home position, and wait for the next HOME_POSITION, which has the new place.
 
         Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
         firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
-            timeout: seconds until HOME_POSITION reports the new place.
+            timeout: seconds to wait for HOME_POSITION after the acknowledgement.
 
         Raises:
             InvalidArgument: the place has no altitude above mean sea level. Nothing was sent.
             CommandRejected: the vehicle refused: it has no position, or the place is invalid.
             CommandTimeout: there was no acknowledgement.
-            OperationTimeout: the vehicle accepted the command, but HOME_POSITION does not report the new place.
+            OperationTimeout: the vehicle accepted the command, but no HOME_POSITION was received.
         """
         if place is not None and place.altitude_amsl_m is None:
             raise InvalidArgument(
@@ -329,7 +333,7 @@ class TravelActions(VehicleBase):
                 await self._sender.send_long(order, MavCmd.DO_SET_HOME, 1)  # 1 means the present position.
             else:
                 # The command takes altitudes above mean sea level only.
-                amsl_place = point_at(place).replace(altitude_relative_m=None)
+                amsl_place = position_with_altitude(place).replace(altitude_relative_m=None)
                 latitude, longitude, altitude, _ = self._position.global_target(amsl_place)
                 position: dict[str, Any] = {"x": latitude, "y": longitude, "z": altitude}
                 send = self._session.commands.send_place
@@ -343,7 +347,7 @@ class TravelActions(VehicleBase):
 
         Infinite while the position is unknown.
         """
-        return self._position.distance_to(point_at(target))
+        return self._position.distance_to(position_with_altitude(target))
 
     def _check_can_turn(self, heading_deg: float | None) -> None:
         if heading_deg is not None and not self._turns_by_reposition and not self.autopilot.condition_yaw:
@@ -394,7 +398,7 @@ class LookActions(VehicleBase):
             CommandTimeout: there was no acknowledgement.
             OperationRejected: the mode changed, or a newer order was given, before the acknowledgement.
         """
-        place = self._position.command_place(point_at(target))
+        place = self._position.command_place(position_with_altitude(target))
         if not self._session.commands.is_unsupported(ROI_LOCATION) and await self._set_roi_location(place):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT

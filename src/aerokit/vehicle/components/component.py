@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -258,7 +259,7 @@ class Component(ReadOnly):
         with subscriber.subscribe((message_type,), capacity=100, overflow="drop_oldest", rate_hz=None) as answers:
             refusal: CommandRejected | None = None
             with anyio.move_on_after(timeout):
-                for _ in range(REQUEST_ATTEMPTS):
+                for attempts_left in reversed(range(REQUEST_ATTEMPTS)):
                     try:
                         await self._session.commands.send_long(
                             MavCmd.REQUEST_MESSAGE,
@@ -271,8 +272,10 @@ class Component(ReadOnly):
                         pass
                     except CommandRejected as error:
                         refusal = error
-                    # After a refusal, return the message if it has already arrived, but do not wait for it.
-                    with anyio.move_on_after(ATTEMPT_TIMEOUT_S if refusal is None else 0):
+                    # After the last request, wait until the time-out. After a refusal, return the message if it has
+                    # already arrived, but do not wait for it.
+                    limit_s = ATTEMPT_TIMEOUT_S if attempts_left else math.inf
+                    with anyio.move_on_after(limit_s if refusal is None else 0):
                         async for answer in answers:
                             if where is None or where(answer):
                                 return answer

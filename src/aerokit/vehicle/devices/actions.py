@@ -155,9 +155,9 @@ class DeviceActions(VehicleBase):
         Raises:
             InvalidArgument: an argument is not allowed. Nothing was sent.
             NotSupported: the vehicle runs ArduPilot, whose simulation has SIM_ parameters instead. Nothing was sent.
-            CommandRejected: SYS_FAILURE_EN is 0, or PX4 cannot let this part fail in this way.
-            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot make this part fail. If an
-                acknowledgement was lost, the part may have failed.
+            CommandRejected: SYS_FAILURE_EN is 0, or PX4 can let this part fail, but not in this way.
+            CommandTimeout: there was no acknowledgement. PX4 sends none if it cannot let this part fail in any way. If
+                an acknowledgement was lost, the part may have failed.
         """
         # The decorator `checks_arguments` has refused every other intent.
         await INJECT_FAILURE.send(self._context, UNITS[unit], FailureType[kind.upper()], instance)
@@ -167,7 +167,8 @@ def _chunks(text: str) -> list[str]:
     """Split a text into chunks of at most 50 bytes, between characters.
 
     A receiver treats a chunk of less than 50 bytes as the last chunk. A chunk that cannot hold the next character is
-    therefore padded with spaces, and an empty chunk follows if the last chunk is full.
+    therefore padded with spaces, and an empty chunk follows if the last of several chunks is full. A text of one chunk
+    has the id 0, and needs no end mark.
     """
     chunks = [""]
     for character in text:

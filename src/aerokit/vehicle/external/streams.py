@@ -246,12 +246,14 @@ class MeasurementStream(Generic[MeasurementT]):
             present_name = next((name for name in names if name in values), None)
             if present_name is not None and values[present_name] in allowed:
                 continue
-            problem = (
-                f"{names[0]} does not exist" if present_name is None else f"{present_name} = {values[present_name]:g}"
-            )
+            if present_name is None:
+                raise OperationRejected(
+                    f"{measurement}: this build of {firmware} ignores the measurements, because it has no"
+                    f" {' or '.join(names)}"
+                )
             choices = " or ".join(f"{value:g}" for value in allowed[:4])
             raise OperationRejected(
-                f"{measurement}: {problem}, so {firmware} ignores the measurements;"
-                f" set {names[0]} to {choices} and reboot"
+                f"{measurement}: {present_name} = {values[present_name]:g}, so {firmware} ignores the measurements;"
+                f" set {present_name} to {choices} and reboot"
             )
         return values

@@ -74,7 +74,7 @@ class GrowthReporter:
         if self._on_progress is not None:
             self._on_progress(progress)
 
-    def log_growth(self) -> None:
+    def report(self) -> None:
         """Log an INFO message if the flight log has grown since it was listed; called at the end of a download."""
         if self._present_size > self._entry.size:
             logger.info(
@@ -157,7 +157,7 @@ class Logs:
             await self._files.download(
                 path, to, resume=resume, idle_timeout_s=idle_timeout_s, timeout=timeout, on_progress=growth
             )
-            growth.log_growth()
+            growth.report()
             return
         part = PartFile(to, _part_suffix(entry))
         # The time of the log is part of the file name's suffix. If the time is unknown, the part file may belong to
@@ -168,7 +168,7 @@ class Logs:
             into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
             await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
         part.finish()
-        growth.log_growth()
+        growth.report()
 
     async def read(
         self,
@@ -197,7 +197,7 @@ class Logs:
             into = Reassembly(blocks.extend, block_size=LOG_BLOCK)
             await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
             content = bytes(blocks)
-        growth.log_growth()
+        growth.report()
         return content
 
     async def erase(self, *, idle_timeout_s: float = ERASE_TIMEOUT_S, timeout: float | None = None) -> None:
@@ -212,13 +212,19 @@ class Logs:
         async with self._channel.operation("erase logs", timeout):
             # Identify logs by time and size, because a new log may get the id of an erased log.
             remaining = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
-            deadline = self._transfers.connection.now() + idle_timeout_s
+            progress_at = self._transfers.connection.now()
             while remaining:
                 self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
                 await anyio.sleep(ERASE_RETRY_INTERVAL_S)
+                count_before = len(remaining)
                 remaining &= {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
-                if remaining and self._transfers.connection.now() >= deadline:
-                    raise FileTimeout(f"erase logs: {len(remaining)} logs still exist after {idle_timeout_s:g} s")
+                now = self._transfers.connection.now()
+                if len(remaining) < count_before:
+                    progress_at = now
+                elif now - progress_at >= idle_timeout_s:
+                    raise FileTimeout(
+                        f"erase logs: {len(remaining)} logs still exist, and none has gone for {idle_timeout_s:g} s"
+                    )
 
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:
         """Receive the flight log while PX4 writes it, during an ``async with`` block (MAV_CMD_LOGGING_START).
@@ -251,7 +257,7 @@ class Logs:
             if path is not None:
                 return path, log
         try:
-            entry = await self._entry(log, idle_timeout_s, timeout, may_be_silent=method == "auto")
+            entry = await self._entry(log, idle_timeout_s, timeout, gives_up_early=method == "auto")
         except FileTimeout:
             # ArduPilot does not answer LOG_* messages while it is armed. MAVFTP can read a log whose entry is known.
             if not isinstance(log, LogEntry) or method != "auto":
@@ -275,16 +281,17 @@ class Logs:
         return await log_path(self._files, directories, entry, idle_timeout_s, may_have_grown=entry == self._newest)
 
     async def _entry(
-        self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, may_be_silent: bool
+        self, log: LogEntry | int, idle_timeout_s: float, timeout: float | None, *, gives_up_early: bool
     ) -> LogEntry:
         """Return the current entry of a log.
 
+        With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
         If only an id is given, the whole list is requested: if there is no log with this id, a request for it alone
         would make ArduPilot list nonexistent logs endlessly.
         """
         log_id = log if isinstance(log, int) else log.id
         only_id = None if isinstance(log, int) else log.id
-        max_unanswered = MAX_UNANSWERED_REQUESTS if may_be_silent else None
+        max_unanswered = MAX_UNANSWERED_REQUESTS if gives_up_early else None
         async with self._channel.operation(f"log {log_id}", timeout):
             entries = await self._entries(idle_timeout_s, only_id, max_unanswered)
         current = next((entry for entry in entries if entry.id == log_id), None)
@@ -305,8 +312,8 @@ class Logs:
                 logs = await request_list(idle_timeout_s, only_id, max_unanswered=MAX_UNANSWERED_REQUESTS)
             except FileTimeout:
                 logs = await listed_logs(self._files, autopilot.log_directories, idle_timeout_s)
-                # If `logs` is None, there are logs but no list file. PX4 then answers sooner or later, so the number of
-                # unanswered requests is not limited.
+                # If `logs` is None, there are logs but no list file. PX4 then answers sooner or later, so the request
+                # is repeated until the time-out.
                 max_unanswered = None
         if logs is None:
             logs = await request_list(idle_timeout_s, only_id, max_unanswered=max_unanswered)
@@ -366,8 +373,8 @@ async def log_path(
     """Return the path of a log for MAVFTP; None if the file cannot be identified.
 
     ArduPilot's log 1 is the lowest of its numbered files such as ``00000001.BIN``. PX4 writes a list of paths to a file
-    when its logs are requested, in the order of the ids. The size must match the entry. A log that is still being
-    written, or that was being written at the time of the entry (``may_have_grown``), may be larger.
+    when its logs are requested, in the order of the ids. The size must match the entry. ArduPilot's file of a log that
+    is still being written, or that was being written at the time of the entry (``may_have_grown``), may be larger.
     """
     for directory in directories:
         try:
@@ -383,8 +390,9 @@ async def log_path(
             return _numbered_path(directory, numbered, log, may_have_grown)
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             logs = await _read_list_file(files, directory, idle_timeout_s)
-            has_size = log.id < len(logs) and logs[log.id].size == log.size
-            return logs[log.id].path if has_size else None
+            # The sizes are those of the time at which PX4 wrote the list, as in the entry.
+            has_same_size = log.id < len(logs) and logs[log.id].size == log.size
+            return logs[log.id].path if has_same_size else None
     return None
 
 
@@ -429,5 +437,5 @@ def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry,
     if entry is None or entry.size is None:
         return None
     may_be_larger = may_have_grown or number == max(entries)  # The vehicle may still be writing the newest log.
-    has_size = entry.size >= log.size if may_be_larger else entry.size == log.size
-    return f"{directory}/{entry.name}" if has_size else None
+    is_size_plausible = entry.size >= log.size if may_be_larger else entry.size == log.size
+    return f"{directory}/{entry.name}" if is_size_plausible else None

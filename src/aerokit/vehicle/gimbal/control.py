@@ -80,7 +80,10 @@ class ReleaseCommand:
             self._send()
 
         async def send_until_acknowledged() -> None:
-            """Send the command if the vehicle was silent, and repeat it until it is acknowledged or no longer due."""
+            """Wait for the acknowledgement, and send the command once more if the target was silent.
+
+            If the vehicle is silent now, the command is first sent at the vehicle's next HEARTBEAT.
+            """
             with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
                 if not can_send_now:
                     await self._session.wait_for_heartbeat()
@@ -92,7 +95,7 @@ class ReleaseCommand:
                 except CommandTimeout:
                     if not self._is_target_silent():
                         raise
-                    # The target did not receive the command, so repeat it when the target is back.
+                    # The target did not receive the command, so send it once more at the target's next HEARTBEAT.
                     await self._wait_target_heartbeat()
                     if self._is_still_due():
                         self._send()
@@ -227,7 +230,7 @@ class GimbalControl:
         orders = self._orders
         if self._was_entered:
             raise BusyError("a GimbalControl can be entered only once: call control() again")
-        if self._is_primary in orders.device.control_blocks:
+        if self._is_primary in orders.device.control_blocks:  # The keys are True for primary, False for secondary.
             raise BusyError(f"{orders.name}: another block of this program already has control; nothing was sent")
         if not self._is_primary and not orders.rules.has_secondary:
             raise orders.not_supported("has no secondary control")
@@ -332,7 +335,11 @@ class GimbalControl:
         requests = orders.registry.control_requests
 
         def is_still_due() -> bool:
-            return self._taken is None and not self._control_request.leave_release_to(requests)
+            if self._taken is not None:
+                return False
+            # If other blocks need this control, they are marked, so that they release it when they end.
+            is_left_to_others = self._control_request.leave_release_to(requests)
+            return not is_left_to_others
 
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 

@@ -162,7 +162,8 @@ class GimbalDevice:
     def __init__(self, context: VehicleContext, component_id: int, number: int) -> None:
         self.component_id: int = component_id
         self.number: int = number
-        # Component id of the manager; None until known.
+        # Component id of the manager: at first the component to which the gimbal is attached; None for other gimbals,
+        # whose manager is not known yet.
         self.manager_id: int | None = component_id if number else None
         self.flags: int = 0  # the latest GIMBAL_DEVICE_FLAGS
         self.failures: int = 0  # the latest GIMBAL_DEVICE_ERROR_FLAGS
@@ -259,7 +260,7 @@ class GimbalDevice:
         self.reboots += 1
         self._status_ms = 0
         self._manager_rank = 0
-        self.manager_id = self.component_id if self.number else None
+        self.manager_id = self.component_id if self.number else None  # as for a new gimbal
         self.flags = 0
         self.failures = 0
         self.manager_information = None

@@ -179,7 +179,10 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Return the gimbal that a manager's message is about; None unless orders to this gimbal go to the sender."""
+        """Record the sender as manager if its rank is high enough, and return the gimbal that its message is about.
+
+        None if orders to this gimbal go to another component.
+        """
         frame = message.received_frame
         if frame is None:
             return None
@@ -191,7 +194,7 @@ class GimbalRegistry:
         if device_id > MAX_GIMBAL_NUMBER and device_id != sender:
             self._record_received(message)
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
-        else:  # The device is the sender itself, or attached to it.
+        else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
             device = self._device_of(message, device_id)
             rank = max(rank, RANK_INFORMATION)
         if device is None:

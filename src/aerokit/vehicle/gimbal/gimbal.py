@@ -12,7 +12,7 @@ from aerokit._internal.async_block import ReadOnly
 from aerokit.errors import BusyError, CommandRejected, CommandTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.messages import GimbalDeviceInformation, GimbalManagerInformation, GlobalPositionInt
-from aerokit.position import Home, Position, point_at
+from aerokit.position import Home, Position, position_with_altitude
 from aerokit.vehicle.gimbal.control import GimbalControl
 from aerokit.vehicle.gimbal.device import MAX_GIMBAL_NUMBER, YawFrame, information_of
 from aerokit.vehicle.gimbal.discovery import MAX_GIMBALS, GimbalRegistry
@@ -101,7 +101,7 @@ class RoiMixin(GimbalMixin):
         check_range("tolerance_deg", tolerance_deg, 0, 45, above=True)
         orders = self._orders
         orders.check_roi()
-        target = point_at(target)
+        target = position_with_altitude(target)
         place = self._context.vehicle_position.command_place(target)
         order = orders.begin_order()
         aim = AngleTarget(

@@ -13,7 +13,7 @@ from aerokit.errors import ConnectionClosed
 from aerokit.events import MissionCurrentChanged, MissionFinished, MissionItemReached
 from aerokit.mavlink.enums import MissionState
 from aerokit.mavlink.messages import MissionCurrent
-from aerokit.position import point_at
+from aerokit.position import position_with_altitude
 from aerokit.vehicle.state.condition import MissionProgress
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class PlanContext:
     @property
     def home(self) -> Position | None:
         home = self.session.telemetry.home.latest
-        return None if home is None else point_at(home)
+        return None if home is None else position_with_altitude(home)
 
     @property
     def is_flying_mission(self) -> bool:

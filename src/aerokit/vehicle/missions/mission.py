@@ -72,16 +72,16 @@ class MissionEndDetector:
         is_return = last_command == MavCmd.NAV_RETURN_TO_LAUNCH
         self._are_items_known = bool(items)
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
-        self._is_last_item_landing = last_command in LANDING_PURPOSES
+        self._is_last_item_landing_or_return = last_command in LANDING_PURPOSES
         self._ends_in_air = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         # Modes in which the vehicle may land. If the last item is a landing or a return, only its mode counts.
         self._landing_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)
             for command, purpose in LANDING_PURPOSES.items()
-            if command == last_command or not self._is_last_item_landing
+            if command == last_command or not self._is_last_item_landing_or_return
         ]
-        # HEARTBEAT may report the mission mode until this time.
+        # Until this time, HEARTBEAT may not report the mission mode yet.
         self._grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
@@ -97,12 +97,13 @@ class MissionEndDetector:
     def _is_end_reported(self) -> bool:
         """Return True if the vehicle reports the end of the mission. A vehicle that has fallen may report it too."""
         if self._tracker.is_complete:
-            if not self._are_items_known and not self._ends_by_landing:
+            if not self._are_items_known and not self._ends_by_landing_or_return:
                 return self._is_on_ground or self._has_stayed_complete()
-            # ArduPilot reports completion at home, PX4 already when it begins to return.
-            completes_at_home = self._session.autopilot.mission_completes_at_home
-            is_back = self._ends_in_air and (completes_at_home or self._has_returned())
-            return not self._ends_by_landing or self._is_on_ground or is_back
+            if self._ends_in_air:
+                # ArduPilot reports completion at home, PX4 already when it begins to return.
+                completes_at_home = self._session.autopilot.mission_completes_at_home
+                return completes_at_home or self._has_returned() or self._is_on_ground
+            return not self._ends_by_landing_or_return or self._is_on_ground
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
         if self._ends_in_air and self._is_landing:
             return self._is_on_ground or self._has_returned()
@@ -128,10 +129,10 @@ class MissionEndDetector:
         return now - self._completed_at >= END_GRACE_S
 
     @property
-    def _ends_by_landing(self) -> bool:
+    def _ends_by_landing_or_return(self) -> bool:
         """True if the last item is a landing, or a return. If the items are unknown, the mode shows it at the end."""
         if self._are_items_known:
-            return self._is_last_item_landing
+            return self._is_last_item_landing_or_return
         is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
 
@@ -151,8 +152,8 @@ class MissionEndDetector:
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         is_mode_settling = now < self._vehicle_context.arbiter.mode_settles_at
-        may_have_this_mode = is_paused or is_in_mode or self._is_landing or is_mode_settling
-        if may_have_this_mode and not session.telemetry.is_confirmed_disarmed:
+        is_mode_expected = is_paused or is_in_mode or self._is_landing or is_mode_settling
+        if is_mode_expected and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
         # The mission's end also changes the mode. Its report may arrive after the mode change, so wait for END_GRACE_S.
@@ -177,7 +178,7 @@ class MissionEndDetector:
         """True if the vehicle has changed from the mission mode to the mode of its last item (land or return)."""
         current, last = self._tracker.current.latest, self._tracker.last_item
         is_at_end = (current is not None and current == last) or not self._are_items_known
-        return is_at_end and self._ends_by_landing and self._is_in_landing_mode
+        return is_at_end and self._ends_by_landing_or_return and self._is_in_landing_mode
 
     @property
     def _is_in_landing_mode(self) -> bool:
@@ -240,10 +241,10 @@ class MissionControl(VehiclePlan["Mission"]):
         return self._tracker.reached
 
     async def set_current(self, item: int, *, timeout: float = 5.0) -> None:
-        """Set the next item. A vehicle that is flying its mission proceeds to it immediately.
+        """Make ``item`` the current item. A vehicle that is flying its mission proceeds to it immediately.
 
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
-        without a position (a DO command) is executed; ``current`` then shows the next item.
+        without a position (a DO command) is executed; ``current`` then shows the item after it.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -259,7 +260,8 @@ class MissionControl(VehiclePlan["Mission"]):
         """Fly the mission from ``item`` on; returns when HEARTBEAT reports the mission mode.
 
         The vehicle must be armed: **it takes off** if the mission begins with a take-off. A copter on the ground needs
-        a take-off as the first item. If you cancel the call, aerokit orders the vehicle to hold.
+        a take-off as the first item. If you cancel the call, or it raises OperationTimeout, aerokit orders the vehicle
+        to hold.
 
         ArduPilot gets MISSION_START, because a mode change alone does not make it take off. Other autopilots get a mode
         change.
@@ -357,7 +359,7 @@ class MissionControl(VehiclePlan["Mission"]):
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 stall_reason=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
-                at_positions=False,  # No single position ends a mission, which may take hours.
+                at_positions=False,  # The next poll is soon enough, and a mission may take hours.
             )
 
     @property
@@ -376,7 +378,7 @@ class MissionControl(VehiclePlan["Mission"]):
         is_at_end = self._tracker.is_complete or self._tracker.is_at_last_item
         return is_at_end and session.telemetry.mode.latest in final_modes
 
-    def _plan_type(self) -> type[Mission]:
+    def _get_plan_type(self) -> type[Mission]:
         from aerokit.missions import Mission
 
         return Mission
@@ -416,22 +418,22 @@ class MissionControl(VehiclePlan["Mission"]):
                     raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
                 raise
 
-    async def _set_current_by_message(self, seq: int, timeout: float, order_status: SentCommand | None = None) -> None:
+    async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand | None = None) -> None:
         """Send MISSION_SET_CURRENT until MISSION_CURRENT reports the item, as long as the order is valid."""
         from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
         target = (transfers.system_id, transfers.component_id)
         async with self._context.lock:  # PX4 ignores MISSION_SET_CURRENT during a transfer.
-            if order_status is not None:
-                self._vehicle_context.sender.raise_if_ended(order_status.order)
-                await self._vehicle_context.sender.await_recent_state(order_status.order)
+            if sent is not None:
+                self._vehicle_context.sender.raise_if_ended(sent.order)
+                await self._vehicle_context.sender.await_recent_state(sent.order)
             await transfers.run(
                 SetCurrentItem(
                     *target,
                     seq,
                     self._current_seq,
-                    order_status=order_status,
+                    order_status=sent,
                     round_trip=transfers.round_trip,
                     idle_timeout_s=timeout,
                 )

@@ -123,7 +123,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             await transfer.clear()
             self._on_count(0)
 
-    def _plan_type(self) -> type[PlanT]:
+    def _get_plan_type(self) -> type[PlanT]:
         """Return the class of the plan, imported on demand."""
         raise NotImplementedError
 
@@ -131,7 +131,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         """Called after each transfer with the number of items."""
 
     def _checked(self, plan: PlanT) -> PlanT:
-        plan_type = self._plan_type()
+        plan_type = self._get_plan_type()
         check_kind("plan", plan, plan_type)
         plan.check(home_is_item_0=bool(self._context.offset_of(plan_type.MISSION_TYPE)))
         return plan
@@ -144,7 +144,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         from aerokit.vehicle.missions.transfer import PlanTransfer
 
         context = self._context
-        transfer = PlanTransfer(context, self._plan_type(), idle_timeout_s=idle_timeout_s, on_progress=on_progress)
+        transfer = PlanTransfer(context, self._get_plan_type(), idle_timeout_s=idle_timeout_s, on_progress=on_progress)
         with context.transfers.limit(timeout):
             async with context.lock:
                 yield transfer
@@ -169,7 +169,7 @@ class FenceControl(VehiclePlan["Fence"]):
         """
         await self._context.vehicle_context.sender.auxiliary_command(MavCmd.DO_FENCE_ENABLE, float(on))
 
-    def _plan_type(self) -> type[Fence]:
+    def _get_plan_type(self) -> type[Fence]:
         from aerokit.missions import Fence
 
         return Fence
@@ -181,7 +181,7 @@ class RallyControl(VehiclePlan["RallyPoints"]):
     PX4 calls them safe points, and uses them if RTL_TYPE is set accordingly.
     """
 
-    def _plan_type(self) -> type[RallyPoints]:
+    def _get_plan_type(self) -> type[RallyPoints]:
         from aerokit.missions import RallyPoints
 
         return RallyPoints

@@ -181,8 +181,8 @@ class PlanChannel:
         if not isinstance(exchange, MissionUpload):
             return ""
         self._has_changed |= exchange.may_have_changed_items
-        is_overwritten = self.mission_type in self._context.autopilot.overwrites_plans_in_place
-        is_partly_overwritten = is_overwritten and self._has_changed
+        overwrites_in_place = self.mission_type in self._context.autopilot.overwrites_plans_in_place
+        is_partly_overwritten = overwrites_in_place and self._has_changed
         if is_silent and exchange.was_sent_completely:
             return "; all items were sent, but whether the vehicle accepted them is unknown: call download()"
         if is_partly_overwritten and refused_item:
@@ -190,7 +190,7 @@ class PlanChannel:
             return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
         if is_partly_overwritten:
             return "; the vehicle now has some new and some old items: upload again, or clear"
-        if is_overwritten and is_silent:
+        if overwrites_in_place and is_silent:
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
         return "; the vehicle still has its previous items"
 
@@ -242,7 +242,7 @@ class PlanTransfer(Generic[PlanT]):
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
         """Replace the vehicle's plan: send the differences if that is possible, otherwise a file or all items."""
         items = plan.to_items()
-        if self._offset:  # Item 0 must be the vehicle's own home, because older firmware may move its home to item 0.
+        if self._offset:  # Item 0 must be the vehicle's own home, because older firmware may take it as its new home.
             items = with_home(items, self._context.home)
         if len(items) == self._offset:  # The plan is empty, except for home.
             await self.clear()

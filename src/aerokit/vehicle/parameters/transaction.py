@@ -74,8 +74,8 @@ class _Block:
             if not isinstance(answer, Parameter):
                 raise answer
             if name not in self._saved:
-                # The read has updated the store. Its value is preferred, because an answer may be a float that lacks
-                # the last bits.
+                # The read has updated the store. The store's value is preferred, because it is exact, whereas the
+                # answer may be a float that lacks the last bits.
                 self._saved[name] = self._access.store.get(name) or answer
                 self._registry.add(name, self)
 

@@ -192,7 +192,7 @@ class CommandSender:
         order_status: OrderStatus | None,
         was_just_sent: bool = False,
     ) -> CommandAck:
-        """Send a command and return its ACCEPTED ack. Earlier calls with the same component and MAV_CMD end first."""
+        """Send a command and return its ACCEPTED ack. Waits until earlier calls with the same key have ended."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_if_ended(key)
@@ -287,7 +287,7 @@ class CommandSender:
                 self._accepted_at[key] = self._connection.now()
         if run is not None:
             run.receive(ack)
-        elif key in self._pending_acks and is_final:
+        elif is_answer and is_final:
             self._pending_acks[key].pop(0)
             if not self._pending_acks[key]:
                 del self._pending_acks[key]

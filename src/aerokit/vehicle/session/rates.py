@@ -236,8 +236,8 @@ class MessageRates:
                 stream.failures += 1
                 stream.next_attempt_at = self._connection.now() + min(2.0**stream.failures, MAX_RETRY_INTERVAL_S)
             return
-        # The vehicle has accepted or refused the rate. In both cases, the request is repeated only when the stream is
-        # requested again.
+        # The vehicle has accepted or refused the rate. In both cases, nothing more is sent until another rate is
+        # needed, or `request_again` or `watch` makes the stream due again.
         stream.failures = 0
         stream.mark_requested(self._connection.now(), hz)
 

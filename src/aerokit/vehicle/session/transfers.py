@@ -139,19 +139,19 @@ class Transfers:
 
     @property
     def version(self) -> AutopilotVersion | None:
-        """The autopilot's version, None while unknown."""
+        """The component's version, None while unknown."""
         return self._version.latest
 
     @property
     def known_capabilities(self) -> int | None:
-        """MAV_PROTOCOL_CAPABILITY bits of the autopilot, None while unknown."""
+        """MAV_PROTOCOL_CAPABILITY bits of the component, None while unknown."""
         version = self._version.latest
         return None if version is None else version.capabilities
 
     async def capabilities(self) -> int | None:
-        """Return the MAV_PROTOCOL_CAPABILITY bits of the autopilot; None if it does not send them within a few seconds.
+        """Return the component's MAV_PROTOCOL_CAPABILITY bits; None if it does not send them within a few seconds.
 
-        Later calls do not wait again for a component that has not answered.
+        Later calls do not wait again for a component that has not answered, unless it is an autopilot.
         """
         if not self._version.is_known and not self._is_version_unavailable:
             with anyio.move_on_after(VERSION_TIMEOUT_S), suppress(CommandRejected, CommandTimeout):

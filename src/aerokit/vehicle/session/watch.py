@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 # If the vehicle's time since boot decreases by more than this, the vehicle has rebooted. Reordered messages cause a
 # smaller decrease. A reboot soon after the previous one also causes a smaller decrease and is not detected.
-REBOOT_STEP_MS = 3000
+REBOOT_MIN_DECREASE_MS = 3000
 # A decreased time shows a reboot only if it persists for this long and in at least two messages, because a single
 # message may be late.
 REBOOT_CONFIRM_S = 0.2
 # An expected reboot is detected when the vehicle's clock is behind its expected time by more than this. A boot takes
 # longer than this, and messages are delayed by less.
-MIN_REBOOT_STEP_MS = 2000
+EXPECTED_REBOOT_MIN_LAG_MS = 2000
 # A simulation's clock may be faster than real time. Its speed is computed once the first and the last reported time
 # differ by this many seconds.
 CLOCK_SPAN_S = 5.0
@@ -210,9 +210,9 @@ class VehicleWatch:
         # How far the vehicle's clock is behind its expected time. The result is too small if the earlier message was
         # delayed.
         behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
-        if self._expects_reboot and behind_ms > MIN_REBOOT_STEP_MS:
+        if self._expects_reboot and behind_ms > EXPECTED_REBOOT_MIN_LAG_MS:
             self._on_reboot_detected(clock, milliseconds)
-        elif milliseconds + REBOOT_STEP_MS >= milliseconds_before:  # The time has not decreased by enough for a reboot.
+        elif milliseconds_before - milliseconds <= REBOOT_MIN_DECREASE_MS:  # The decrease is too small for a reboot.
             self._last_times[clock] = (milliseconds, now)
             if self._first_time is None and clock == "time_boot_ms":
                 self._first_time = (milliseconds, now)
