@@ -66,6 +66,8 @@ def test_px4_invalid_position_encoding_is_denied() -> None:
     nan, reposition = 0x7FF80000, MavCmd.DO_REPOSITION
     assert client.command_int(reposition, 5, -1, 1, x=nan, y=nan) == MavResult.DENIED
     assert client.command(reposition, -1, 1, 0, NAN, INT32_MAX, INT32_MAX, NAN) == MavResult.DENIED
+    next_float = 2.0**31 + 256  # The firmware also refuses the floats next to INT32_MAX.
+    assert client.command(reposition, -1, 1, 0, NAN, next_float, next_float, NAN) == MavResult.DENIED
     assert client.command_int(reposition, 5, -1, 1, x=INT32_MAX, y=INT32_MAX, z=NAN) == MavResult.ACCEPTED
 
 

@@ -9,7 +9,7 @@ import pytest
 from simulated_client import PX4_HOME, Client
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavResult, MavState
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavState
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedPx4
 from aerokit.sim.px4.telemetry import BUILDERS
@@ -120,6 +120,18 @@ def test_precision_landing_lands() -> None:
     assert px4.mode == PRECISION_LAND
     client.run_until(lambda: not px4.is_armed, 40.0)
     assert px4.mode == HOLD
+
+
+def test_precision_landing_after_search_timeout_ignores_target() -> None:
+    px4, client = flying()
+    assert client.command(MavCmd.NAV_LAND_LOCAL) == MavResult.ACCEPTED
+    client.run(px4.parameters["PLD_SRCH_TOUT"] + 1.0)
+    east_before = px4.motion.east
+    client.send(m.LandingTarget(0, 0, MavFrame.LOCAL_NED, 0.0, 0.0, 9.0, 0.0, 0.0, y=9.0, position_valid=1))
+    client.run(2.0)
+    assert px4.external.target == (0.0, 9.0)
+    assert px4.motion.east == pytest.approx(east_before, abs=0.1)
+    assert px4.motion.velocity_down > 0.0
 
 
 def test_forced_disarm_during_take_off_allows_new_flight() -> None:

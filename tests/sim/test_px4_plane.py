@@ -55,6 +55,13 @@ def test_plane_identifies_itself() -> None:
     assert len(SimulatedPx4Plane().parameters) == 978
 
 
+def test_orbit_of_plane_without_radius_uses_default() -> None:
+    plane, client = flying_plane()
+    for radius, used_radius in ((150.0, 150.0), (NAN, plane.parameters["NAV_LOITER_RAD"])):
+        assert client.command(MavCmd.DO_ORBIT, radius, NAN, 0, NAN, NAN, NAN, NAN) == MavResult.ACCEPTED
+        assert plane.flight.radius_m == used_radius
+
+
 def test_plane_on_ground_stays_armed() -> None:
     plane, client = ready_plane()
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED

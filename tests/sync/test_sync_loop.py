@@ -258,7 +258,7 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
                 left_undone.add(linecache.getline(*place).strip())
     assert len(was_come_to) > 20
     assert left_undone == {
-        "return self._run(None, function, *args, **kwargs)",
+        "return self._run(True, function, *args, **kwargs)",
         "call: _Call[T] | None = None",
         "try:",
     }

@@ -77,9 +77,9 @@ class LogServer:
         self._outgoing: deque[Callable[[], Message]] = deque()
         self._channel: Channel | None = None  # where the present transfer is sent
         self._transfer_number = 0  # Number of the present transfer. An earlier transfer sends nothing more.
-        # Content of the log that was requested last, and its index; -1 if there is none.
+        # Content of the log that was requested last, and the index of this log in `logs`; -1 if there is none.
         self._content = b""
-        self._content_number = -1
+        self._content_index = -1
         vehicle.on(LogRequestList, self._on_list)
         vehicle.on(LogRequestData, self._on_data)
         vehicle.on(LogErase, self._on_erase)
@@ -104,17 +104,17 @@ class LogServer:
     def _on_erase(self, request: LogErase, channel: Channel) -> None:
         self.restart()
         self.logs.clear()
-        self._content_number = -1
+        self._content_index = -1
         self._erase_files()
 
     def _on_end(self, request: LogRequestEnd, channel: Channel) -> None:
         self.restart()
 
-    def content(self, number: int) -> bytes:
+    def content(self, index: int) -> bytes:
         """Return the content of the log at this index."""
-        log = self.logs[number]
-        if number != self._content_number or len(self._content) != log.size:  # The size differs if the log has grown.
-            self._content_number = number
+        log = self.logs[index]
+        if index != self._content_index or len(self._content) != log.size:  # The size differs if the log has grown.
+            self._content_index = index
             self._content = log.make()
         return self._content
 
@@ -124,9 +124,9 @@ class LogServer:
         self.logs[-1] = old.grown(count, time_utc)
         self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[old.size :])
 
-    def blocks(self, number: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
+    def blocks(self, index: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
         """Return functions that create the LOG_DATA messages of a range. A range without data has one empty block."""
-        data = self.content(number)
+        data = self.content(index)
         end = min(len(data), offset + count)
         starts: Sequence[int] = range(offset, end, _BLOCK) if offset < end else [offset]
         return [partial(_log_data, data, log_id, start, end) for start in starts]
@@ -150,7 +150,7 @@ class LogServer:
 class ArduPilotLogServer(LogServer):
     """ArduPilot's log server. Log numbers start at 1, and requests are refused while the vehicle is armed.
 
-    Requests during a transfer are ignored. A request for an unknown log aborts the transfer.
+    Requests during a transfer, and for an unknown log, are ignored.
     """
 
     def __init__(
@@ -180,10 +180,8 @@ class ArduPilotLogServer(LogServer):
         return LogEntry(number, len(self.logs), last, log.time_utc, log.size)
 
     def _on_data(self, request: LogRequestData, channel: Channel) -> None:
-        if self._refuses() or self.is_busy:
-            return
-        if not 1 <= request.id <= len(self.logs):
-            self.restart()
+        is_known = 1 <= request.id <= len(self.logs)
+        if self._refuses() or self.is_busy or not is_known:
             return
         self.transfer(self.blocks(request.id - 1, request.id, request.ofs, request.count), channel)
 

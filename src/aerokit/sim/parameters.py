@@ -195,7 +195,10 @@ def _lines_and_switches(
 
 
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return all lines in ``used``, filled up to ``count`` with the first others that need no switch."""
+    """Return the lines of the parameters named in ``used``.
+
+    If these are fewer than ``count``, the first other lines without a switch are added.
+    """
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))
     selected: list[str] = []

@@ -203,7 +203,7 @@ class SimulatorServer:
         self._schedule()
 
     def _step(self, now: float) -> None:
-        """Advance the vehicles whose next event is due to the time ``now``."""
+        """Advance to ``now`` each vehicle whose next event is due."""
         dues = self._dues
         for number, due in enumerate(dues):
             if due <= now:
@@ -218,7 +218,8 @@ class SimulatorServer:
         self._skip_lateness()
         now = self.now
         if self.on_datagram is not None:
-            self.on_datagram(now, data, False)
+            is_from_vehicle = False
+            self.on_datagram(now, data, is_from_vehicle)
         try:
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
                 # The vehicle may be ahead of `now`: a timer fired early, or another vehicle advanced this vehicle.
@@ -232,11 +233,14 @@ class SimulatorServer:
 
     def _flush(self) -> None:
         """Write the datagrams of all vehicles to their links."""
+        # Batching saves datagrams in real time. On virtual time, with an event source, each vehicle sends its own.
+        is_real_time = self._remove_source is None
         for port in self._ports:
-            for datagram in port.take_datagrams(together=self._remove_source is None):
+            for datagram in port.take_datagrams(together=is_real_time):
                 port.link.write(datagram)
                 if self.on_datagram is not None:
-                    self.on_datagram(self.now, datagram, True)
+                    is_from_vehicle = True
+                    self.on_datagram(self.now, datagram, is_from_vehicle)
             port.disconnect_clients()
 
     def _schedule(self) -> None:

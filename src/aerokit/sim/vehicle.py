@@ -94,8 +94,8 @@ class ExtraComponent:
 class SimulatedVehicle:
     """Base of a simulated vehicle, which does no I/O. Subclasses define messages, streams and motion.
 
-    `receive` and `step` take the time, `take_outbox` returns bytes, and `next_due` is the time of the next event.
-    The first link uses the first channel. Call `open_channel` for each further link.
+    Pass the present time to `receive` and `step`, and send the bytes that `take_outbox` returns. `next_due` is the time
+    of the next event. The first link uses the first channel. Call `open_channel` for each further link.
     """
 
     def __init__(
@@ -261,19 +261,18 @@ class SimulatedVehicle:
         self.call_at(self.now + delay, action)
 
     def every(self, interval: float, action: Callable[[], None], *, first: float | None = None) -> None:
-        """Call a function every ``interval`` seconds until a reboot.
+        """Call a function every ``interval`` seconds. A reboot cancels all further calls.
 
         ``first`` is the delay of the first call in seconds; None means ``interval``.
         """
         start = self.now + (interval if first is None else first)
-        booted_at = self.booted_at
         count = 0
 
         def repeat() -> None:
             nonlocal count
             count += 1
-            if booted_at == self.booted_at:  # The vehicle has not rebooted in the meantime.
-                self.call_at(round((start + count * interval) * NS_PER_S) / NS_PER_S, repeat)
+            # The next call is scheduled first, so that an action that reboots the vehicle cancels it.
+            self.call_at(round((start + count * interval) * NS_PER_S) / NS_PER_S, repeat)
             action()
 
         self.call_at(start, repeat)
@@ -358,21 +357,24 @@ class SimulatedVehicle:
     def send_text(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT on every channel. A text of more than 50 characters is divided into chunks."""
         text = text.encode("ascii", "replace").decode()
-        if len(text) <= _TEXT_SIZE:
-            self._record_text(severity, text)
-            self.send_parts([Statustext(severity, text, 0, 0)])
+        if len(text) > _TEXT_SIZE:
+            self._text_id = self._text_id % 0xFFFF + 1  # 1 to 65535, because the id 0 means a text of one chunk.
+            self.send_chunks(severity, text, self._text_id)
             return
-        self._text_id = self._text_id % 0xFFFF + 1  # 1 to 65535, because the id 0 means a text of one chunk.
-        self.send_chunks(severity, text, self._text_id)
+        self._record_text(severity, text)
+        self.send_parts([Statustext(severity, text, 0, 0)])
 
     def send_chunks(self, severity: int, text: str, text_id: int) -> None:
-        """Send STATUSTEXTs with a common id. The last chunk has fewer than 50 characters, which marks the end."""
+        """Record a text, and send it as STATUSTEXTs with a common id.
+
+        The last chunk has fewer than 50 characters, which marks the end.
+        """
         self._record_text(severity, text)
         chunks = [text[start : start + _TEXT_SIZE] for start in range(0, len(text) + 1, _TEXT_SIZE)]
         self.send_parts([Statustext(severity, chunk, text_id, number) for number, chunk in enumerate(chunks)])
 
     def send_parts(self, chunks: list[Statustext]) -> None:
-        """Send the chunks of a text."""
+        """Send the chunks of one text. A subclass may send them only to some channels."""
         for chunk in chunks:
             self.send(chunk)
 

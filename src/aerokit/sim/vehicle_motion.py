@@ -343,10 +343,10 @@ _LIMITS = MotionLimits(
 
 
 class UnderwaterMotion(Motion):
-    """Motion of a submarine. ``down`` is its depth.
+    """Motion of a submarine between the water surface and the bottom.
 
-    ``bottom_down`` is the depth of the bottom, ``ground_down`` the depth of the water surface. ``buoyancy_m_s2`` is the
-    upward acceleration without thrust.
+    ``down`` is a coordinate of the local frame: the surface is at ``ground_down``, where the submarine starts, and the
+    bottom at ``bottom_down``. ``buoyancy_m_s2`` is the upward acceleration without thrust.
     """
 
     def __init__(self, rng: random.Random, *, bottom_down: float = 200.0, buoyancy_m_s2: float = 0.1) -> None:
@@ -398,9 +398,11 @@ class UnderwaterMotion(Motion):
         self._turn(dt, powered=powered)
 
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
+        """Integrate, and keep the submarine between the surface and the bottom."""
         super()._integrate(north, east, down, dt)
-        if self.down < self.ground_down:
-            self.down = self.ground_down
+        surface_down = self.ground_down
+        if self.down < surface_down:
+            self.down = surface_down
             self.velocity_down = max(0.0, self.velocity_down)
         elif self.down > self.bottom_down:
             self.down: float = self.bottom_down

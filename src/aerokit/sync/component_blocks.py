@@ -68,18 +68,18 @@ def opened_component(
     twin: type[ComponentT],
     open_async: Callable[..., AbstractAsyncContextManager[Any]],
     address: Any,
-    connection: Any,
+    connection: ConnectionTwin | None,
     **options: Any,
 ) -> ComponentT:
     """Open a component on a new loop thread; if ``connection`` is given, on the connection's loop thread."""
-    is_shared = isinstance(connection, ConnectionTwin)
-    loop = connection._loop if is_shared else LoopThread()
+    owns_loop = connection is None
+    loop = LoopThread() if connection is None else connection._loop
     try:
-        async_connection = connection.aio if is_shared else connection
+        async_connection = None if connection is None else connection.aio
         context: OpenContext[Any] = loop.open_context(open_async(address, connection=async_connection, **options))
         loop.call(context.value._use_threads)
     except BaseException:
-        if not is_shared:
+        if owns_loop:
             loop.close()
         raise
-    return twin(loop, context, owns_loop=not is_shared)
+    return twin(loop, context, owns_loop=owns_loop)

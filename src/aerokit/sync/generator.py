@@ -281,7 +281,10 @@ class Page:
         return render_function(node, returns, member.text, body)
 
     def _property_twin(self, twin: Twin, member: ClassMember) -> str:
-        """Return the source of a property. A twin is cached, so that each access returns the same object."""
+        """Return the source of a property.
+
+        If the property wraps its value in a twin, it is cached, so that each access returns the same object.
+        """
         name = member.name
         read = f"self.aio.{name}"
         if name in twin.called:

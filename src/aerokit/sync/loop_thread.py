@@ -85,7 +85,7 @@ class LoopThread:
             BusyError: called on the loop's own thread, which would be a deadlock.
             ConnectionClosed: the loop was closed before or during the call.
         """
-        return self._run(INTERRUPTED_CALL_TIMEOUT_S, function, *args, **kwargs)
+        return self._run(False, function, *args, **kwargs)
 
     def run_shielded(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Like :meth:`run`, for short clean-up functions that must not be interrupted.
@@ -93,17 +93,20 @@ class LoopThread:
         Ctrl-C waits for the function and then raises KeyboardInterrupt, with the function's error as its cause. A
         second Ctrl-C does not wait.
         """
-        return self._run(None, function, *args, **kwargs)
+        return self._run(True, function, *args, **kwargs)
 
     def _run(
         self,
-        interrupt_timeout_s: float | None,
+        is_shielded: bool,
         function: Callable[P, Awaitable[T]],
         /,  # Positional only, because the function itself may have arguments with these names.
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run a function. After Ctrl-C, wait ``interrupt_timeout_s`` for its end; None means without limit."""
+        """Run a function. If the wait is interrupted, cancel the call, and wait INTERRUPTED_CALL_TIMEOUT_S for its end.
+
+        A shielded call is started even after Ctrl-C, and its end is awaited without limit.
+        """
         call: _Call[T] | None = None
         try:
             call = _Call(functools.partial(function, *args, **kwargs))
@@ -111,15 +114,14 @@ class LoopThread:
             self._start(call)
             self.wait_for(call)
         except BaseException as error:
-            is_shielded = interrupt_timeout_s is None
             if is_shielded and isinstance(error, KeyboardInterrupt):
                 # Clean-up must run even if Ctrl-C came before the call was started. A second start has no effect.
                 call = call or _Call(functools.partial(function, *args, **kwargs))
                 with contextlib.suppress(AerokitError):
                     self._start(call)
             if call is not None:
-                self._cancel(call)
-                wait_s = SIGNAL_CHECK_INTERVAL_S if interrupt_timeout_s is None else interrupt_timeout_s
+                self._cancel(call)  # Clean-up functions shield what must not be cancelled.
+                wait_s = SIGNAL_CHECK_INTERVAL_S if is_shielded else INTERRUPTED_CALL_TIMEOUT_S
                 while call.is_scheduled and not call.wait(wait_s):
                     may_wait_on = is_shielded and self._thread.is_alive()  # Only clean-up is awaited without limit.
                     if not may_wait_on:
@@ -271,28 +273,28 @@ class OpenContext(Generic[T]):
         self.value = opened.result()
 
     def close(self) -> None:
-        """Exit the context manager and wait for it. Idempotent."""
+        """Exit the context manager, and wait for it at most CLOSE_TIMEOUT_S. Idempotent."""
         if self._loop.is_current:  # The loop's own thread must not wait for the loop.
-            self._task.close.set()
+            self._task.close_requested.set()
         elif not self._call.is_done:
             with contextlib.suppress(ConnectionClosed):
-                self._loop.call(self._task.close.set)
+                self._loop.call(self._task.close_requested.set)
                 self._call.wait(CLOSE_TIMEOUT_S)
 
 
 class _ContextTask(Generic[T]):
-    """Enters a context manager, sets ``opened``, and exits the context manager when ``close`` is set."""
+    """Enters a context manager, sets ``opened``, and exits the context manager once ``close_requested`` is set."""
 
     def __init__(self, context: AbstractAsyncContextManager[T]) -> None:
         self._context = context
         self.opened: ThreadFuture[T] = ThreadFuture()
-        self.close = asyncio.Event()
+        self.close_requested = asyncio.Event()
 
     async def run(self) -> None:
         try:
             async with self._context as value:
                 self.opened.set_result(value)
-                await self.close.wait()
+                await self.close_requested.wait()
         finally:
             self.opened.finish()
 

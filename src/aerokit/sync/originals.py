@@ -210,10 +210,10 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
     arguments: dict[str, str] = {}
     for base in getattr(cls, "__orig_bases__", ()):
         names = [parameter.__name__ for parameter in getattr(get_origin(base), "__parameters__", ())]
-        # Only forward references replace type variables. `names` and `values` match, because no base of an original has
-        # both forward references and other arguments.
+        # Only forward references replace type variables. The arguments of a base are either all forward references, so
+        # that `values` matches `names`, or none of them is, so that `values` is empty.
         values = [argument.__forward_arg__ for argument in get_args(base) if isinstance(argument, ForwardRef)]
-        arguments |= dict(zip(names, values))  # noqa: B905 - empty for other arguments
+        arguments |= dict(zip(names, values))  # noqa: B905 - `values` may be empty
 
     class Fill(ast.NodeTransformer):
         def visit_Name(self, node: ast.Name) -> ast.Name:

@@ -5021,8 +5021,8 @@ class Vehicle(VehicleTwin):
         """Return the camera with this number. It need not have been found yet.
 
         Args:
-            number: component id of the camera (100 to 105, at most 255), or 1 to 6 for a camera attached to the
-                autopilot.
+            number: component id of the camera (usually 100 to 105, but any id from 7 to 255 is allowed), or 1 to 6 for
+                a camera attached to the autopilot.
 
         Raises:
             InvalidArgument: no camera can have this number.

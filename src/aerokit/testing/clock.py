@@ -116,10 +116,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # No callback is ready although the event sources have run. If a poll is due or there is no timer to jump
-            # to, the next iteration polls or runs the event sources again.
+            # The event sources have made no callback ready. If they stopped because a poll is due, or if there is no
+            # timer to jump to, the next iteration polls or runs them again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
+            # Otherwise, the next event is a timer.
             self._now = max(self._now, self._next_timer())
         self._schedule_sources_before_timer()
         end = self._now + self._clock_resolution

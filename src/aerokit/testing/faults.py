@@ -114,10 +114,11 @@ class FaultInjector:
         self, name: str, value: object, after_s: float, for_s: float | None = None, *, healthy_value: object = False
     ) -> None:
         """Set an attribute of `Faults` after some seconds and, after ``for_s`` more, set it to its healthy value."""
+        faults = self.all
         end_s = None if for_s is None else after_s + _duration(for_s)
-        self._schedule(partial(setattr, self.all, name, value), after_s)
+        self._schedule(partial(setattr, faults, name, value), after_s)
         if end_s is not None:
-            self._schedule(partial(setattr, self.all, name, healthy_value), end_s)
+            self._schedule(partial(setattr, faults, name, healthy_value), end_s)
 
     def _schedule(self, action: Callable[[], None], after_s: float) -> None:
         if not (math.isfinite(after_s) and after_s >= 0.0):

@@ -59,8 +59,8 @@ class StalledQueue:
         # Bytes that the simulated operating system has accepted, and sends after the stall.
         self._accepted: list[tuple[bytes, Peer]] = []
         self._outboxes: dict[Peer, Outbox] = {}
-        self._stalled_peers: set[Peer] = set()
-        self._is_stalled = True
+        self._stalled_peers: set[Peer] = set()  # Peers whose outbox has reported a stall.
+        self._is_stalled = True  # Of the whole connection, until `drain`.
 
     @property
     def unsent_bytes(self) -> int:
@@ -220,7 +220,7 @@ class FaultyLink(Link):
         self.incoming.start(loop.time())
         try:
             await self.link.open(self._incoming_path)
-        except BaseException:  # The link can be opened again, even after a cancellation.
+        except BaseException:  # After a failed or cancelled attempt, `open` may be called again.
             self._incoming_path.close()
             self._in_flight.clear()
             self._incoming_path = None

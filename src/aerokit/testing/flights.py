@@ -180,7 +180,7 @@ class SimulatedFleet(Sequence[Flight]):
         Raises RuntimeError if the fleet was opened before.
         """
         if self._was_opened:
-            raise RuntimeError("this flight was already opened, and can be opened only once; create a new flight")
+            raise RuntimeError("this flight or fleet was already opened, and can be opened only once; create a new one")
         self._was_opened = True
         near_end, far_end = memory_link_pair(latency_s=self._latency_s)
         async with AsyncExitStack() as stack:

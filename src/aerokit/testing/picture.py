@@ -31,6 +31,7 @@ _FONT_SIZE = 12
 _MAX_NAMES = 8
 _FAILED = "#e00000"
 _LABEL_HEIGHT = 13
+_LABEL_GAP = 8  # Pixels between a point and its label.
 _LABEL_WIDTH = 60
 _MAX_LABELS = 40
 _CORNERS = 90  # Corners of the polygon that draws a circle.
@@ -274,11 +275,9 @@ class _Labels:
     """Labels with mode names at the points where modes start. Labels that would overlap are left out."""
 
     def __init__(self) -> None:
-        self._places: list[tuple[float, float]] = []  # places of the labels so far
+        self._label_places: list[tuple[float, float]] = []  # places of the labels so far
 
-    def modes(
-        self, track: Drawable, places: Sequence[tuple[float, float]], colour: str, *, above: float = 8
-    ) -> list[_Shape]:
+    def modes(self, track: Drawable, places: Sequence[tuple[float, float]], colour: str) -> list[_Shape]:
         """Return a dot and a label with the mode name for each point of the track at which a mode starts."""
         shapes: list[_Shape] = []
         previous_mode = None
@@ -288,16 +287,17 @@ class _Labels:
             previous_mode = point.mode
             shapes.append(_Dot(x, y, colour, radius=2.5))
             # Place the label above the point or, if another label is there, up to three lines higher.
-            label_levels = (y - above - step * _LABEL_HEIGHT for step in range(4))
+            label_levels = (y - _LABEL_GAP - step * _LABEL_HEIGHT for step in range(4))
             label_y = next((level for level in label_levels if self._is_free(x, level)), None)
-            if label_y is not None and len(self._places) < _MAX_LABELS:
-                self._places.append((x, label_y))
+            if label_y is not None and len(self._label_places) < _MAX_LABELS:
+                self._label_places.append((x, label_y))
                 shapes.append(_Text(x + 4, label_y, point.mode, "start", colour))
         return shapes
 
     def _is_free(self, x: float, y: float) -> bool:
         return all(
-            abs(x - label_x) > _LABEL_WIDTH or abs(y - label_y) >= _LABEL_HEIGHT for label_x, label_y in self._places
+            abs(x - label_x) > _LABEL_WIDTH or abs(y - label_y) >= _LABEL_HEIGHT
+            for label_x, label_y in self._label_places
         )
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _MARKER = "simulated"
 _PICTURES_OPTION = "--flight-pictures"
 # Attribute of a test function that pytest-asyncio runs. It holds a function that opens the flights and calls the test.
-_OPENING_TEST = "_aerokit_opening_test"
+_TEST_WITH_OPEN_FLIGHTS = "_aerokit_test_with_open_flights"
 # The plugin compares names instead of classes, because tests without flights must not import aerokit.
 _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
 
@@ -134,7 +134,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     if not fleets or item.get_closest_marker("asyncio") is None:
         return (yield)
     assert isinstance(item, pytest.Function)
-    with _function_replaced(item, _only_on_virtual_time(_opening_flights(item.obj, fleets))):
+    with _function_replaced(item, _only_on_virtual_time(_with_open_flights(item.obj, fleets))):
         return (yield)
 
 
@@ -201,23 +201,24 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
     """Return the function that pytest must call to run the test, with its flights open if it is an ``async def``."""
     fleets = _fleets(item)
     test: Callable[..., Any] = item.obj
-    opening_test = getattr(test, _OPENING_TEST, None)
-    if opening_test is not None:  # The test has the asyncio marker.
-        # If `test` is a plain function, it is the wrapper with which pytest-asyncio runs the test on its own loop.
+    marked_test = getattr(test, _TEST_WITH_OPEN_FLIGHTS, None)
+    if marked_test is not None:  # The test has the asyncio marker.
+        # If `test` is a plain function, pytest-asyncio has wrapped the test, to run it on pytest-asyncio's loop.
         wrapped_by_pytest_asyncio = None if inspect.iscoroutinefunction(test) else test
-        return _on_virtual_time(opening_test, try_first=wrapped_by_pytest_asyncio)
+        return _on_virtual_time(marked_test, try_first=wrapped_by_pytest_asyncio)
     if not fleets or not inspect.iscoroutinefunction(test):
         return test
-    opening_test = _opening_flights(test, fleets)
+    test_with_open_flights = _with_open_flights(test, fleets)
     # A test that uses the fixture `anyio_backend` is run by anyio's plugin.
-    return opening_test if "anyio_backend" in item.fixturenames else _on_virtual_time(opening_test)
+    is_run_by_anyio = "anyio_backend" in item.fixturenames
+    return test_with_open_flights if is_run_by_anyio else _on_virtual_time(test_with_open_flights)
 
 
-def _opening_flights(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> Callable[..., Any]:
+def _with_open_flights(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> Callable[..., Any]:
     """Return a test that opens the fleets, awaits ``test`` and closes them."""
 
     @functools.wraps(test)
-    async def opening_test(**arguments: Any) -> None:
+    async def run_with_open_flights(**arguments: Any) -> None:
         from contextlib import AsyncExitStack
 
         async with AsyncExitStack() as stack:
@@ -225,17 +226,17 @@ def _opening_flights(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> 
                 await stack.enter_async_context(fleet.open())
             await test(**arguments)
 
-    return opening_test
+    return run_with_open_flights
 
 
 class _NotVirtualTime(Exception):
     """Raised if the running loop is not on virtual time."""
 
 
-def _only_on_virtual_time(opening_test: Callable[..., Any]) -> Callable[..., Any]:
+def _only_on_virtual_time(test_with_open_flights: Callable[..., Any]) -> Callable[..., Any]:
     """Return a test that raises `_NotVirtualTime` at its beginning if pytest-asyncio's loop runs in real time."""
 
-    @functools.wraps(opening_test)
+    @functools.wraps(test_with_open_flights)
     async def run(**arguments: Any) -> None:
         import asyncio
 
@@ -243,10 +244,10 @@ def _only_on_virtual_time(opening_test: Callable[..., Any]) -> Callable[..., Any
 
         if not isinstance(asyncio.get_running_loop(), VirtualClockLoop):
             raise _NotVirtualTime
-        await opening_test(**arguments)
+        await test_with_open_flights(**arguments)
 
     # pytest-asyncio copies the attribute to its wrapper, where `_runnable_function` reads it.
-    setattr(run, _OPENING_TEST, opening_test)
+    setattr(run, _TEST_WITH_OPEN_FLIGHTS, test_with_open_flights)
     return run
 
 

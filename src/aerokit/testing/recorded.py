@@ -119,10 +119,10 @@ class RecordedMissions(MissionServer):
         self.listen()
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the items of the plan that the vehicle has at present.
+        """Return the items of the plan that the vehicle has at present; None if it has no plan of this type.
 
-        This is the first recorded plan even before its time. Return None if the recording contains no plan of this
-        type.
+        This is the uploaded plan or else the latest recorded plan. Before the time of the first recorded plan, it is
+        the first one.
         """
         if mission_type in self._written:
             return self._written[mission_type]
@@ -149,7 +149,7 @@ class RecordedMissions(MissionServer):
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         recorded = (self.items(request.mission_type) or ())[request.seq]
         wants_float = isinstance(request, m.MissionRequest)
-        return _item_message(recorded, request.seq, sender_of(request), as_float=wants_float)
+        return _item_message(recorded, request.seq, sender_of(request), wants_float=wants_float)
 
     def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
         self._received[message.seq :] = [message]
@@ -184,15 +184,15 @@ class RecordedMissions(MissionServer):
         return results[min(number, len(results) - 1)]
 
 
-def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, as_float: bool) -> AnyItem:
+def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, wants_float: bool) -> AnyItem:
     """Convert a recorded item to the message that the client requests: MISSION_ITEM or MISSION_ITEM_INT."""
     scale = 1.0 if item.frame == MavFrame.MISSION else 1e7  # In MAV_FRAME_MISSION, x and y are not in degrees.
-    is_float = isinstance(item, m.MissionItem)
-    if as_float:
-        place = (item.x, item.y) if is_float else (item.x / scale, item.y / scale)
-        return item_message_float(item_from(item), place, seq, client, item.mission_type, item.current)
-    converted = item_from(item)
-    if is_float:
+    was_float = isinstance(item, m.MissionItem)
+    converted = item_from(item)  # with x and y as recorded
+    if wants_float:
+        place = (item.x, item.y) if was_float else (item.x / scale, item.y / scale)
+        return item_message_float(converted, place, seq, client, item.mission_type, item.current)
+    if was_float:
         converted = converted.replace(x=round(item.x * scale), y=round(item.y * scale))
     return item_message_int(converted, seq, client, item.mission_type, current=bool(item.current))
 
@@ -242,7 +242,8 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        self._answered_counts: dict[int, int] = {}  # number of answers sent, by `id` of the first candidate
+        # Number of answers sent from each list of recorded answers, by `id()` of the first answer in the list.
+        self._answered_counts: dict[int, int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""
         self.missions: RecordedMissions = RecordedMissions(self)

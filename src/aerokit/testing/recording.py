@@ -57,7 +57,9 @@ class RecordedPlan:
 
 
 class RecordedFlight:
-    """Content of a recording that concerns one vehicle. Times are seconds since its first message, without long gaps.
+    """Content of a recording about one vehicle.
+
+    Times are in seconds since the first message of the vehicle. Long gaps in the recording are shortened.
 
     If ``system_id`` is None, the vehicle is the first autopilot with a HEARTBEAT. Raises InvalidArgument if the
     recording contains no such vehicle, and OSError if the file cannot be read.

@@ -156,14 +156,14 @@ class Track(Sequence[TrackPoint]):
         __tracebackhide__ = True
         highest = self._highest()
         reached = highest.altitude_m >= altitude_m - within_m
-        self._record_failure(reached, TrackFailure(highest, altitude_m=altitude_m))
+        self._record_failure_unless(reached, TrackFailure(highest, altitude_m=altitude_m))
         assert reached, f"the vehicle did not reach {altitude_m:g} m: the highest point was {highest}"
 
     def assert_stayed_below(self, altitude_m: float) -> None:
         """Assert that the vehicle was never more than ``altitude_m`` metres above home."""
         __tracebackhide__ = True
         highest = self._highest()
-        self._record_failure(highest.altitude_m <= altitude_m, TrackFailure(highest, altitude_m=altitude_m))
+        self._record_failure_unless(highest.altitude_m <= altitude_m, TrackFailure(highest, altitude_m=altitude_m))
         assert highest.altitude_m <= altitude_m, f"the vehicle rose above {altitude_m:g} m: {highest}"
 
     def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
@@ -173,7 +173,7 @@ class Track(Sequence[TrackPoint]):
         """
         __tracebackhide__ = True
         distance, point = self._nearest(place)
-        self._record_failure(distance <= within_m, TrackFailure(point, circle=(place, within_m)))
+        self._record_failure_unless(distance <= within_m, TrackFailure(point, circle=(place, within_m)))
         assert distance <= within_m, (
             f"the vehicle did not pass within {within_m:g} m of {_text(place)}: the minimum distance was"
             f" {distance:.1f} m, {point}"
@@ -185,7 +185,7 @@ class Track(Sequence[TrackPoint]):
         centre = self.home if of is None else of
         distance, point = self._farthest(centre)
         name = "home" if of is None else _text(of)
-        self._record_failure(distance <= radius_m, TrackFailure(point, circle=(centre, radius_m)))
+        self._record_failure_unless(distance <= radius_m, TrackFailure(point, circle=(centre, radius_m)))
         assert distance <= radius_m, f"the vehicle left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
 
     def assert_stayed_inside(self, polygon: Sequence[Position]) -> None:
@@ -196,7 +196,8 @@ class Track(Sequence[TrackPoint]):
         offset_of = metres_from(self.home)
         zone = PolygonZone([offset_of(corner) for corner in polygon])
         outside = [point for point in self if zone.outside_m(offset_of(point)) > 0]
-        self._record_failure(not outside, TrackFailure(outside[0] if outside else self.end, polygon=polygon))
+        if outside:
+            self.failure = TrackFailure(outside[0], polygon=polygon)
         assert not outside, (
             f"the vehicle left the polygon: {len(outside)} of {len(self)} points are outside, the first {outside[0]}"
         )
@@ -205,7 +206,7 @@ class Track(Sequence[TrackPoint]):
         """Assert that the ground speed was never above ``speed_m_s``."""
         __tracebackhide__ = True
         fastest = self._fastest()
-        self._record_failure(fastest.speed_m_s <= speed_m_s, TrackFailure(fastest))
+        self._record_failure_unless(fastest.speed_m_s <= speed_m_s, TrackFailure(fastest))
         assert fastest.speed_m_s <= speed_m_s, (
             f"the vehicle was faster than {speed_m_s:g} m/s: {fastest.speed_m_s:.1f} m/s {fastest}"
         )
@@ -215,13 +216,13 @@ class Track(Sequence[TrackPoint]):
         __tracebackhide__ = True
         end = self.end
         target = self.home if place is None else place
-        self._record_failure(self.max_altitude_m > _ON_GROUND_M, TrackFailure(end))
+        self._record_failure_unless(self.max_altitude_m > _ON_GROUND_M, TrackFailure(end))
         assert self.max_altitude_m > _ON_GROUND_M, f"the vehicle never took off: the track ends {end}"
-        self._record_failure(abs(end.altitude_m) <= _ON_GROUND_M, TrackFailure(end, circle=(target, within_m)))
+        self._record_failure_unless(abs(end.altitude_m) <= _ON_GROUND_M, TrackFailure(end, circle=(target, within_m)))
         assert abs(end.altitude_m) <= _ON_GROUND_M, f"the vehicle is not on the ground: the track ends {end}"
         distance = target.distance_to(end.position)
         name = "home" if place is None else _text(place)
-        self._record_failure(distance <= within_m, TrackFailure(end, circle=(target, within_m)))
+        self._record_failure_unless(distance <= within_m, TrackFailure(end, circle=(target, within_m)))
         assert distance <= within_m, (
             f"the vehicle landed {distance:.1f} m from {name}, not within {within_m:g} m: {end}"
         )
@@ -229,13 +230,13 @@ class Track(Sequence[TrackPoint]):
     def assert_armed_at_end(self) -> None:
         """Assert that the vehicle is armed at the end."""
         __tracebackhide__ = True
-        self._record_failure(self.end.armed, TrackFailure(self.end))
+        self._record_failure_unless(self.end.armed, TrackFailure(self.end))
         assert self.end.armed, f"the vehicle is disarmed at the end, {self.end}"
 
     def assert_disarmed_at_end(self) -> None:
         """Assert that the vehicle is disarmed at the end."""
         __tracebackhide__ = True
-        self._record_failure(not self.end.armed, TrackFailure(self.end))
+        self._record_failure_unless(not self.end.armed, TrackFailure(self.end))
         assert not self.end.armed, f"the vehicle is armed at the end, {self.end}"
 
     def assert_modes(self, *names: str) -> None:
@@ -245,8 +246,8 @@ class Track(Sequence[TrackPoint]):
         for name in names:
             assert name in modes, f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
 
-    def _record_failure(self, passes: bool, failure: TrackFailure) -> None:
-        """Store the details of an assertion in `failure`, if the assertion does not pass."""
+    def _record_failure_unless(self, passes: bool, failure: TrackFailure) -> None:
+        """Store the details of an assertion in `failure`, unless the assertion passes."""
         if not passes:
             self.failure = failure
 
@@ -339,6 +340,7 @@ def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
     """
     first_home_m = first.home.altitude_amsl_m or 0.0
     second_home_m = second.home.altitude_amsl_m or 0.0
+    # `local` returns north and east of the given origin, but heights above the track's own home.
     second_path = [
         (point.time_s, (north, east, up + second_home_m))
         for point, (north, east, up) in zip(second, second.local(first.home), strict=True)

@@ -79,11 +79,12 @@ class Vehicle(
         super().__init__(context)
         self._plans = PlanContext(context, lambda: self.files)
         create_on_first = partial(self.connection.bus.create_on_first, system_id=self.system_id)
-        context.session.at_close(
+        unsubscribe_functions = (
             create_on_first(GIMBAL_MESSAGE_IDS, lambda: self.gimbal),
             create_on_first([ParamValue.ID], lambda: self.parameters),
             create_on_first(PICTURE_MESSAGE_IDS, lambda: self._cameras),
         )
+        context.session.at_close(*unsubscribe_functions)
 
     # A sub-object is imported and created on first use, or when the vehicle first sends a message that the sub-object
     # handles.
@@ -133,8 +134,8 @@ class Vehicle(
         """Return the camera with this number. It need not have been found yet.
 
         Args:
-            number: component id of the camera (100 to 105, at most 255), or 1 to 6 for a camera attached to the
-                autopilot.
+            number: component id of the camera (usually 100 to 105, but any id from 7 to 255 is allowed), or 1 to 6 for
+                a camera attached to the autopilot.
 
         Raises:
             InvalidArgument: no camera can have this number.

@@ -8,6 +8,7 @@ import os
 import signal
 from typing import Any
 
+import anyio
 import pytest
 from cli_harness import run_on
 
@@ -15,6 +16,7 @@ from aerokit.apps.cli import calibrate
 from aerokit.apps.cli.calibrate import bar, lines_of
 from aerokit.sim import SimulatedCopter, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.testing import run_virtual
+from aerokit.vehicle.calibration.calibration import Calibration
 from aerokit.vehicle.calibration.values import CalibrationPose as Pose
 from aerokit.vehicle.calibration.values import CalibrationStep
 
@@ -79,6 +81,15 @@ def test_interrupt_cancels_on_vehicle(kind: type[Any], capsys: pytest.CaptureFix
     assert capsys.readouterr().out.splitlines()[-1] == "compass: cancelled on the vehicle"
     is_running = vehicle.calibration.is_running if kind is SimulatedPx4 else vehicle.calibrations.compasses.is_running
     assert not is_running
+
+
+def test_unanswered_cancellation_says_how_long_it_waited(
+    entered: list[bool], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entered += [False]
+    monkeypatch.setattr(Calibration, "cancel", lambda calibration: anyio.sleep_forever())
+    assert run(SimulatedCopter(boot_time_s=0.0), "accelerometer") == 130
+    assert "not cancelled on the vehicle: it did not confirm within 20 s\n" in capsys.readouterr().out
 
 
 def test_json_has_steps_and_result(entered: list[bool], capsys: pytest.CaptureFixture[str]) -> None:

@@ -184,7 +184,7 @@ def test_sim_fault_is_parsed_with_value_and_time(text: str, parsed: object) -> N
     ("text", "message"),
     [
         ("motor_faild", r"not a fault \(did you mean 'motor_failed'\?\); faults: gps_lost, rc_lost, .*prearm_failures"),
-        ("motor_failed=1", "motor_failed takes no value"),
+        ("motor_failed=1", "motor_failed takes no value; motor_failed@5 begins after 5 simulated seconds"),
         ("loss", "loss needs the share of frames to lose: loss=0.2"),
         ("prearm_failures", "needs a reason"),
         ("gps_lost@soon", "'soon' is not a number"),

@@ -124,7 +124,7 @@ def fault(text: str) -> tuple[str, bool | float | list[str], float]:
             raise ArgumentTypeError("prearm_failures needs a reason: 'prearm_failures=Compass not healthy'")
         return name, [value], at_s
     if equals:
-        raise ArgumentTypeError(f"{name} takes no value: {name}@{at_s:g} begins after {at_s:g} simulated seconds")
+        raise ArgumentTypeError(f"{name} takes no value; {name}@5 begins after 5 simulated seconds")
     return name, True, at_s
 
 

@@ -134,8 +134,10 @@ async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:
     try:
         with anyio.fail_after(_CANCEL_TIMEOUT_S):
             await calibration.cancel()
-    except (NotSupported, OperationTimeout, TimeoutError) as error:
+    except (NotSupported, OperationTimeout) as error:
         text = f"not cancelled on the vehicle: {error}"
+    except TimeoutError:  # This error has no text.
+        text = f"not cancelled on the vehicle: it did not confirm within {_CANCEL_TIMEOUT_S:g} s"
     emit(options, "calibration_cancelled", {"sensor": options.sensor, "text": text}, f"{options.sensor}: {text}")
     return INTERRUPTED
 

@@ -153,7 +153,8 @@ class _SquareFlight(SupervisedFlight):
         """Wait until the vehicle is ready, then arm it and take off."""
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready")
-        if vehicle.autopilot.take_off(altitude_m, 0.0, is_vtol=vehicle.is_vtol) is None:
+        take_off_plan = vehicle.autopilot.take_off(altitude_m, 0.0, is_vtol=vehicle.is_vtol)  # sends nothing
+        if take_off_plan is None:
             raise NotSupported(f"demo: {vehicle.autopilot.firmware} cannot take off")
         await record_parameters(vehicle, self._print)
         await vehicle.wait_ready(timeout=_READY_TIMEOUT_S)

@@ -194,7 +194,11 @@ class LinkExamination:
         yield Finding("problem", "vehicle", text, advice)
 
     def _ids(self) -> Iterator[Finding]:
-        """Yield problems with system and component ids: ids with several senders, ids of programs, and system id 0."""
+        """Yield findings about system and component ids.
+
+        These are ids with several senders, systems with several autopilots, another sender with the default ids of
+        aerokit programs, and system id 0.
+        """
         ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
         for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
             yield Finding(

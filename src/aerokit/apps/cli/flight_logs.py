@@ -110,8 +110,9 @@ async def _report(options: argparse.Namespace) -> int:
     from aerokit.logs.report import write_report
 
     target = options.output or options.log.with_suffix(".html")
+    # Names are checked first: if a log's name is wrong, an error about the derived name of the report would mislead.
     for log in logs:
-        check_log_name(log)  # before the target, whose default is derived from the log's name
+        check_log_name(log)
     check_not_existing(target, options)
     with progress_bar(options.log.name, "B") as on_progress:
         report = write_report(

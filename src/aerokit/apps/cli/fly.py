@@ -173,6 +173,7 @@ class PlanFlight(SupervisedFlight):
         vehicle = self._vehicle
         is_unexplained = vehicle.mode_name == mode and not self._is_in_our_mode and not vehicle.mission.explains_mode
         if self._has_started and is_unexplained:
+            # The grace period is real time, but the text has the vehicle's time, which a simulation speeds up.
             seconds = self._report.speedup * (END_GRACE_S - delay_s)
             self._print(f"waiting {seconds:.2g} s for the end of {mode} or a report that the mission has ended")
 
@@ -294,11 +295,12 @@ async def _connect_and_fly(
             try:
                 code = await flight.fly()
                 # The recording of a real vehicle continues until the end of the flight. If a simulated mission ended in
-                # the air, no pilot would land the vehicle, and the recording would not end.
+                # the air, nothing would land the vehicle, and the recording would not end.
                 continues_recording = code == DONE and not options.sim
             except AerokitError as flight_error:  # raised again below, after the summary
                 error = flight_error
                 code = FAILED
+                # A failsafe may still land the vehicle, even a simulated one. The recording should contain the landing.
                 continues_recording = True
             if continues_recording and flight.armed_by_us and options.record is not None:
                 await record_to_end(vehicle, interrupts, report.print_line, report.speedup)

@@ -53,6 +53,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
         **handlers,
         Cmd.DO_GRIPPER: lambda command: vehicle.devices.grip(command),
         Cmd.DO_SET_SERVO: lambda command: vehicle.accessories.set_servo(command),
+        # Only the first pulse is simulated, which sets the servo as DO_SET_SERVO does.
         Cmd.DO_REPEAT_SERVO: lambda command: vehicle.accessories.set_servo(command),
         Cmd.DO_SET_RELAY: lambda command: vehicle.accessories.set_relay(command),
         Cmd.DO_REPEAT_RELAY: lambda command: vehicle.accessories.repeat_relay(command),

@@ -223,7 +223,7 @@ class SimulatedCopter(CopterHost):
             return _BASE | _GUIDED
         flags = _BASE
         mode_name = self.mode.name
-        # GUIDED_ENABLED is set in modes that use a position, but in RTL only while armed.
+        # GUIDED_ENABLED is set in modes that use a position, but in RTL only while armed. A motor test does not count.
         if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
             flags |= _GUIDED
         if self.is_armed:

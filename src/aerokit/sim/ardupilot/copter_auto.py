@@ -159,7 +159,7 @@ _HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
 # An upload restarts the current command if it changes one of this many commands, beginning with the current one.
 _CHECKED_COMMANDS = 3
 # The copter passes a waypoint without a stop if one of these commands follows and the waypoint has no delay.
-_PASSED_BEFORE = frozenset(
+_NO_STOP_IF_FOLLOWED_BY = frozenset(
     {Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_PAYLOAD_PLACE}
 )
 _WAYPOINTS = frozenset({Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT, Cmd.NAV_LOITER_TIME})
@@ -392,12 +392,15 @@ class CopterAuto(MissionMode):
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
-        """Start a leg to a waypoint. The copter stops there if it has to wait or if no further waypoint follows."""
+        """Start a leg to the place of an item, and stop there.
+
+        The copter does not stop at a waypoint without a delay if one of `_NO_STOP_IF_FOLLOWED_BY` follows.
+        """
         run = self.vehicle.mission
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
             following = next(run.navigation_from(run.nav_index + 1), None)
-            stops = following is None or following.item.command not in _PASSED_BEFORE
+            stops = following is None or following.item.command not in _NO_STOP_IF_FOLLOWED_BY
         self._go(self._place(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:

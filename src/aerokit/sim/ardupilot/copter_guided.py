@@ -113,7 +113,10 @@ class CopterGuided(CopterModeBase):
         self._updated_at = self.vehicle.now
 
     def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
-        """Change roll and pitch at rates in radians per second, starting at the present attitude, and climb (m/s)."""
+        """Change roll and pitch at rates in radians per second, and climb (m/s).
+
+        The first call starts at the present attitude. Later calls continue from the commanded attitude.
+        """
         if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
             self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
         self.submode = GuidedSubmode.ATTITUDE
@@ -256,7 +259,11 @@ class CopterSetpoints:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
-        """Follow a set-point. Return False if it is invalid. With ``rotate``, its vectors are in the body frame."""
+        """Follow a set-point. Return False if it is invalid.
+
+        ``point`` is its position in the world frame. With ``rotate``, its velocity, acceleration and yaw are in the
+        body frame.
+        """
         setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None
         acceleration = setpoint.acceleration if setpoint.has_acceleration else None

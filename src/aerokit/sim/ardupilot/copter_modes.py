@@ -26,7 +26,7 @@ class AutoYaw:
         self._roi: tuple[float, float] | None = None  # (north, east) of the region of interest
         self._heading = 0.0
         self._rate = 0.0
-        """Turn rate that `turn` has set, or `turn_to` for a turn by the longer way; otherwise 0."""
+        """Turn rate (radians per second): set by `turn`, and by `turn_to` for a turn by the longer way; otherwise 0."""
 
     def hold(self) -> None:
         self._control = self._hold
@@ -44,9 +44,10 @@ class AutoYaw:
             self.hold()
 
     def turn_to(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
-        """Turn to a heading in radians, at ``rate`` radians per second (0: the default rate).
+        """Turn to a heading in radians. ``direction`` is 1 for clockwise, -1 for anticlockwise, 0 for the shorter way.
 
-        ``direction`` is 1 for clockwise, -1 for anticlockwise, and 0 for the shorter way.
+        ``rate`` (radians per second; 0: the default rate) applies only to a turn by the longer way. A turn by the
+        shorter way has the default rate.
         """
         motion = self._copter.motion
         self._heading = wrap_pi(heading)

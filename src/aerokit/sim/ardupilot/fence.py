@@ -79,20 +79,20 @@ class PolygonZone:
 
     def outside_m(self, place: Point) -> float:
         """Return the distance from the border in metres; negative inside."""
-        distance = min(_distance_to_side(place, start, end) for start, end in self._sides)
+        distance = min(_distance_to_edge(place, start, end) for start, end in self._sides)
         crossings = sum(_crosses(place, start, end) for start, end in self._sides)
         is_inside = crossings % 2 == 1  # A ray from a point inside crosses the border an odd number of times.
         return -distance if is_inside else distance
 
 
-def _distance_to_side(place: Point, start: Point, end: Point) -> float:
-    """Return the distance from a place to the side between two corners."""
+def _distance_to_edge(place: Point, start: Point, end: Point) -> float:
+    """Return the distance from a place to the polygon's edge between two corners."""
     place_north, place_east = place
     start_north, start_east = start
     end_north, end_east = end
     north, east = end_north - start_north, end_east - start_east
     squared_length = north * north + east * east
-    share = 0.0  # Point of the side that is nearest to the place: 0 is the start, 1 the end.
+    share = 0.0  # Point of the edge that is nearest to the place: 0 is the start, 1 the end.
     if squared_length > 0.0:
         projection = ((place_north - start_north) * north + (place_east - start_east) * east) / squared_length
         share = min(1.0, max(0.0, projection))
@@ -100,12 +100,12 @@ def _distance_to_side(place: Point, start: Point, end: Point) -> float:
 
 
 def _crosses(place: Point, start: Point, end: Point) -> bool:
-    """Return True if a ray from ``place`` to the north crosses the side."""
+    """Return True if a ray from ``place`` to the north crosses the edge from ``start`` to ``end``."""
     place_north, place_east = place
     start_north, start_east = start
     end_north, end_east = end
-    are_ends_on_same_side = (start_east > place_east) == (end_east > place_east)
-    if are_ends_on_same_side:
+    is_start_to_the_east, is_end_to_the_east = start_east > place_east, end_east > place_east
+    if is_start_to_the_east == is_end_to_the_east:
         return False
     share = (place_east - start_east) / (end_east - start_east)
     return place_north < start_north + share * (end_north - start_north)
@@ -133,7 +133,8 @@ class ArduPilotFence(Generic[HostT]):
     """Checks the height, the distance from home and the uploaded zones. `update` is called ten times a second.
 
     FENCE_STATUS reports a breach. In `act`, a subclass adds the reaction of its firmware. This class itself is the
-    fence of ArduSub, which only reports breaches while armed. Braking before the fence (AVOID_ENABLE) is not simulated.
+    fence of ArduSub, which is checked only while armed, and reports breaches without a reaction. Braking before the
+    fence (AVOID_ENABLE) is not simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
@@ -245,7 +246,8 @@ class ArduPilotFence(Generic[HostT]):
         """Check the position and react to a new breach."""
         vehicle = self.vehicle
         self._follow_parameters()
-        # Continue if only a disabled lower limit (`_MIN_ALT`) is configured, because `_check` may enable it in flight.
+        # If no kind is enabled, there is nothing to check, unless the lower limit (`_MIN_ALT`) is configured: `_check`
+        # may enable it in flight.
         if not self.enabled and not self.configured & _MIN_ALT:
             return
         is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors

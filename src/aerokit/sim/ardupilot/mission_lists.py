@@ -102,7 +102,7 @@ class CommandList(ItemList):
         self.version += 1
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Replace or append an item. Item 0 is checked, but not stored, because it is home."""
+        """Replace or append an item. Item 0 of a list that is not empty is checked, but not stored: it is home."""
         stored_item = as_stored(item, self._kind)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
@@ -116,12 +116,13 @@ class CommandList(ItemList):
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         """Store an item at index ``seq``, or append it. Return a MAV_MISSION_RESULT."""
         count = len(self._commands)
-        # A list with space only for home refuses every item, even item 0, which is never stored.
+        # A list with space only for home refuses every item, even item 0, although it would need no space.
         has_space = self.capacity > 1 and seq < self.capacity
         if seq > count or not has_space:
             return MavMissionResult.ERROR
         if seq == count:
-            self.add_home()  # The first uploaded item follows the placeholder for home.
+            # Home comes first, so in an empty list, even item 0 is stored as item 1 (AP_Mission.cpp, add_cmd).
+            self.add_home()
             self._commands.append(stored_item)
         elif seq != _HOME_SEQ:
             self._commands[seq] = stored_item

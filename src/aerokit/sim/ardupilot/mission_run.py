@@ -249,7 +249,10 @@ class MissionRun:
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Let a stopped mission resume at the next navigation command from ``index`` on. Return False without one."""
+        """Let a stopped mission resume at the next navigation command from ``index`` on. Return False without one.
+
+        If "do" commands precede the navigation command, the mission resumes at the first of them.
+        """
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:
@@ -259,7 +262,6 @@ class MissionRun:
                 self._running_nav = command.item
                 self._state = MissionState.NOT_STARTED
                 return True
-            # Remember the first of the "do" commands that precede the navigation command: the mission resumes at it.
             if self._running_do is None:
                 self._running_do = command
                 self._last_do_index = command.seq

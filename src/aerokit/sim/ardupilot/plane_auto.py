@@ -302,10 +302,10 @@ class PlaneGuided(PlaneNavigatingMode):
         """Follow the latest attitude or course that was commanded. Without one, circle the target."""
         wing, now = self.vehicle.wing, self.vehicle.now
         has_bank, has_pitch, has_throttle = (
-            now - target.received_at < _ATTITUDE_TIMEOUT_S for target in (self._bank, self._pitch, self._throttle)
+            now - value.received_at < _ATTITUDE_TIMEOUT_S for value in (self._bank, self._pitch, self._throttle)
         )
-        has_target = has_bank or has_pitch or has_throttle or self._course is not None
-        if self.vehicle.is_landed or not has_target:
+        has_command = has_bank or has_pitch or has_throttle or self._course is not None
+        if self.vehicle.is_landed or not has_command:
             super().update(dt)  # circles the target
             return
         limits = wing.wing_limits

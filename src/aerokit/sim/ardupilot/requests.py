@@ -39,7 +39,7 @@ _SUPPORTED_MESSAGES: dict[Kind, frozenset[int]] = {
 # A stream may have at most 80 % of the rate of the main loop, which is 400 Hz (GCS_Common.cpp, cap_message_interval).
 _MIN_INTERVAL_S, _MAX_INTERVAL_S = 0.0025 / 0.8, 60.0
 _MODES_MONITOR_INTERVAL_S = 5.0
-_MESSAGE_INTERVAL_IDS = 1 << 16  # Number of message ids that fit into the 16 bits of MESSAGE_INTERVAL.message_id.
+_MAX_INTERVAL_ID = 0xFFFF  # MESSAGE_INTERVAL.message_id has 16 bits.
 _MIN_TERRAIN_REQUEST_INTERVAL_S = 2.0
 
 DISPLAY_VALUES: dict[str, float] = {
@@ -101,7 +101,7 @@ class ArduPilotMessageRequests:
         interval_us = round(channel.streams.interval(message_id) * 1e6)
         if interval_us == 0:
             interval_us = -1  # The message is not streamed.
-        if message_id < _MESSAGE_INTERVAL_IDS:
+        if message_id <= _MAX_INTERVAL_ID:
             self._vehicle.send(m.MessageInterval(message_id, interval_us if is_supported else 0), channel)
         return MavResult.ACCEPTED if is_supported else MavResult.FAILED
 

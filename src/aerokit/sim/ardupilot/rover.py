@@ -54,7 +54,10 @@ class RoverArming(ArduPilotArming[RoverHost]):
         self.vehicle.path.reset()
 
     def disarm(self, *, force: bool = True) -> bool:
-        """Disarm, even while driving. The current place becomes home unless a command has set home."""
+        """Disarm, even while driving; ``force`` has no effect.
+
+        The current place becomes home unless a command has set home.
+        """
         rover, was_armed = self.vehicle, self.vehicle.is_armed
         if not super().disarm(force=True):
             return False

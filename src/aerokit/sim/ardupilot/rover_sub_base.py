@@ -97,7 +97,7 @@ class GuidedSetpoints:
     def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
         """Convert a set-point to a target of GUIDED. ``point`` is its position in the world frame.
 
-        Set-points with an acceleration, with a number that is not finite, or with too few parts are ignored.
+        A set-point with an acceleration, with a number that is not finite, or that `is_complete` rejects is ignored.
         """
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
@@ -115,7 +115,7 @@ class GuidedSetpoints:
         if yaw is not None and frame in self.RELATIVE_YAW_FRAMES:
             yaw += self.vehicle.motion.yaw
         # Only a target with a yaw or a yaw rate can move the vehicle backwards. Without them, the vehicle turns to the
-        # direction of travel.
+        # direction of travel. Like the firmware, use the sign of vx in every frame, even where vx is north.
         backwards = message.vx < 0 and (yaw is not None or yaw_rate is not None)
         if velocity is not None and frame in self.BODY_FRAMES:
             velocity = rotated(velocity, self.vehicle.motion.yaw)

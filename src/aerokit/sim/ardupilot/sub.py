@@ -185,12 +185,12 @@ class _HullLimit:
         self._reported_at = 0.0
 
     def update(self, sub: SubHost, value: float) -> None:
-        """Compare a measured value with its maximum. Values above the maximum must last for `_HULL_TIMEOUT_S`."""
+        """Compare a measured value with its maximum, which must be exceeded for `_HULL_TIMEOUT_S`; warn repeatedly."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:
             self._good_at = sub.now
-            self._reported_at = sub.now
+            self._reported_at = sub.now  # The first warning, too, comes only after an interval.
             self.is_exceeded = False
             return
         if sub.now - self._good_at > _HULL_TIMEOUT_S:

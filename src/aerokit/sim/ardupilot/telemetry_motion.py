@@ -312,9 +312,11 @@ def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
     place = vehicle.navigation.position
     if place is None:
         return None
-    south, west = (round(1e7 * degrees) for degrees in _GRID_CORNER)
+    south_offset_e7, west_offset_e7 = (round(1e7 * degrees) for degrees in _GRID_CORNER)
     all_grids = (1 << _GRIDS_PER_BLOCK) - 1
-    return m.TerrainRequest(place.latitude_e7 - south, place.longitude_e7 - west, _GRID_M, all_grids)
+    return m.TerrainRequest(
+        place.latitude_e7 - south_offset_e7, place.longitude_e7 - west_offset_e7, _GRID_M, all_grids
+    )
 
 
 def _rangefinder(vehicle: ArduPilotVehicle) -> m.Rangefinder | None:

@@ -36,11 +36,12 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
     MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE. The gimbal denies commands of other components and ignores their messages.
 
     - ``component_id``: MAVLink reserves 154 and 171 to 175 for gimbals; ``system_id``: None uses that of the vehicle
-    - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: minimum and maximum angle; roll and pitch relative to the horizon
+    - ``roll_deg``, ``pitch_deg``, ``yaw_deg``: minimum and maximum angle. Roll and pitch are relative to the horizon at
+      any attitude of the vehicle
     - ``slew_deg_s``: turn rate
     - ``attitude_rate_hz``: rate of GIMBAL_DEVICE_ATTITUDE_STATUS
 
-    Not simulated: compensation of the vehicle's attitude, motor failures, a second manager.
+    Not simulated: motor failures, a second manager.
     """
 
     TYPE: ClassVar[int] = MavType.GIMBAL

@@ -63,7 +63,9 @@ class Px4Calibration:
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
         if self.is_running:
-            if sensor:  # calibration_routines.cpp, calibrate_cancel_check
+            # A request without a sensor cancels the calibration. Others are refused (calibration_routines.cpp,
+            # calibrate_cancel_check).
+            if sensor:
                 self._px4.send_text(MavSeverity.CRITICAL, f"command denied during calibration: {command.command}")
                 return MavResult.TEMPORARILY_REJECTED
             self._cancel()
@@ -80,6 +82,7 @@ class Px4Calibration:
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration failed: Disconnect battery and try again")
             return MavResult.DENIED
         elif sensor == "airspeed":
+            # Without wind, the calibration runs until it is cancelled. PX4 itself gives up after 90 s.
             self._start(sensor)
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] Ensure sensor is not measuring wind")
         return MavResult.ACCEPTED

@@ -18,7 +18,7 @@ from aerokit.sim.autopilot import SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer
 from aerokit.sim.logs import SimulatedLog
-from aerokit.sim.motion import GRAVITY_M_S2, HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, SimulatedWind
+from aerokit.sim.motion import GRAVITY_M_S2, HOME, GlobalPoint, LocalFrame, Motion, MotionLimits, Ned, SimulatedWind
 from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4 import modes
 from aerokit.sim.px4.arming import Px4Arming, Px4Calibration
@@ -101,7 +101,7 @@ class Px4Vehicle(Px4Host):
         self.events = Px4Events(self)
         self._next_text_id = 0
         self._pings = 0  # number of PINGs sent
-        self.home: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self.home: Ned = (0.0, 0.0, 0.0)  # In the local frame, whose origin is the argument `home`.
         self.missions: Px4MissionServer = Px4MissionServer(self)
         """Mission, fence and rally points, which survive a reboot."""
         self.camera_trigger: Px4CameraTrigger = Px4CameraTrigger(self)

@@ -105,8 +105,11 @@ def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 _FORCE_MAGIC = 21196.0
 _REBOOT_DELAY_S = 0.2
 _ALIASES: dict[Px4Mode, Px4Mode] = {(modes.AUTO, 0): modes.MISSION, modes.ORBIT: modes.POSITION}
-# PX4 refuses a COMMAND_INT whose x and y have the value `_NAN_AS_INT`, the upper 32 bits of a double NaN.
+# In the x and y of COMMAND_INT, INT32_MAX means "unspecified". PX4 refuses the upper 32 bits of a double NaN there.
 _INT32_MAX, _NAN_AS_INT = 0x7FFFFFFF, 0x7FF80000
+# In the floats of COMMAND_LONG, INT32_MAX is rounded to 2^31. PX4 refuses 2^31 and the floats next to it
+# (mavlink_receiver.cpp, handle_message_command_long).
+_BEFORE_INT32_MAX, _AFTER_INT32_MAX = 2.0**31 - 128, 2.0**31 + 256
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
@@ -143,8 +146,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
 def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | None:
     """Return the MAV_RESULT with which an invalid position or frame is refused; None for a valid command."""
     if command.is_long:
-        # INT32_MAX marks an invalid coordinate. In the floats of COMMAND_LONG, it arrives rounded to a multiple of 128.
-        is_int32_max = all(_INT32_MAX - 128 < value <= _INT32_MAX + 256 for value in (command.x, command.y))
+        is_int32_max = all(_BEFORE_INT32_MAX <= value <= _AFTER_INT32_MAX for value in (command.x, command.y))
         return MavResult.DENIED if is_int32_max else None
     if command.x == command.y == _NAN_AS_INT:
         return MavResult.DENIED
@@ -259,9 +261,9 @@ class _Flight:
             return result
         if self._px4.failsafes.fence.allows(self._destination(command)):
             self._go_to(command)
-        else:
+        else:  # PX4 checks the fence only after the acknowledgement, and stays in HOLD (navigator_main.cpp).
             self._px4.send_text(MavSeverity.CRITICAL, "Reposition is outside geofence")
-        return result
+        return MavResult.ACCEPTED
 
     def _destination(self, command: ReceivedCommand) -> tuple[float, float, float]:
         """Return the position in a command. Values that are NaN or INT32_MAX mean the vehicle's present position."""
@@ -282,16 +284,20 @@ class _Flight:
             px4.flight.speed_m_s = command.param1
 
     def orbit(self, command: ReceivedCommand) -> int:
-        """Circle a position. Params that are NaN keep the previous radius and speed."""
+        """Circle a position. Params that are NaN keep the previous radius and speed.
+
+        A plane has no ORBIT, but circles its target in HOLD. It ignores the speed, and NaN selects its default radius.
+        """
         px4, orbit = self._px4, self._px4.flight.orbit
         north, east, down = self._destination(command)
-        radius = command.param1 if math.isfinite(command.param1) else orbit.radius_m
-        speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
-        if px4.VEHICLE_TYPE == MavType.FIXED_WING:  # A plane has no ORBIT, but circles its target in HOLD.
+        has_radius = math.isfinite(command.param1)
+        if px4.VEHICLE_TYPE == MavType.FIXED_WING:
             result = self._change(modes.HOLD)  # sets the target to the current position; the next line replaces it
             px4.flight.target = (north, east, down)
-            px4.flight.radius_m = radius
+            px4.flight.radius_m = command.param1 if has_radius else px4.parameters["NAV_LOITER_RAD"]
             return result
+        radius = command.param1 if has_radius else orbit.radius_m
+        speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
         if not orbit.plan(radius, speed, (north, east), down):
             px4.send_text(MavSeverity.CRITICAL, "Orbit radius limit exceeded")
             return MavResult.ACCEPTED  # PX4 checks the radius only after the acknowledgement (FlightTaskOrbit.cpp).

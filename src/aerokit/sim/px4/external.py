@@ -98,18 +98,24 @@ class PrecisionLanding:
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
-        self._search_began_at: float | None = None  # None while the target is visible
-        self._search_count = 0
+        self.enter()
 
     def enter(self) -> None:
-        self._search_began_at = None
+        self._search_began_at: float | None = None  # None while the target is visible
         self._search_count = 0
+        self._has_given_up = False
 
     def update(self) -> None:
-        """Approach the target, and descend while the vehicle is above it. Search for it if it is lost."""
+        """Approach the target, and descend while the vehicle is above it. Search for it if it is lost.
+
+        After too many or too long searches, land without the target, even if it becomes visible again.
+        """
         px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
-        if target is None or self._search_count > parameters["PLD_MAX_SRCH"]:
+        if self._has_given_up:
+            px4.flight.descend()
+            return
+        if target is None:
             self._search()
             return
         self._search_began_at = None
@@ -121,13 +127,14 @@ class PrecisionLanding:
         motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
 
     def _search(self) -> None:
-        """Climb and wait for the target. After too many or too long searches, land without it."""
+        """Climb and wait for the target, or give up and begin to land."""
         px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         if self._search_began_at is None:
             self._search_began_at = px4.now
             self._search_count += 1
         has_timed_out = px4.now - self._search_began_at > parameters["PLD_SRCH_TOUT"]
         if has_timed_out or self._search_count > parameters["PLD_MAX_SRCH"]:
+            self._has_given_up = True
             px4.flight.descend()
             return
         _, _, home_down = px4.home

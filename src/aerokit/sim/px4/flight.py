@@ -155,7 +155,8 @@ class Px4Flight:
             or (mode == modes.MISSION and vehicle.mission.wants_up)
         )
         if vehicle.is_landed:
-            self._lift_off()
+            if self.lifts_off:
+                self._lift_off()
             return
         if mode == modes.TAKEOFF:
             self._take_off()
@@ -179,8 +180,9 @@ class Px4Flight:
             self.go()
 
     def _lift_off(self) -> None:
+        """Leave the ground once the motors have reached their speed."""
         vehicle = self._vehicle
-        if self.lifts_off and vehicle.now - vehicle.arming.armed_at >= _SPOOL_UP_S:
+        if vehicle.now - vehicle.arming.armed_at >= _SPOOL_UP_S:
             self._ramp_began_at = vehicle.now
             vehicle.leave_ground()
 
@@ -249,12 +251,11 @@ class Px4Flight:
         destination_north, destination_east, destination_down = self.destination
         current_height = destination_down - down
         distance = math.hypot(north - destination_north, east - destination_east)
-        height = max(vehicle.parameters["RTL_RETURN_ALT"], current_height)
-        if distance < vehicle.parameters["RTL_MIN_DIST"]:
-            height = max(vehicle.parameters["RTL_DESCEND_ALT"], current_height)
-        # The return begins with a climb at the present place. `min` prevents a descent, because a smaller down
-        # coordinate is higher.
-        return_down = min(down, destination_down - height)
+        is_near = distance < vehicle.parameters["RTL_MIN_DIST"]
+        return_height = vehicle.parameters["RTL_DESCEND_ALT" if is_near else "RTL_RETURN_ALT"]
+        # The return begins with a climb at the present place, and never with a descent.
+        height = max(return_height, current_height)
+        return_down = destination_down - height
         self.target = (north, east, return_down)
         amsl = vehicle.frame.origin.altitude_m - return_down
         text = f"RTL: start return at {amsl:.0f} m ({height:.0f} m above destination)"

@@ -274,7 +274,10 @@ class Px4Mission:
             self._px4.info("Returning to launch")
 
     def _index_after_jump(self, item: MissionItem) -> int:
-        """Return the index of the item after a DO_JUMP. PX4 counts the jumps, and sends the item to the last client."""
+        """Return the index at which the mission continues after a DO_JUMP.
+
+        PX4 counts the jumps in the DO_JUMP, and sends the changed DO_JUMP to the last client.
+        """
         index = self.current
         jumps_done = self._jumps.get(index, 0)
         if jumps_done >= item.param2:

@@ -200,9 +200,9 @@ class Px4MissionServer(MissionServer):
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        A download counts as complete once all items were sent. The firmware also applies this rule to an upload, if the
-        number of received items equals the number of stored items. The upload then ends, but other uploads are refused
-        until a download times out.
+        A transfer of all items counts as complete. PX4 does not check its direction: the request also ends an upload,
+        if as many items were received as are stored (mavlink_mission.cpp, handle_mission_request_list). PX4 still
+        remembers that upload as unfinished, so it refuses other uploads until a download times out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):

@@ -108,7 +108,10 @@ class Px4Gimbal:
         return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Set the angles (NaN keeps the present ones) and the rates at which they change. RETRACT changes nothing."""
+        """Set the angles and the rates at which they change.
+
+        If any angle is NaN, all three angles stay. NEUTRAL centres the gimbal, RETRACT changes nothing.
+        """
         if flags & Flags.RETRACT:
             return
         current = self.angles()
@@ -247,7 +250,7 @@ _GEOTAG_DELAY_S = 0.02
 class Px4CameraTrigger:
     """Camera trigger. Sends CAMERA_TRIGGER for each image, and CAMERA_IMAGE_CAPTURED if ``sends_image_captured``.
 
-    As on the real vehicle, commands to a disabled trigger are not answered.
+    As on the real vehicle, commands are not answered if no trigger is fitted.
     """
 
     sequence: int
@@ -284,7 +287,7 @@ class Px4CameraTrigger:
         }
 
     def _digicam_control(self, command: ReceivedCommand) -> int | None:
-        """Handle DO_DIGICAM_CONTROL. Return None, for no answer, without a trigger."""
+        """Handle DO_DIGICAM_CONTROL. If no trigger is fitted, return None, which sends no answer."""
         if not self.is_fitted:
             return None
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.

@@ -38,8 +38,8 @@ class MessageSource(Generic[T]):
 
     Args:
         message: name of the message class. The class itself is imported only when it is needed.
-        decode: function that returns the value, or None if the message does not contain it. If this is None,
-            `Telemetry` handles the message.
+        decode: function that returns the value, or None if the message does not contain the value. Pass None instead
+            of a function if `Telemetry` itself handles the message.
         needs_context: True if ``decode`` also takes a :class:`Context`.
         hz: the default rate to request, in Hz.
         fallback: use the message only while no better message has reported the state recently.
@@ -217,7 +217,7 @@ class StreamedMessage:
             return
         if self._is_watched or frame.received_at >= self._decode_from:
             self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
-            # Only the loop's thread may call observers, so the lock keeps other threads from decoding the frame.
+            # The lock keeps a thread that reads a cell from applying older frames between `catch_up` and `_apply`.
             with self._lock:
                 if self.pending:
                     self.catch_up()  # Frames that arrived earlier must be applied first.
@@ -227,7 +227,7 @@ class StreamedMessage:
         # MAVLink 2 truncates zeros at the end of the payload, so a missing byte is 0.
         if self._instance_at is not None and len(frame.body) > self._instance_at:
             instance = frame.body[self._instance_at]
-        self.pending[instance] = message or frame
+        self.pending[instance] = message or frame  # Setting an item of a dict is atomic, so it needs no lock.
 
     def catch_up(self) -> None:
         """Decode the pending frames in the order of their arrival."""
