@@ -95,7 +95,7 @@ class LogDownload(Transfer[int]):
         end = message.ofs + message.count
         is_end_too_early = message.count < LOG_BLOCK and end < self._size
         if is_end_too_early:
-            self._end_early(end)
+            self._on_short_block(end)
         else:
             self._on_block(message, now)
         if not self.done:
@@ -135,9 +135,9 @@ class LogDownload(Transfer[int]):
             self._report_progress(now, self._reassembly.done, self._size)
         self._requests.on_answer(offset, now)
 
-    def _end_early(self, end: int) -> None:
-        # The vehicle has sent a short block before the end of the log, because it could not read its own log. This may
-        # be temporary, so the data is requested again a few times.
+    def _on_short_block(self, end: int) -> None:
+        """Process the end of a block that is short although the log is longer: fail only after some of them."""
+        # The vehicle could not read its own log. This may be temporary, so the data is requested again a few times.
         self._is_streaming = False
         self._early_ends += 1
         if self._early_ends >= MAX_EARLY_ENDS:
@@ -296,7 +296,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         self._entries: dict[int, LogEntry] = {}
         self._missing: dict[int, None] | None = None  # ids of the missing entries; None before the first entry
         self._stream = MessageStream(self.round_trip)
-        self._last_id = 0
+        self._last_id = 0  # the id of the last entry or, after a request, the first requested id
 
     def start(self, now: float) -> None:
         self._start_clock(now)
