@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
 
 MIN_CHANNELS, MAX_CHANNELS = 8, 18
-MAVLINK_1_CHANNELS = (
-    8  # RC_CHANNELS_OVERRIDE has further channels only in MAVLink 2, and releases them by another value.
-)
+# MAVLink 2 adds channels to RC_CHANNELS_OVERRIDE, which are released by another value.
+MAVLINK_1_CHANNELS = 8
 MAX_MICROSECONDS = 0xFFFF
 UNUSED = 0xFFFF  # The channel does not exist (RC_CHANNELS), or stays unchanged (RC_CHANNELS_OVERRIDE).
 NUMBERS = tuple(str(number) for number in range(1, MAX_CHANNELS + 1))
