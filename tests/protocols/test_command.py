@@ -192,8 +192,8 @@ def test_command_int_is_resent_unchanged() -> None:
 @pytest.mark.parametrize(
     ("params", "text"),
     [
-        ((math.inf,), "param1 = inf does not fit"),
-        ((1e39,), "does not fit"),
+        ((math.inf,), "param1 = inf is not a finite 32-bit float"),
+        ((1e39,), "is not a finite 32-bit float"),
         ((0, "up"), "param2 = 'up' is not a number"),
         (tuple(range(8)), "at most 7 parameters"),
     ],

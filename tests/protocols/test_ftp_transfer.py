@@ -198,6 +198,17 @@ def test_download_measures_round_trip_by_first_block() -> None:
         assert exchange.round_trip.smoothed_s == measured
 
 
+def test_download_late_block_does_not_shorten_measured_interval() -> None:
+    """Blocks 0, 2 and 3 arrive in order, one each 0.1 s; block 1 arrives late, shortly before block 3."""
+    download = Download(10_000)
+    download.exchange.start(0.0)
+    (burst,) = requests_in(download.exchange.take_outbox())
+    for number, at in ((0, 0.1), (2, 0.3), (1, 0.39), (3, 0.4)):
+        block = reply_to(burst, content(239), offset=239 * number, ahead=number + 1)
+        download.exchange.receive(as_message(block), at)
+    assert download.exchange._interval.smoothed_s == pytest.approx(0.1)
+
+
 def test_download_of_grown_file_ends_at_old_size() -> None:
     download = Download(300)
     download.exchange.start(0.0)

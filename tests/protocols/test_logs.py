@@ -55,7 +55,7 @@ def test_log_list_without_logs() -> None:
 
 
 def test_log_list_of_one_entry() -> None:
-    exchange = make_list(start=2, end=2)
+    exchange = make_list(from_id=2, to_id=2)
     run(exchange, LogVehicle([content(5), content(6), content(7)]))
     assert [log.size for log in exchange.result()] == [6]
 

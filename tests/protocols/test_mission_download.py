@@ -132,7 +132,20 @@ def test_mission_download_timeout_names_missing() -> None:
     result = run(exchange, ArduPilotModel(HELD), Radio(silences=[(1.05, 100.0)]))
     assert isinstance(result.error, MissionTimeout)
     assert result.error.missing == tuple(range(result.error.missing[0], 49))
+    assert f"missing: {result.error.missing[0]}–48;" in str(result.error)
     assert result.seconds < 14.0
+
+
+def test_mission_download_timeout_names_missing_home() -> None:
+    exchange = download(only=(0,), offset=1)
+    exchange.start(0.0)
+    exchange.receive(m.MissionCount(*GCS, 3), 0.1)
+    while not exchange.done:
+        assert exchange.deadline is not None
+        exchange.expire(exchange.deadline)
+    with pytest.raises(MissionTimeout, match="missing: home;") as caught:
+        exchange.result()
+    assert caught.value.missing == ()
 
 
 def test_mission_download_restarts_after_change() -> None:

@@ -193,12 +193,25 @@ def test_mission_upload_restarts_after_cancellation() -> None:
     assert vehicle.stored == NEW
 
 
+def test_mission_upload_timeout_after_restart_remembers_requests() -> None:
+    exchange = upload(NEW)
+    exchange.start(0.0)
+    exchange.receive(m.MissionRequestInt(*GCS, 0), 0.1)
+    exchange.receive(m.MissionAck(*GCS, Result.OPERATION_CANCELLED), 0.2)
+    while not exchange.done:
+        assert exchange.deadline is not None
+        exchange.expire(exchange.deadline)
+    with pytest.raises(MissionTimeout, match=f"items not confirmed: 0–{len(NEW) - 1};"):
+        exchange.result()
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_mission_upload_timeout_names_unconfirmed(model: type[Store]) -> None:
     vehicle, exchange = model(OLD), upload(NEW, window=1, offset=1)
     result = run(exchange, vehicle, Radio(silences=[(1.0, 100.0)]))
     assert isinstance(result.error, MissionTimeout)
     assert result.error.missing == tuple(range(result.error.missing[0], 39))
+    assert f"items not confirmed: {result.error.missing[0]}–38;" in str(result.error)
     assert 5 <= result.error.missing[0] <= 10
     assert 10.0 <= result.seconds < 14.0
     assert result.sent[-1] == m.MissionAck(1, 1, Result.OPERATION_CANCELLED)

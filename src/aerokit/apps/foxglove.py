@@ -197,7 +197,7 @@ class _TopicChannels:
         """Send all values that are newer than the last values sent."""
         for system_id, vehicle in vehicles.items():
             self._publish_states(system_id, vehicle)
-            self._publish_pose(system_id, vehicle)
+            self._publish_location_and_pose(system_id, vehicle)
             self._publish_texts(system_id, vehicle)
         for (system_id, component_id, _), message in self._messages.items():
             assert message.received_frame is not None
@@ -217,11 +217,12 @@ class _TopicChannels:
     def _publish_states(self, system_id: int, vehicle: Vehicle) -> None:
         """Send the states that are newer than the last ones sent and, at intervals, the statistics of the link."""
         for state, cell in vehicle.telemetry.cells.items():
-            value, name = cell.latest, topics.vehicle_topic(system_id, state)
+            value, topic_name = cell.latest, topics.vehicle_topic(system_id, state)
             if value is None:
                 continue
-            if self._open_topic_if_newer(name, cell.updated_at, partial(topics.state_topic, system_id, state, value)):
-                self._send(name, cell.updated_at, topics.state_fields(value))
+            make_topic = partial(topics.state_topic, system_id, state, value)
+            if self._open_topic_if_newer(topic_name, cell.updated_at, make_topic):
+                self._send(topic_name, cell.updated_at, topics.state_fields(value))
         # The link's statistics change with every frame, so they are sent at an interval.
         name, now = topics.vehicle_topic(system_id, "link"), self._connection.now()
         if now - self._sent_at.get(name, -_LINK_INTERVAL_S) >= _LINK_INTERVAL_S:
@@ -229,7 +230,7 @@ class _TopicChannels:
             if self._open_topic_if_newer(name, now, lambda: topics.state_topic(system_id, "link", link)):
                 self._send(name, now, link)
 
-    def _publish_pose(self, system_id: int, vehicle: Vehicle) -> None:
+    def _publish_location_and_pose(self, system_id: int, vehicle: Vehicle) -> None:
         """Send the location and, in the map frame, transform and pose, which combine position and attitude."""
         position, attitude = vehicle.position.latest, vehicle.attitude.latest
         if position is None:
@@ -241,13 +242,14 @@ class _TopicChannels:
         )
         if self._open_topic_if_newer(location, position_at, lambda: Topic(location, topics.LOCATION_FIX)):
             heading, velocity = vehicle.heading_deg.latest, vehicle.velocity.latest
-            unix_s = self._to_unix_time(position_at)
-            self._send(location, position_at, topics.location_fix(unix_s, system_id, position, heading, velocity))
-        map_position, unix_s = self._map_frame.east_north_up_m(position), self._to_unix_time(pose_at)
+            location_unix_s = self._to_unix_time(position_at)
+            fix = topics.location_fix(location_unix_s, system_id, position, heading, velocity)
+            self._send(location, position_at, fix)
+        map_position, pose_unix_s = self._map_frame.east_north_up_m(position), self._to_unix_time(pose_at)
         if self._open_topic_if_newer(transform, pose_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
-            self._send(transform, pose_at, topics.frame_transform(unix_s, system_id, map_position, attitude))
+            self._send(transform, pose_at, topics.frame_transform(pose_unix_s, system_id, map_position, attitude))
         if self._open_topic_if_newer(pose, pose_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
-            self._send(pose, pose_at, topics.pose_in_frame(unix_s, map_position, attitude))
+            self._send(pose, pose_at, topics.pose_in_frame(pose_unix_s, map_position, attitude))
 
     def _publish_texts(self, system_id: int, vehicle: Vehicle) -> None:
         name = topics.vehicle_topic(system_id, "log")
@@ -257,9 +259,10 @@ class _TopicChannels:
                 self._send(name, text.at, topics.log_entry(self._to_unix_time(text.at), system_id, text))
 
     def _open_topic_if_newer(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
-        """Return True if a viewer subscribes to the topic, and the value is newer than the last value sent.
+        """Open the channel of a topic at its first value. Return True if the value must be sent.
 
-        Opens the channel of the topic at its first value, because the type of the channel depends on the value.
+        The channel cannot be opened earlier, because its type depends on the value. A value must be sent if a viewer
+        subscribes to the topic, and the value is newer than the last value sent.
         """
         channel = self._channels.get(name)
         if channel is None:
@@ -267,7 +270,7 @@ class _TopicChannels:
                 name, schema=dict(make_topic().schema), message_encoding="json", context=self.context
             )
         if not channel.has_sinks():
-            self._sent_at.pop(name, None)
+            self._sent_at.pop(name, None)  # so that the next viewer gets the current value
             return False
         return updated_at > self._sent_at.get(name, -math.inf)
 

@@ -29,7 +29,7 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:
     """Add a note to the result if the value was set without a check of its range; return the result.
 
-    The note names ``option``, the option that gives the metadata.
+    If there is no metadata at all, the note names ``option``, the option that gives it.
     """
     if result.error is not None or result.outcome == "unchanged":
         return result

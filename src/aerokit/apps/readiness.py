@@ -25,6 +25,8 @@ _FAILSAFE_REPORT_DURATION_S = 10.0
 def active_failsafe(vehicle: Vehicle) -> list[str] | None:
     """Return the vehicle's newest texts about its active failsafe, the oldest of them first; None if none is active.
 
+    If no such text was received, the result is one line that says so.
+
     ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which means nothing while the vehicle is disarmed
     (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).
     """
@@ -69,7 +71,11 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
 
 
 def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
-    """Return what is missing for a flight, in its two groups, without regard to a mode that does not allow arming."""
+    """Return what is missing for a flight, in its two groups.
+
+    If the vehicle's checks pass, its mode decides which missing estimates prevent arming. Otherwise a mode that does
+    not allow arming is not included.
+    """
     missing = vehicle.missing_for_flight()
     against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
     sensors = vehicle.sensors.latest
@@ -97,10 +103,10 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     needs_position = mode is None or mode.name not in vehicle.autopilot.modes_without_position
     needed = []
     for text in missing:
-        is_about_position = text.startswith(("the estimator has no ", "no GPS receiver has "))
-        is_about_estimates = text.startswith(("estimator (", "position (", "home ("))
-        is_unknown_estimate = is_about_estimates and text.endswith(" not received)")
-        if (needs_position or not is_about_position) and not is_unknown_estimate:
+        is_missing_position = text.startswith(("the estimator has no ", "no GPS receiver has "))
+        # A report that was not received shows nothing about the vehicle, which may have the estimate.
+        is_missing_report = text.startswith(("estimator (", "position (", "home (")) and text.endswith(" not received)")
+        if (needs_position or not is_missing_position) and not is_missing_report:
             needed.append(text)
     return needed
 
@@ -108,7 +114,7 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     """Return the known reasons why `Vehicle.arm` would fail; empty if none is known. Sends nothing.
 
-    ``missing`` are the missing conditions for flight. In modes without a position, ArduPilot arms without most of them.
+    ``missing`` are the missing conditions for flight. In modes that need no position, ArduPilot arms without most.
     """
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
@@ -129,15 +135,17 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     if estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which arming would change the mode"
         headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
+        # The vehicle may have a value that was not received, so it is no known reason.
         return [headline, *(text for text in missing if not text.endswith(" not received)"))]
     return []
 
 
 def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return data about the current mode if the vehicle cannot arm in it; None if it can, or the mode is unknown.
+    """Return data about the current mode if the vehicle cannot arm in it, or only if a parameter permits it.
 
-    ``mode`` is the name of the current mode, ``arms_in`` that of the mode to which ``arm`` would change, or None.
-    ``unless`` is the parameter that can permit arming in the current mode, or None.
+    Return None for other modes, and for an unknown mode. ``mode`` is the name of the current mode, ``arms_in`` that of
+    the mode to which ``arm`` would change, or None. ``unless`` is the autopilot's parameter that can permit arming in
+    the current mode, or None. The value of this parameter is not checked.
     """
     autopilot = vehicle.autopilot
     mode = vehicle.mode.latest
@@ -167,8 +175,8 @@ def own_flight_modes(vehicle: Vehicle) -> str:
     return ", ".join(dict.fromkeys(mode.name for mode in modes if mode is not None))
 
 
-def arms_but(vehicle: Vehicle) -> str:
-    """Return words for a vehicle that can arm, but not fly by itself."""
+def arms_but_cannot_fly_text(vehicle: Vehicle) -> str:
+    """Return words to print before the reasons why a vehicle that can arm cannot fly autonomously."""
     return f"arms in {vehicle.mode_name}, but cannot take off by itself or fly {own_flight_modes(vehicle)}"
 
 
@@ -178,7 +186,7 @@ def readiness_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
     for index, text in enumerate(checks.against_arming):
         lines.append(f"{checks.prefix}: {text}" if index == 0 else f"  {text}")
     if checks.against_flight:
-        words = "also missing for flight" if lines else arms_but(vehicle)
+        words = "also missing for flight" if lines else arms_but_cannot_fly_text(vehicle)
         lines += [f"{words}:", *(f"  {text}" for text in checks.against_flight)]
     return lines
 
@@ -194,8 +202,8 @@ class ArmingCheckRequests:
         self._failing: dict[Vehicle, tuple[str, ...]] = {}
         self._requested_at: dict[Vehicle, float] = {}
 
-    def are_due(self, vehicle: Vehicle) -> bool:
-        """Return True if the caller should now call `run_arming_checks`, and record that it does."""
+    def take_due(self, vehicle: Vehicle) -> bool:
+        """Return True if the caller must now call `run_arming_checks`. True is returned once for each request."""
         failing = _failing_checks(vehicle)
         if failing is None:
             self._failing.pop(vehicle, None)

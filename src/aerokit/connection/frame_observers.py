@@ -183,7 +183,7 @@ _ObserverT = TypeVar("_ObserverT")
 
 
 class FrameObservers:
-    """Callbacks invoked with every received or sent frame, and the recording.
+    """Holds the callbacks for received and for sent frames, and the recording, if any, which gets all of them.
 
     ``on_change()`` is called when :attr:`want_all` may have changed.
     """

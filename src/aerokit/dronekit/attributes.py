@@ -114,7 +114,7 @@ class VehicleAttributes(VehicleCore):
 
     Reading an attribute returns the latest value without waiting, on any thread.
 
-    Each message is stored by a single assignment, so that values read together are from the same message.
+    Each message is stored by a single assignment, so that the values within one attribute are from the same message.
     """
 
     _dk_heartbeat: m.Heartbeat | None = None

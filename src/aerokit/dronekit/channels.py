@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from aerokit.dronekit.core import VehicleCore
 
 MIN_CHANNELS, MAX_CHANNELS = 8, 18
+# MAVLink 2 adds channels to RC_CHANNELS_OVERRIDE, which are released by another value.
+MAVLINK_1_CHANNELS = 8
+MAX_MICROSECONDS = 0xFFFF
 UNUSED = 0xFFFF  # The channel does not exist (RC_CHANNELS), or stays unchanged (RC_CHANNELS_OVERRIDE).
 NUMBERS = tuple(str(number) for number in range(1, MAX_CHANNELS + 1))
 ALL_VALUES = attrgetter(*(f"chan{number}_raw" for number in NUMBERS))
@@ -70,8 +73,8 @@ class Channels(_ChannelDict):
     """RC input of the autopilot, overrides included: microseconds by number (``'1'`` or 1). Read only.
 
     The values come from RC_CHANNELS and RC_CHANNELS_RAW. Each message changes all values at once. A channel is None if
-    it does not exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW with more than
-    eight. Setting :attr:`count` changes the number. :attr:`overrides` changes channels.
+    it does not exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW of port 1, which has
+    channels 9 to 16. Setting :attr:`count` changes the number. :attr:`overrides` changes channels.
     """
 
     def __init__(self, vehicle: VehicleCore, count: int) -> None:
@@ -144,8 +147,9 @@ class ChannelsOverride(_ChannelDict):
     """Overridden channels: microseconds by number. Each change is sent at once, as RC_CHANNELS_OVERRIDE.
 
     Set a channel to 1000–2000 (any 16-bit value is sent); set it to None or 0, or delete it, to release it to the
-    radio. Other channels belong to the radio; those above 8 keep overrides of other programs. Raises KeyError for an
-    invalid channel and ValueError for an invalid value, without changing or sending anything.
+    radio. Each change also releases all other channels from 1 to 8, even if another program overrides them; other
+    channels above 8 are left as they are. Raises KeyError for an invalid channel and ValueError for an invalid value,
+    without changing or sending anything.
 
     **Nothing is repeated**: the vehicle ends overrides when it receives none for a while (ArduPilot: RC_OVERRIDE_TIME,
     3 s), which makes a hanging program safe. To hold a stick, set it several times a second. All channels are released
@@ -240,12 +244,12 @@ class ChannelsOverride(_ChannelDict):
     def _send(self, active: dict[str, int], released: set[str]) -> None:
         """Send RC_CHANNELS_OVERRIDE with the overridden channels, and with the channels to release."""
         aio = self._core.check_link()
-        if aio.connection.mavlink_version == 1 and any(int(channel) > MIN_CHANNELS for channel in active):
+        if aio.connection.mavlink_version == 1 and any(int(channel) > MAVLINK_1_CHANNELS for channel in active):
             raise APIException("channels above 8 need MAVLink 2, and this vehicle uses MAVLink 1")
         # 0 releases channels 1 to 8 and leaves higher channels unchanged; RELEASE_UPPER releases higher channels.
         values = [active.get(number, 0) for number in NUMBERS]
         for channel in released:
-            if int(channel) > MIN_CHANNELS:
+            if int(channel) > MAVLINK_1_CHANNELS:
                 values[int(channel) - 1] = RELEASE_UPPER
         self._core.send(RcChannelsOverride(self._core.target_system, 0, *values))
 
@@ -259,9 +263,9 @@ def _checked_value(number: int, value: Any) -> int:
         return 0
     with contextlib.suppress(TypeError, ValueError, OverflowError):
         microseconds = round(value)  # round() accepts floats and numpy numbers.
-        if 0 <= microseconds <= UNUSED:
+        if 0 <= microseconds <= MAX_MICROSECONDS:
             return int(microseconds)
     raise InvalidArgument(
-        f"channel {number} = {value!r} is not allowed: expected microseconds (usually 1000 to 2000), or None, which"
-        " releases the channel"
+        f"channel {number} = {value!r} is not allowed: expected 0 to {MAX_MICROSECONDS} microseconds (usually"
+        " 1000 to 2000), or None, which releases the channel"
     )

@@ -160,12 +160,12 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which a reposition command may be sent.
+    """Return the modes that must be checked before a reposition command; empty if the vehicle checks its mode itself.
 
-    On PX4, the command itself sets the first of these modes. On other autopilots the result is empty: the command does
-    not change the mode, and the vehicle refuses the command in wrong modes.
+    On PX4, the command sets the first of these modes. On other autopilots, it does not change the mode, and the vehicle
+    refuses it in wrong modes.
     """
-    if not aio.autopilot.repositions_amsl:
+    if not aio.autopilot.repositions_amsl:  # not PX4
         return ()
     purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
     modes = map(aio.autopilot.mode_for, purposes)
@@ -214,12 +214,13 @@ class CurrentCommand:
 
     @property
     def seq(self) -> int:
-        """``seq`` of the current command; 0 before the first MISSION_CURRENT."""
+        """``seq`` of the current command; 0 before the first MISSION_CURRENT, and on PX4 while no mission is active."""
         message = self._latest.message
         if message is None:
             return 0
         if self._core.aio.autopilot.home_is_item_0:
             return int(message.seq)
+        # An item that the program has just set counts even if no mission is active yet.
         is_requested = message.seq == self._requested_index
         if message.total == NO_MISSION or (self._is_no_mission_active(message) and not is_requested):
             return 0
@@ -344,12 +345,12 @@ class Maintenance(VehicleCore):
 def _tune_text(tune: str | bytes) -> str:
     """Check a tune, and return it as text."""
     try:
-        text = tune.encode() if isinstance(tune, str) else tune
-        notes = text.rstrip(b"\0").decode("ascii")
+        data = tune.encode() if isinstance(tune, str) else tune
+        text = data.rstrip(b"\0").decode("ascii")
     except (UnicodeError, AttributeError):
         raise InvalidArgument(f"tune = {tune!r} is not allowed: it must be ASCII text") from None
-    if "\0" in notes or len(notes) > sum(TUNE_SIZES):
+    if "\0" in text or len(text) > sum(TUNE_SIZES):
         raise InvalidArgument(
-            f"tune of {len(notes)} characters is not allowed: it must have at most {sum(TUNE_SIZES)}, without NUL"
+            f"tune of {len(text)} characters is not allowed: it must have at most {sum(TUNE_SIZES)}, without NUL"
         )
-    return notes
+    return text

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle as AsyncVehicle
 
 HOME_TIMEOUT_S = 10.0
-MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles are reduced by whole turns
+MAX_ANGLE_DEG = 360.0  # limit of vehicle.aio.gimbal; larger angles are refused there
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None)
 
 
@@ -121,7 +121,7 @@ async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
 
 
 def _checked(name: str, value: float) -> float:
-    """Check an angle, and return it in the range of the gimbal."""
+    """Check an angle. If it is above `MAX_ANGLE_DEG`, reduce it by whole turns to -180 to 180 degrees."""
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -103,14 +103,13 @@ class Master:
         if vehicle is not None and (isinstance(mode, str) or not is_px4):
             vehicle.mode = mode
             return
-        number: Any
-        if isinstance(mode, str):
-            number = (self.mode_mapping() or {})[mode]
-        elif is_px4:
-            number = (mode, custom_mode or 0, custom_sub_mode or 0)
+        number: Any = (self.mode_mapping() or {})[mode] if isinstance(mode, str) else mode
+        if not is_px4:
+            params = (MavModeFlag.CUSTOM_MODE_ENABLED.value, number, 0)
+        elif isinstance(mode, str):
+            params = number  # three numbers
         else:
-            number = mode
-        params = number if isinstance(number, tuple) else (MavModeFlag.CUSTOM_MODE_ENABLED.value, number, 0)
+            params = (mode, custom_mode or 0, custom_sub_mode or 0)
         self._command(MavCmd.DO_SET_MODE, *params)
 
     set_mode_apm: Callable[..., None] = set_mode
@@ -185,9 +184,9 @@ class Master:
     ) -> Any:
         """Return the next message of the given types (None: any) that satisfies pymavlink's ``condition``.
 
-        The first call starts storing messages: up to 1,000, for up to five seconds. If none matches, returns None at
-        once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises APIException if
-        the connection is closed.
+        From the first call on, messages are stored: the last 1,000, each for at most five seconds. If none matches,
+        returns None at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises
+        APIException if the connection is closed.
         """
         types = (type,) if isinstance(type, str) else type
         names = None if types is None else set(types)

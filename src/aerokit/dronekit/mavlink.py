@@ -254,12 +254,16 @@ def _check_address(ip: object) -> None:
 
 
 def _classic_error(error: LinkOpenError) -> Exception:
-    """Convert a failure to open a link to an exception of the operating system's type, which programs catch."""
-    cause = error.__context__
+    """Convert a failure to open a link to the type of its cause, OSError or ValueError, which programs catch.
+
+    Without such a cause, return the error itself.
+    """
+    original = error.__context__
     classic: Exception
-    if isinstance(cause, OSError):
-        classic = type(cause)(str(error)) if cause.errno is None else type(cause)(cause.errno, str(error))
-    elif isinstance(cause, ValueError):  # raised by pyserial for an unsupported baud rate
+    if isinstance(original, OSError):
+        make = type(original)
+        classic = make(str(error)) if original.errno is None else make(original.errno, str(error))
+    elif isinstance(original, ValueError):  # raised by pyserial for an unsupported baud rate
         classic = ValueError(str(error))
     else:
         return error

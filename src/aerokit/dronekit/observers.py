@@ -79,7 +79,10 @@ class Listeners:
         return name in self.by_name or EVERY_NAME in self.by_name
 
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
-        """Call the listeners of a name with a value. Returns immediately or, with ``waits``, after the calls.
+        """Call the listeners of a name with a value.
+
+        With a listener thread, returns immediately or, with ``waits``, after the calls. Without one, the listeners run
+        in this call.
 
         With ``cache``, listeners are called only if the value has changed. Without it, values are skipped while too
         many calls are queued.

@@ -189,8 +189,9 @@ class ParameterValues:
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
     """Set a parameter. Return None if the vehicle confirms the value, otherwise the error.
 
-    Values of integer parameters are truncated, as in ArduPilot. PARAM_SET is sent once. If it is not answered, the
-    value is requested, with ``retries`` + 1 attempts in total.
+    Values of integer parameters are truncated, as in ArduPilot. If PARAM_SET is not answered, the value is requested.
+    PARAM_SET is sent again only if the vehicle still reports the old value. The call ends after the time of ``retries``
+    attempts, and `LAST_WAIT_SHARE` of another one, without an answer.
     """
     idle_timeout_s = (retries + LAST_WAIT_SHARE) * _attempt_s(aio)
     try:

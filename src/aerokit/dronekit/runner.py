@@ -140,7 +140,7 @@ def run_script(path: str | os.PathLike[str], arguments: Sequence[str] = ()) -> N
 
 
 def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> int:
-    """Run the program that a command line names in this process. Exceptions of the program propagate.
+    """Run, in this process, the program that a command line names. Exceptions of the program propagate.
 
     Args:
         arguments: ``program.py arguments…`` or ``-m module arguments…``.

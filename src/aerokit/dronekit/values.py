@@ -247,6 +247,7 @@ class Capabilities:
         self.param_union: bool = bool(bits & 1 << 4)
         self.ftp: bool = bool(bits & 1 << 5)
         self.set_attitude_target: bool = bool(bits & 1 << 6)
+        # The next two names are DroneKit's, for SET_POSITION_TARGET_LOCAL_NED and SET_POSITION_TARGET_GLOBAL_INT.
         self.set_attitude_target_local_ned: bool = bool(bits & 1 << 7)
         self.set_altitude_target_global_int: bool = bool(bits & 1 << 8)
         self.terrain: bool = bool(bits & 1 << 9)

@@ -66,8 +66,9 @@ LEVELS = (logging.CRITICAL,) * 3 + (logging.ERROR, logging.WARNING, logging.INFO
 class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: its attributes and their listeners, orders, parameters and missions.
 
-    :func:`connect` creates it. ``connect(…, vehicle_class=…)`` creates a subclass, whose constructor must pass its one
-    argument to this class and may add listeners and attributes. The vehicle can be used from any thread. Callbacks run
+    :func:`connect` creates it. ``connect(…, vehicle_class=MyVehicle)`` creates a ``MyVehicle``, a subclass of this
+    class. Its constructor gets one argument, which it must pass to the constructor of this class; it may add listeners
+    and attributes. The vehicle can be used from any thread. Callbacks run
     in order on a separate thread, and may use the vehicle, too. The vehicle is a context manager; :meth:`close`
     closes the connection.
     """

@@ -39,7 +39,7 @@ class AdaptiveWindow:
 
     The window grows while answers arrive as fast as the fastest answers so far. It shrinks when answers take much
     longer, because they then wait in a queue. Loss does not shrink the window unless most requests are lost, because
-    radios lose frames at any rate.
+    radios lose frames even if they carry little.
     """
 
     def __init__(self, *, start: int = 4, min_size: int = 2, max_size: int = 64) -> None:
@@ -104,9 +104,10 @@ class BlockRequests:
         self._round_trip = round_trip
         self._burst_size = burst_size
         self._spacing_s = spacing_s
-        self._waiting: dict[int, None] = {}
+        # All keys are offsets. An overdue block is in `_waiting` and still in `_sent_blocks`.
+        self._waiting: dict[int, None] = {}  # blocks to request, in order
         self._in_flight: dict[int, _BlockRequest] = {}  # in the order in which they were sent
-        self._blocks: dict[int, _BlockRequest] = {}
+        self._sent_blocks: dict[int, _BlockRequest] = {}  # blocks that were requested and have not arrived
         self._sent_count = 0
         self._timeouts = 0  # number of times that answers were overdue since the last answer
         self._busy_until = float("-inf")  # until this time, the server is busy with a burst
@@ -133,7 +134,7 @@ class BlockRequests:
         """Drop the request for a block, for example because the block arrived in a burst."""
         self._waiting.pop(offset, None)
         self._in_flight.pop(offset, None)
-        self._blocks.pop(offset, None)
+        self._sent_blocks.pop(offset, None)
 
     def discard_from(self, end: int) -> None:
         """Drop the requests for all blocks from ``end`` on."""
@@ -146,7 +147,7 @@ class BlockRequests:
 
     def on_answer(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
         """Record an answer. ``sent_at`` is the time of the transmission that it answers, if known."""
-        block = self._blocks.get(offset)
+        block = self._sent_blocks.get(offset)
         self.discard(offset)
         if block is None:
             return
@@ -203,7 +204,7 @@ class BlockRequests:
 
     def _record_transmission(self, offset: int, now: float) -> None:
         self._sent_count += 1
-        block = self._blocks.setdefault(offset, _BlockRequest())
+        block = self._sent_blocks.setdefault(offset, _BlockRequest())
         block.attempts += 1
         block.transmission_number = self._sent_count
         block.previous_sent_at = block.sent_at
@@ -298,9 +299,9 @@ class Reassembly:
         self.tail = max(end, self.position)  # Data beyond the end may already have been written.
 
     def missing(self, size: int | None = None) -> tuple[tuple[int, int], ...]:
-        """Return the missing ranges as (offset, size); ``size`` is the expected size of the file, if known.
+        """Return the missing ranges as (offset, length); ``size`` is the expected size of the file, if known.
 
-        A range of size 0 extends to the unknown end of the file.
+        A range of length 0 extends to the unknown end of the file.
         """
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:

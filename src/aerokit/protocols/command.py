@@ -256,8 +256,9 @@ class CommandExchange(Exchange[CommandAck]):
         """Process a COMMAND_ACK. Other messages are ignored."""
         if self.done or not isinstance(message, CommandAck) or not self._is_ours(message):
             return
-        # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored. A command
-        # that is sent only once ignores none, because it would wait in vain if it ignored its own acknowledgement.
+        # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
+        # command is repeated. A command with a single attempt ignores none, because it would wait in vain if it ignored
+        # its own acknowledgement.
         may_ignore = self._sent_count == 1 and self._attempts > 1
         is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
         if message.result != MavResult.IN_PROGRESS:
@@ -427,5 +428,5 @@ def _checked_number(command: int, field: str, value: float) -> float:
     except (TypeError, ValueError):
         raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not a number") from None
     if math.isinf(number) or abs(number) > FLOAT32_MAX:  # NaN is allowed: many commands use it for "unchanged".
-        raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} does not fit into 32 bits")
+        raise InvalidArgument(f"{command_name(command)}: {field} = {value!r} is not a finite 32-bit float")
     return number

@@ -110,12 +110,15 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
         else:
             self._window.on_answer(index, now)
         self._store(index, setting, count, now)
-        if self._next_index >= count:
+        if self._is_streaming and self._next_index >= count:
             self._end_stream()
 
     def _end_stream(self) -> None:
         self._is_streaming = False
         self._quiet_at = None
+        self._request_missing()
+
+    def _request_missing(self) -> None:
         for index in self._missing():
             self._window.request(index)
 
@@ -131,7 +134,7 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
                 settings = (self._received[index] for index in range(self._count))
                 self._finish({setting.name: setting for setting in settings})
         elif len(self._window) == 0:  # Nothing is requested, but values are missing: the count has increased.
-            self._end_stream()
+            self._request_missing()
 
 
 class SettingReads(NamedReads[Setting]):
@@ -166,8 +169,8 @@ class SettingReads(NamedReads[Setting]):
             self._count_probe()
             self._window.on_answer(PROBE, now)
             # The component answers requests, so other names without an answer may be unknown to it.
-            unanswered = [other for other in self._names if other not in self._answers and other != name]
-            self._reject_unknown(unanswered, now)
+            unanswered = [other for other in self._names if other not in self._results and other != name]
+            self._reject_if_requested_often(unanswered, now)
         if name and name in self._window:
             self._window.on_answer(name, now)
             self._settle(name, setting_of(message), now)
@@ -178,9 +181,9 @@ class SettingWrite(Transfer[Setting]):
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
     answer arrives, the value is read. PARAM_EXT_SET is sent again only if the component still reports ``before``, the
-    value from before the write. Any other value that it reports twice is the result: the component rounded or clamped
-    the value, or another station set it. Retries are therefore bounded, and a later change by another station is not
-    undone.
+    value from before the write. If the component keeps reporting it, the write fails. Any other value that it reports
+    twice is the result: the component rounded or clamped the value, or another station set it. A later change by
+    another station is therefore not undone.
 
     Raises from ``result()``:
         ParameterRejected: the component refused (``code`` is the PARAM_ACK), or keeps the previous value.

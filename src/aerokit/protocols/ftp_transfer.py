@@ -81,7 +81,7 @@ class _Burst(NamedTuple):
         blocks, remainder = divmod(reply.offset - self.offset, DATA_SIZE)
         return remainder == 0 and blocks >= 0 and blocks % SEQUENCE_COUNT == self.blocks_before(reply)
 
-    def end(self, reply: FtpMessage) -> int | None:
+    def file_end(self, reply: FtpMessage) -> int | None:
         """Return the end of the file according to this NAK; None if the NAK does not belong to this burst."""
         blocks = self.blocks_before(reply)
         if blocks == 0:
@@ -101,7 +101,7 @@ class FtpDownload(FtpExchange[int]):
 
     Args:
         session: the session of the open file.
-        size: the size that the server reported on opening.
+        size: the size that the server reported on opening; 0 if the server does not know it.
     """
 
     def __init__(
@@ -124,11 +124,11 @@ class FtpDownload(FtpExchange[int]):
         self._bursts: deque[_Burst] = deque(maxlen=MAX_BURSTS)
         self._is_bursting = False
         self._failed_bursts = 0
-        self._repeated_bursts = 0  # number of bursts requested since the last block that was new
+        self._bursts_without_new_block = 0  # number of bursts requested since the last block that was new
         self._highest_blocks: dict[int, int] = {}  # by sequence number of a burst: the highest received block number
         self._supports_bursts = True
         self._burst_at = 0.0  # time of the latest request for a burst, or of the last block after it
-        # Burst and time of the last block that was received, and the highest number of a block of this burst.
+        # Burst of the last block that was received, and time and number of the block with the highest number of it.
         self._last_burst: _Burst | None = None
         self._last_block_at = 0.0
         self._last_block_number = -1
@@ -141,9 +141,9 @@ class FtpDownload(FtpExchange[int]):
 
     def expire(self, now: float) -> None:
         if self._is_idle(now):
-            self._fail(self._timed_out())
+            self._fail(self._timeout_error())
             return
-        if self._is_bursting and now >= self._burst_due_at:
+        if self._is_bursting and now >= self._next_block_deadline:
             self._is_bursting = False
             self._failed_bursts += 1
         self._proceed(now)
@@ -168,7 +168,7 @@ class FtpDownload(FtpExchange[int]):
                 if burst.contains(reply):
                     self._on_block(burst, reply, now)
                     return
-            elif (end := burst.end(reply)) is not None:
+            elif (end := burst.file_end(reply)) is not None:
                 self._end_burst(burst, end, reply)
                 return
 
@@ -187,8 +187,9 @@ class FtpDownload(FtpExchange[int]):
     def _record_block(self, burst: _Burst, number: int, now: float) -> None:
         """Record that block ``number`` of a burst has arrived: as progress, and to estimate the speed of the link."""
         # Blocks that a repeated burst sends again also count as progress, because they show that the server works. The
-        # number of repeated bursts is limited, so that the download cannot go on forever.
-        if number > self._highest_blocks.get(burst.sequence, -1) and self._repeated_bursts <= MAX_REPEATED_BURSTS:
+        # number of such bursts is limited, so that the download cannot go on forever.
+        is_further = number > self._highest_blocks.get(burst.sequence, -1)
+        if is_further and self._bursts_without_new_block <= MAX_REPEATED_BURSTS:
             self._highest_blocks[burst.sequence] = number
             self._progress_at = now
         # Only the first burst measures the round trip, because a later burst may have to wait for the end of an earlier
@@ -197,11 +198,9 @@ class FtpDownload(FtpExchange[int]):
             self.round_trip.add_sample(now - burst.sent_at)
         elif self._last_burst is burst and number > self._last_block_number:
             self._interval.add_sample((now - self._last_block_at) / (number - self._last_block_number))
-        is_out_of_order = self._last_burst is burst and number < self._last_block_number
-        if not is_out_of_order:
-            self._last_block_number = number
-        self._last_burst = burst
-        self._last_block_at = now
+        is_late = self._last_burst is burst and number <= self._last_block_number
+        if not is_late:
+            self._last_burst, self._last_block_number, self._last_block_at = burst, number, now
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
@@ -231,10 +230,10 @@ class FtpDownload(FtpExchange[int]):
     def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
         offset = sent.offset
         self._requests.on_answer(offset, now, sent_at=sent.at)
-        is_end = reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset)
         if reply.is_ack and reply.data:
             self._add(offset, reply.data, now)
-        elif is_end:  # An ACK without data also means that the offset is not before the end of the file.
+        # An ACK without data also means that the offset is not before the end of the file.
+        elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
             self._end_at(offset)
         else:
             self._fail(self._refused(reply))
@@ -262,7 +261,7 @@ class FtpDownload(FtpExchange[int]):
             self._fail(error)
             return
         if is_new:
-            self._repeated_bursts = 0
+            self._bursts_without_new_block = 0
             self._requests.discard(offset)
             self._report_progress(now, self._reassembly.done, self._total)
 
@@ -274,8 +273,8 @@ class FtpDownload(FtpExchange[int]):
         if self._size is not None and reassembly.position >= self._size:
             self._finish(reassembly.position)
             return
-        if reassembly.is_complete:
-            self._end()
+        if reassembly.is_complete:  # The size is unknown, or was larger.
+            self._finish_at_end()
             return
         self._request_gaps()
         if not self._supports_bursts:
@@ -313,7 +312,7 @@ class FtpDownload(FtpExchange[int]):
         self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, session=self._session, size=DATA_SIZE, offset=offset))
 
     def _request_burst(self, now: float) -> None:
-        """Request a burst of everything after the last block received."""
+        """Request a burst of everything after the received block with the largest offset."""
         offset = self._reassembly.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. A later request with one of them would look like a
@@ -323,16 +322,16 @@ class FtpDownload(FtpExchange[int]):
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True
         self._burst_at = now
-        self._repeated_bursts += 1
+        self._bursts_without_new_block += 1
         self._send(
             FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, session=self._session, size=DATA_SIZE, offset=offset)
         )
 
     @property
-    def _burst_due_at(self) -> float:
+    def _next_block_deadline(self) -> float:
         """Deadline for the next block. If it passes, the burst has ended or, before any block, has not started."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
-        if self._interval.smoothed_s is None:
+        if self._interval.smoothed_s is None:  # The time between two blocks has not been measured yet.
             # Repeating the burst of a long file is expensive, so the burst gets more time to start.
             if self._size is not None and self._size > SHORT_FILE:
                 silence_s = max(silence_s, FIRST_BLOCK_TIMEOUT_S)
@@ -348,7 +347,7 @@ class FtpDownload(FtpExchange[int]):
         if due_at is not None:
             deadline = min(deadline, due_at)
         if self._is_bursting:
-            deadline = min(deadline, self._burst_due_at)
+            deadline = min(deadline, self._next_block_deadline)
         self.deadline: float | None = deadline
 
     # ------------------------------------------------------------------------------------ ends
@@ -357,7 +356,7 @@ class FtpDownload(FtpExchange[int]):
     def _total(self) -> int | None:
         return self._size if self._reassembly.end is None else self._reassembly.end
 
-    def _end(self) -> None:
+    def _finish_at_end(self) -> None:
         """Finish at the end of a file of unknown size. Fail if the file has ended before its announced size."""
         end = self._reassembly.position
         if self._size is None:  # The size of a virtual file is known only now.
@@ -366,10 +365,10 @@ class FtpDownload(FtpExchange[int]):
             text = f"read {self._path}: the file ended after {end} bytes, but its size is {self._size}"
             self._fail(RemoteProtocolError(text))
 
-    def _timed_out(self) -> FileTimeout:
-        missing = self._reassembly.missing(self._size)
+    def _timeout_error(self) -> FileTimeout:
+        missing = self._reassembly.missing(self._size)  # Not empty, because the download is not complete.
         received = self._reassembly.done
-        first_offset, _ = missing[0] if missing else (0, 0)
+        first_offset, _ = missing[0]
         return FileTimeout(
             f"read {self._path}: no data received for {self._idle_timeout_s:g} s; {received} bytes received,"
             f" {len(missing)} ranges missing, the first from byte {first_offset}",
@@ -387,9 +386,9 @@ class FtpUpload(FtpExchange[None]):
         self._data = data
         self._session = session
         self._requests = BlockRequests(self.round_trip)
-        self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))
-        self._written = 0
-        self._writes: dict[int, _SentRequest] = {}  # requests by sequence number
+        self._unwritten = dict.fromkeys(range(0, len(data), DATA_SIZE))  # offsets of the blocks not yet acknowledged
+        self._written_bytes = 0
+        self._sent_by_sequence: dict[int, _SentRequest] = {}
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -415,7 +414,7 @@ class FtpUpload(FtpExchange[None]):
         if reply.request_opcode != MavFtpOpcode.WRITEFILE:
             return
         # A reply has the sequence number of its request plus 1.
-        sent = self._writes.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
+        sent = self._sent_by_sequence.pop((reply.sequence - 1) % SEQUENCE_COUNT, None)
         if sent is None or sent.offset not in self._unwritten:
             return
         if not reply.is_ack:
@@ -424,8 +423,8 @@ class FtpUpload(FtpExchange[None]):
         offset = sent.offset
         del self._unwritten[offset]
         self._requests.on_answer(offset, now, sent_at=sent.at)
-        self._written += len(self._block(offset))
-        self._report_progress(now, self._written, len(self._data))
+        self._written_bytes += len(self._block(offset))
+        self._report_progress(now, self._written_bytes, len(self._data))
         self._proceed(now)
 
     def _proceed(self, now: float) -> None:
@@ -439,7 +438,7 @@ class FtpUpload(FtpExchange[None]):
 
     def _write(self, offset: int, now: float) -> None:
         sequence = self._client.next_sequence()
-        self._writes[sequence] = _SentRequest(offset, now)
+        self._sent_by_sequence[sequence] = _SentRequest(offset, now)
         data = self._block(offset)
         self._send(
             FtpMessage(

@@ -95,7 +95,7 @@ class LogDownload(Transfer[int]):
         end = message.ofs + message.count
         is_end_too_early = message.count < LOG_BLOCK and end < self._size
         if is_end_too_early:
-            self._end_early(end)
+            self._on_short_block(end)
         else:
             self._on_block(message, now)
         if not self.done:
@@ -135,9 +135,9 @@ class LogDownload(Transfer[int]):
             self._report_progress(now, self._reassembly.done, self._size)
         self._requests.on_answer(offset, now)
 
-    def _end_early(self, end: int) -> None:
-        # The vehicle has sent a short block before the end of the log, because it could not read its own log. This may
-        # be temporary, so the data is requested again a few times.
+    def _on_short_block(self, end: int) -> None:
+        """Process the end of a block that is short although the log is longer: fail only after some of them."""
+        # The vehicle could not read its own log. This may be temporary, so the data is requested again a few times.
         self._is_streaming = False
         self._early_ends += 1
         if self._early_ends >= MAX_EARLY_ENDS:
@@ -268,7 +268,7 @@ LAST_ID = 0xFFFF
 
 
 class LogList(Transfer[tuple[LogEntry, ...]]):
-    """Requests the entries of the logs with ids from ``start`` (None: the first) to ``end`` (None: the last).
+    """Requests the entries of the logs with ids from ``from_id`` (None: the first) to ``to_id`` (None: the last).
 
     Args:
         first_id: the id of this autopilot's oldest log.
@@ -283,24 +283,24 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         target_component: int,
         *,
         first_id: int,
-        start: int | None = None,
-        end: int | None = None,
+        from_id: int | None = None,
+        to_id: int | None = None,
         max_unanswered: int | None = None,
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._first_id = first_id
-        self._start = first_id if start is None else start
-        self._end = end
+        self._from_id = first_id if from_id is None else from_id
+        self._to_id = to_id
         self._max_unanswered = max_unanswered
         self._entries: dict[int, LogEntry] = {}
         self._missing: dict[int, None] | None = None  # ids of the missing entries; None before the first entry
         self._stream = MessageStream(self.round_trip)
-        self._last_id = 0
+        self._last_id = 0  # the id of the last entry or, after a request, the first requested id
 
     def start(self, now: float) -> None:
         self._start_clock(now)
-        self._request(now, self._start, LAST_ID if self._end is None else self._end)
+        self._request(now, self._from_id, LAST_ID if self._to_id is None else self._to_id)
 
     def receive(self, message: Message, now: float) -> None:
         if self.done or not isinstance(message, LogEntry) or not self._is_from_target(message):
@@ -331,16 +331,16 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
             self._fail(self._timed_out())
             self._outbox.append(LogRequestEnd(self.target_system, self.target_component))
         elif self._missing is None:
-            self._request(now, self._start, LAST_ID if self._end is None else self._end)
+            self._request(now, self._from_id, LAST_ID if self._to_id is None else self._to_id)
         else:
             self._request_missing(now)
 
     def _expect(self, entry: LogEntry) -> None:
         """Determine the ids of the requested logs from the first entry, which contains the number of all logs."""
         last = self._first_id + entry.num_logs - 1
-        if self._end is not None:
-            last = min(last, self._end)
-        self._missing = dict.fromkeys(range(self._start, last + 1))
+        if self._to_id is not None:
+            last = min(last, self._to_id)
+        self._missing = dict.fromkeys(range(self._from_id, last + 1))
 
     def _request_missing(self, now: float) -> None:
         assert self._missing
@@ -358,7 +358,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     def _timed_out(self) -> FileTimeout:
         if self._missing is None:
-            return FileTimeout("log list: the vehicle does not answer", missing=((self._start, 0),))
+            return FileTimeout("log list: the vehicle does not answer", missing=((self._from_id, 0),))
         missing = tuple((number, 1) for number in self._missing)
         text = f"log list: the entries of logs {format_ranges(self._missing)} were not received"
         return FileTimeout(text, missing=missing)

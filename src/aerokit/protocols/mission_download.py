@@ -174,8 +174,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._reject(result)
 
     def _wait_while_busy(self, result: int, now: float) -> None:
-        # ArduPilot refuses a download while it waits for items of an upload. It drops an upload that has become silent
-        # after 8 s, so the download is retried for a little longer.
+        # ArduPilot refuses a download while it waits for items of an upload. After 8 s of silence, it drops the upload,
+        # so the download is retried for a little longer.
         if self._busy_until is None:
             self._busy_until = now + BUSY_TIMEOUT_S
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
@@ -251,12 +251,14 @@ class MissionDownload(MissionExchange[DownloadResult]):
     def _time_out(self, now: float) -> None:
         """Cancel the download and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
-        missing = [seq for seq in self._indices if seq not in self._items]
-        details = "no MISSION_COUNT was received" if self._count is None else f"missing: {format_ranges(missing)}"
+        # Numbered as the caller does, without home.
+        missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)
+        has_count = bool(self._indices)  # `_count` is None after a restart
+        details = f"missing: {format_ranges(missing) or 'home'}" if has_count else "no MISSION_COUNT was received"
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the download:"
                 f" {details}; nothing new for {now - self._progress_at:.1f} s",
-                missing=tuple(seq - self.offset for seq in missing if seq >= self.offset),
+                missing=missing,
             )
         )

@@ -46,8 +46,8 @@ class UploadResult(Snapshot):
 class MissionUpload(MissionExchange[UploadResult]):
     """Uploads a plan: sends MISSION_COUNT, then the items that the vehicle requests.
 
-    If ``first`` is given, the upload begins with MISSION_WRITE_PARTIAL_LIST instead, and replaces the items from
-    ``first`` on. ``supports_int`` is False for a vehicle that does not accept MISSION_ITEM_INT.
+    If ``first`` is given, the upload begins with MISSION_WRITE_PARTIAL_LIST instead, and replaces as many
+    items as are given, from ``first`` on. ``supports_int`` is False if the vehicle does not accept MISSION_ITEM_INT.
 
     With a ``window`` above 1, items are sent before they are requested, so that one round trip carries several items.
     ArduPilot and PX4 accept the next item even if their request for it was lost, and request items that they miss. A
@@ -92,14 +92,14 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._reset()
 
     def _reset(self) -> None:
-        self._is_accepted = False
+        self._is_requesting = False  # True once the vehicle has requested an item after the latest announcement
         self._confirmed_end = self._first  # The vehicle has all items before this one.
         self._sent_end = self._first  # All items before this one were sent at least once.
         self._sent_at: dict[int, float] = {}
         self._send_counts: dict[int, int] = {}
         self._requested: set[int] = set()  # items that the vehicle has requested at least once
         self._error_at: float | None = None  # time of the first ERROR, which is answered by repeating an item
-        self._was_tail_repeated = False
+        self._was_tail_repeated = False  # True if several items at the end were repeated; see `_send_window`
         self._attempt = 1
 
     @property
@@ -128,7 +128,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._received_at = now
         if isinstance(message, MissionAck):
             # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
-            has_expired = self._is_accepted and silence_s >= TRANSFER_EXPIRY_S
+            has_expired = self._is_requesting and silence_s >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
                 self._restart(now)
             else:
@@ -142,7 +142,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._time_out(now)
             return
         self._attempt += 1
-        if not self._is_accepted:
+        if not self._is_requesting:
             self._announce(now)
         elif self._sent_end < self._end:
             may_send_ahead = self._window > 1  # Otherwise, no item is sent before the vehicle requests it.
@@ -156,7 +156,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def link_changed(self, now: float) -> None:
         """Announce the items again, because PX4 accepts items only over the port that received MISSION_COUNT."""
-        if self._is_accepted and not self._is_partial and not self.done:
+        if self._is_requesting and not self._is_partial and not self.done:
             self._reset()
             self._announce(now)
 
@@ -167,8 +167,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         # The vehicle never skips an item, so a request beyond the next item belongs to another transfer.
         if seq > self._sent_end:
             return
-        if not self._is_accepted:
-            self._is_accepted = True
+        if not self._is_requesting:
+            self._is_requesting = True
             self.was_started = True
             self._busy_until = None
             self._report_progress(now, 0, len(self._items))
@@ -176,7 +176,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._advance(seq, now)
         elif seq < self._confirmed_end:
             # The vehicle has restarted the transfer, or this is a delayed request.
-            self._send(seq, now, again=True)
+            self._send(seq, now, unless_in_flight=True)
         elif seq in self._requested:
             self._send_window(now)  # The item was lost, and the vehicle has ignored the items after it.
         self._requested.add(seq)
@@ -205,10 +205,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
-            if self._is_accepted and self._sent_end == self._end:
+            if self._is_requesting and self._sent_end == self._end:
                 self._succeed(now, is_confirmed=not self._was_tail_repeated, opaque_id=ack.opaque_id)
         elif result == MavMissionResult.INVALID_SEQUENCE:
-            if self._is_accepted:
+            if self._is_requesting:
                 # The vehicle already has the item that was sent, or an item before it was lost.
                 self._send_window(now, ahead=1)
                 if self._outbox:  # If nothing was sent, the present deadline stays.
@@ -218,56 +218,60 @@ class MissionUpload(MissionExchange[UploadResult]):
         elif result == MavMissionResult.ERROR and not self._is_partial_refusal:
             self._on_error(now)
         else:
-            self._refuse(result)
+            self._fail_as_refused(result)
 
     @property
     def _is_partial_refusal(self) -> bool:
         """True if an ERROR refuses MISSION_WRITE_PARTIAL_LIST."""
-        return self._is_partial and not self._is_accepted
+        return self._is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
         """Process an ERROR that may be temporary: repeat an item first, and end the upload after a second ERROR."""
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
         # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
-        # therefore repeated.
-        if not self._is_accepted:
+        # therefore repeated. A second ERROR that arrives within a round trip may answer what was sent before the
+        # repetition, so it is ignored.
+        if not self._is_requesting:
             self._wait_while_busy(now)
         elif self._error_at is None:
             self._error_at = now
             are_all_sent = self._sent_end == self._end
             seq = self._end - 1 if are_all_sent else self._confirmed_end
-            self._send(seq, now, again=True)
+            self._send(seq, now, unless_in_flight=True)
             self._wait(now)
         elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
             if self._sent_end == self._end:
                 # All items were sent, so the upload may be complete. The caller must read the plan back.
                 self._succeed(now, is_confirmed=False, opaque_id=0)
             else:
-                self._refuse(MavMissionResult.ERROR)
+                self._fail_as_refused(MavMissionResult.ERROR)
 
     def _wait_while_busy(self, now: float) -> None:
+        """Announce the items again later, as long as the vehicle may be busy. Then fail with its refusal."""
         if self._busy_until is None:
             self._busy_until = now + BUSY_TIMEOUT_S
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
-            self._refuse(MavMissionResult.ERROR)
+            self._fail_as_refused(MavMissionResult.ERROR)
         else:
             self._progress_at = now  # The vehicle answers, so the transfer must not time out as idle.
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, now: float) -> None:
         """Begin again, because the vehicle's transfer has expired or was cancelled."""
-        if not self._is_accepted:  # The vehicle has cancelled an older transfer, not this one.
+        if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
             return
+        # A partial upload does not begin again, because some of the old items may already have been replaced.
         if self._is_partial or self._restarts >= MAX_RESTARTS:
-            self._refuse(MavMissionResult.OPERATION_CANCELLED)
+            self._fail_as_refused(MavMissionResult.OPERATION_CANCELLED)
             return
         self._restarts += 1
         self._reset()
         self._announce(now)
 
-    def _refuse(self, result: int) -> None:
+    def _fail_as_refused(self, result: int) -> None:
+        """Fail with a MAV_MISSION_RESULT of the vehicle."""
         self.is_refusal_ambiguous = self._sent_end - self._confirmed_end > 1
-        self._reject(result, seq=self._confirmed_end if self._is_accepted else None)
+        self._reject(result, seq=self._confirmed_end if self._is_requesting else None)
 
     def _succeed(self, now: float, *, is_confirmed: bool, opaque_id: int) -> None:
         self._report_progress(now, len(self._items), len(self._items))
@@ -277,13 +281,15 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _time_out(self, now: float) -> None:
         """Cancel the upload and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
-        missing = range(max(self._confirmed_end, self.offset), self._end)
-        details = f"items {format_ranges(missing)} were not confirmed" if self._is_accepted else "no item was requested"
+        # Numbered as the caller does, without home.
+        missing = tuple(range(max(self._confirmed_end - self.offset, 0), self._end - self.offset))
+        unconfirmed = f"items not confirmed: {format_ranges(missing) or 'home'}"
+        details = unconfirmed if self.was_started else "no item was requested"
         self._fail(
             MissionTimeout(
                 f"{self.kind}: the vehicle fell silent during the upload: {details}"
                 f"; nothing new for {now - self._progress_at:.1f} s after {self._attempt} attempts",
-                missing=tuple(seq - self.offset for seq in missing),
+                missing=missing,
             )
         )
 
@@ -307,16 +313,17 @@ class MissionUpload(MissionExchange[UploadResult]):
         The vehicle's requests for these items may have been lost.
         """
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # PX4 takes any repeated item for the mission's last item and confirms the upload. This confirmation does
-            # not prove that PX4 has all items.
+            # Not only the last item is repeated. PX4 takes any repeated item for the mission's last item, and confirms
+            # the upload. This confirmation does not prove that PX4 has all items.
             self._was_tail_repeated = True
+        # One more than the window, because the vehicle may already have the first unconfirmed item.
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)
         for seq in range(self._confirmed_end, max(self._sent_end, new_end)):
-            self._send(seq, now, again=True)
+            self._send(seq, now, unless_in_flight=True)
 
-    def _send(self, seq: int, now: float, *, again: bool = False) -> None:
-        """Send one item. With ``again``, it is not sent if an earlier transmission may still be answered."""
-        if again and self._is_in_flight(seq, now):
+    def _send(self, seq: int, now: float, *, unless_in_flight: bool = False) -> None:
+        """Send one item; with ``unless_in_flight``, only if no earlier transmission may still be answered."""
+        if unless_in_flight and self._is_in_flight(seq, now):
             return
         make_message = to_wire_float if self._as_float else to_wire
         self._outbox.append(

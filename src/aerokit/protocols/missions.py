@@ -192,7 +192,7 @@ class SetCurrentItem(Transfer[None]):
     item, this also counts as confirmation.
 
     With an ``order_status``, a retry waits for a HEARTBEAT that is newer than the last transmission. Retries stop when
-    the order has ended.
+    ``order_status.end`` says that the order must not be sent any more.
     """
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
@@ -247,12 +247,12 @@ class SetCurrentItem(Transfer[None]):
             self._send(now)
 
     def _has_passed(self, seq: int) -> bool:
-        """Return True if the vehicle can only be at item ``seq`` because it has set and then passed our item."""
-        last = self._reported
-        if last is None:
+        """Return True if ``seq`` shows that the vehicle went to our item and has already left it."""
+        before = self._reported
+        if before is None:
             return False
-        has_moved_on = last <= self._seq < seq
-        has_jumped_back = self._seq < seq < last  # The vehicle went back to our item, and has passed it since.
+        has_moved_on = before <= self._seq < seq
+        has_jumped_back = self._seq < seq < before  # The vehicle went back to our item, and has passed it since.
         return has_moved_on or has_jumped_back
 
     def _send(self, now: float) -> None:

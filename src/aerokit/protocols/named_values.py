@@ -153,7 +153,7 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         super().__init__(target_system, target_component, **options)
         self._names = tuple(dict.fromkeys(names))
         self._window: RequestWindow[str] = RequestWindow(self.round_trip, size=window, duplicate_last=duplicate_last)
-        self._answers: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
+        self._results: dict[str, ValueT | ParameterRejected | ParameterTimeout] = {}
         self._sent_at: dict[str, float] = {}
 
     def start(self, now: float) -> None:
@@ -173,8 +173,8 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
             return
         if self._is_idle(now):
             for name in self._names:
-                if name not in self._answers:
-                    self._answers[name] = ParameterTimeout(self._timeout_text(name), missing=(name,))
+                if name not in self._results:
+                    self._results[name] = ParameterTimeout(self._timeout_text(name), missing=(name,))
         self._step(now)
 
     @abstractmethod
@@ -197,15 +197,15 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _settle(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
         """Record the final answer for a name."""
         self._window.discard(name)
-        self._answers[name] = answer
-        self._report_progress(now, len(self._answers), len(self._names))
+        self._results[name] = answer
+        self._report_progress(now, len(self._results), len(self._names))
 
     def _step(self, now: float) -> None:
         """Finish, or send the requests that are due. Called after each message and at each deadline."""
-        if len(self._answers) < len(self._names):
+        if len(self._results) < len(self._names):
             self._before_sending(now)  # This call may settle the last names.
-        if len(self._answers) == len(self._names):
-            self._finish({name: self._answers[name] for name in self._names})
+        if len(self._results) == len(self._names):
+            self._finish({name: self._results[name] for name in self._names})
             return
         for name in self._window.take_due(now):
             self._outbox += self._request(name)
@@ -223,7 +223,7 @@ class NamedReads(NamedRequests[ValueT]):
     """
 
     unknown_text: ClassVar[str]  # for example "the vehicle has no parameter"
-    _is_probe_wanted = False
+    _is_probe_wanted = False  # True if `PROBE` is requested together with the next requests
     _probes_sent = 0
     _probes_answered = 0
 
@@ -250,7 +250,7 @@ class NamedReads(NamedRequests[ValueT]):
         # There cannot be more answers than requests, so further answers are duplicates.
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 
-    def _reject_unknown(self, names: Iterable[str], now: float) -> None:
+    def _reject_if_requested_often(self, names: Iterable[str], now: float) -> None:
         """Reject those of the unanswered names that were requested so often that a loss of all answers is unlikely."""
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:

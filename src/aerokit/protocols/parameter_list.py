@@ -24,8 +24,9 @@ __all__ = ["ParameterList", "merge_update"]
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
     """Merge a PARAM_VALUE that is not part of a list into a known parameter.
 
-    If values are not sent bytewise, the message has less information than a list or a file. In its answer to PARAM_SET,
-    ArduPilot reports an integer as a float if the value is the default. An INT32 beyond 2**24 loses its last bits.
+    If values are not sent bytewise, the message may have the wrong type: in its answer to PARAM_SET, ArduPilot reports
+    an integer as a float if the value is the default. The message may also have a rounded value: an INT32 beyond 2**24
+    loses its last bits. The known type or value is then kept.
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
@@ -39,7 +40,7 @@ def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Param
 
 
 # Maximum seconds between two parts of a list. ArduPilot sends parts ten times a second, or once a second (MAV1_PARAMS).
-MAX_TICK_S = 1.1
+MAX_PART_INTERVAL_S = 1.1
 
 # Once at most this many values are missing, they are requested immediately, without waiting for the end of the stream.
 # A few values may then arrive twice, which costs little.
@@ -59,7 +60,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     """Download of all parameters: requests the list once, then missing indices as soon as a gap appears.
 
     The vehicle reports the number of parameters. If this number changes during the transfer, indices shift: ArduPilot
-    reveals a group of parameters when the group is enabled, PX4 counts a parameter once it is used. If a name then has
+    reveals a group of parameters when the group is enabled, PX4 counts only the parameters in use. If a name then has
     two indices or none, values received before the change are requested again. Values with index 65535 are not part of
     the list.
 
@@ -76,11 +77,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._bytewise = bytewise
-        self._names: dict[str, Parameter] = {}  # by name: the parameter with its latest value
+        self._parameters: dict[str, Parameter] = {}  # by name: the parameter with its latest value
         self._refusals: dict[int, int] = {}  # by index: number of PARAM_ERROR messages
         self._count_in_stream: int | None = None  # number of parameters that the stream's last message reported
         self._must_request_missing = False
-        self._streamed_values = 0  # number of values received from the stream
+        self._streamed_count = 0  # number of values received from the stream
 
     # ---------------------------------------------------------------------------- as an exchange
 
@@ -122,21 +123,21 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         if self._is_streaming and (is_streamed or not self._is_near_end):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
-        if parameter.name not in self._names and len(self._names) >= MAX_PARAMETERS:
+        if parameter.name not in self._parameters and len(self._parameters) >= MAX_PARAMETERS:
             return  # A faulty vehicle must not fill the memory.
-        self._names[parameter.name] = parameter
+        self._parameters[parameter.name] = parameter
         self._store(index, parameter, message.param_count, now)
 
     def _on_uncounted_value(self, message: ParamValue, now: float) -> None:
-        # The value is not part of the list. Either another client has set the parameter, or the value is PX4's hash of
-        # all parameters, after which the list starts.
+        # The value has no index, so it is not a part of the list. Either another client has set the parameter, or the
+        # value is PX4's hash of all parameters, after which the list starts.
         self._record_count(message.param_count, is_streamed=False)
         if message.param_id == HASH_NAME:
             self._last_at = now
             self._quiet_at = (now + self._quiet_s()) if self._is_streaming else None
-        elif message.param_id in self._names:
+        elif message.param_id in self._parameters:
             reported = parameter_of(message, self._bytewise)
-            self._names[reported.name] = merge_update(self._names[reported.name], reported, self._bytewise)
+            self._parameters[reported.name] = merge_update(self._parameters[reported.name], reported, self._bytewise)
 
     def _on_refusal(self, message: ParamError) -> None:
         # The error means that the list has become shorter. Only the index in the message is used, because PX4 does not
@@ -167,10 +168,10 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         """Request missing indices before this one, and measure the pauses of the stream."""
         for missing in range(self._next_index, min(index, self._count or 0)):
             self._window.request(missing)
-        if self._streamed_values:
+        if self._streamed_count:
             self._pause_s = max(now - self._last_at, PAUSE_DECAY * self._pause_s)
         self._next_index = index + 1
-        self._streamed_values += 1
+        self._streamed_count += 1
         self._last_at = now
         if index == 0:  # `start` may have requested this value to measure the round trip.
             self._window.on_answer(0, now)
@@ -189,7 +190,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
 
     def _on_quiet(self, now: float) -> None:
         is_short_list = self._count is not None and self._count <= MIN_STREAMED
-        has_started = self._streamed_values >= MIN_STREAMED or is_short_list
+        has_started = self._streamed_count >= MIN_STREAMED or is_short_list
         if has_started:
             self._end_stream()
         else:
@@ -206,10 +207,10 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         Answers to requests also count as messages, because they delay the stream.
         """
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
-        if self._streamed_values < MIN_STREAMED:  # A single value may be the answer to our request by index.
+        if self._streamed_count < MIN_STREAMED:  # A single value may be the answer to our request by index.
             return max(seconds, MIN_START_TIMEOUT_S)
-        # Near the end, waiting for a further tick of the vehicle would take longer than requesting the rest.
-        return seconds if self._is_near_end else max(seconds, MAX_TICK_S)
+        # Near the end, waiting for a further part of the list would take longer than requesting the rest.
+        return seconds if self._is_near_end else max(seconds, MAX_PART_INTERVAL_S)
 
     @property
     def _is_near_end(self) -> bool:
@@ -235,19 +236,19 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         if len(parameters) != count:  # Some received indices are not below the count, which has decreased.
             return
         names = {parameter.name for parameter in parameters}
-        is_consistent = len(names) == count == len(self._names)  # Each name has exactly one index, and vice versa.
+        is_consistent = len(names) == count == len(self._parameters)  # Each name has exactly one index, and vice versa.
         if not is_consistent and self._drop_stale(count):
             self._must_request_missing = True
         else:
             self._finish(ParameterTable(self._in_order(parameters, names)))
 
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
-        """Sort parameters by index, each name once with its latest value. Names without an index come last."""
+        """Number the parameters of the list, each name once with its latest value. Names without an index come last."""
         ordered = dict.fromkeys(parameter.name for parameter in parameters)
         if self._refreshes == 0:  # After a change of the list, names without an index may no longer exist.
-            ordered.update(dict.fromkeys(name for name in self._names if name not in names))
+            ordered.update(dict.fromkeys(name for name in self._parameters if name not in names))
         table = []
         for index, name in enumerate(ordered):
-            latest = self._names[name]
+            latest = self._parameters[name]
             table.append(Parameter(name, latest.value, latest.type, index=index))
         return table

@@ -127,18 +127,18 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             own_system=own_system,
             **options,
         )
-        self._probe = probe
+        self._may_probe = probe
         self._is_probe_wanted = probe
         self._possibly_stale = dict(possibly_stale)
-        self._refused: set[str] = set()
+        self._refused_once: set[str] = set()
         self._alternatives = {name: tuple(other_names) for name, other_names in alternatives.items()}
 
     def _read_request(self, name: str, index: int) -> Message:
         return ParamRequestRead(self.target_system, self.target_component, name, index)
 
     def _before_sending(self, now: float) -> None:
-        if self._probe and (overdue := self._overdue(now)):
-            self._reject_unknown(overdue, now)
+        if self._may_probe and (overdue := self._overdue(now)):
+            self._reject_if_requested_often(overdue, now)
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
@@ -148,7 +148,7 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._count_probe()
             overtaken = self._window.on_answer(PROBE, now, overtaken=1)
             if overtaken:
-                self._reject_unknown(overtaken, now)
+                self._reject_if_requested_often(overtaken, now)
                 self._is_probe_wanted = True
         name = message.param_id
         if name and name in self._window:
@@ -163,16 +163,16 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
 
     def _reject_alternatives(self, name: str, now: float) -> None:
         for alternative in self._alternatives.get(name, ()):
-            if alternative in self._names and alternative not in self._answers:
+            if alternative in self._names and alternative not in self._results:
                 text = f"the vehicle has no parameter {alternative}; its name on this vehicle is {name}"
                 self._settle(alternative, ParameterRejected(text, name=alternative), now)
 
     def _on_error(self, message: ParamError, now: float) -> None:
         # PX4 also answers DOES_NOT_EXIST if it has no room to send the value. The request is therefore repeated once.
         name = message.param_id
-        is_first = name in self._names and name in self._window and name not in self._refused
+        is_first = name in self._names and name in self._window and name not in self._refused_once
         if is_first and message.error == MavParamError.DOES_NOT_EXIST:
-            self._refused.add(name)
+            self._refused_once.add(name)
             self._window.on_answer(name, now)
             self._window.request(name)
         else:
@@ -187,9 +187,9 @@ class ParameterWrites(ParameterRequests):
     """Set some parameters. The result has the value that each parameter has afterwards, as the vehicle reports it.
 
     An answer with the requested value and type completes a write. If no answer arrives, the value is read. PARAM_SET is
-    sent again only if the vehicle still reports ``before``, the last known value. Any other value that it reports twice
-    is the result: the vehicle rounded or clamped the value, or another station set it. Retries are therefore bounded,
-    and a later change by another station is not undone.
+    sent again only if the vehicle still reports ``before``, the last known value, or if that is unknown. If the vehicle
+    keeps reporting it, it becomes the result. Any other value that it reports twice is the result as well: the vehicle
+    rounded or clamped the value, or another station set it. A later change by another station is therefore not undone.
 
     ``recent`` has names that an earlier call has just written. Answers to the earlier write may still arrive, so the
     first matching answer is verified by another read.
@@ -245,30 +245,30 @@ class ParameterWrites(ParameterRequests):
             return  # The message answers another station, because our write of the name was not sent yet.
         requested = self._requested[name]
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
-        unexpected = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
+        answers = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recent:
             # The message may be the late answer to the earlier write, so the value is read once more.
             self._recent.remove(name)
-            unexpected.add(reported)
+            answers.add(reported)
             self._window.on_answer(name, now)
             self._window.request(name)
             return
         # The requested value with another type must be reported twice.
-        if is_as_requested and (reported.type == requested.type or unexpected.ends_with(reported)):
+        if is_as_requested and (reported.type == requested.type or answers.ends_with(reported)):
             self._window.on_answer(name, now)
             self._settle(name, reported, now)
             return
         sent_at = self._sent_at.get(name, now)
         if self._stale_answers.is_stale(name, sent_at, now, attempts=self._window.attempts(name)):
             return
-        unexpected.add(reported)
+        answers.add(reported)
         self._window.on_answer(name, now)
-        before = self._before.get(name)  # None if unknown; the reported value may then be the old one
-        is_unchanged = before is None or same_value(reported.value, before)
-        if is_unchanged and not is_as_requested:
-            self._to_set.add(name)  # The value is still the old one, so PARAM_SET is sent again.
-        if unexpected.are_conclusive(is_unchanged=is_unchanged):
+        before = self._before.get(name)  # None if unknown
+        may_be_unchanged = before is None or same_value(reported.value, before)
+        if may_be_unchanged and not is_as_requested:
+            self._to_set.add(name)  # The value may still be the old one, so PARAM_SET is sent again.
+        if answers.are_conclusive(is_unchanged=may_be_unchanged):
             self._settle(name, reported, now)
         else:
             self._window.request(name)

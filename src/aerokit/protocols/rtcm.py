@@ -62,8 +62,11 @@ def rtcm_messages(data: bytes) -> list[bytes]:
     messages: list[bytes] = []
     begin = 0
     while True:  # `while begin < len(data)` would accept empty data.
-        size = _frame_size(data, begin) if len(data) - begin > HEADER_SIZE else None
+        remaining = len(data) - begin
         subject = f"rtcm (byte {begin} of {len(data)})"
+        if 0 < remaining <= HEADER_SIZE and data[begin] == PREAMBLE:
+            raise InvalidArgument(f"{subject} is not allowed: the message is incomplete: it ends in its header")
+        size = _frame_size(data, begin) if remaining > HEADER_SIZE else None
         if size is None:
             raise InvalidArgument(f"{subject} is not allowed: no RTCM 3 message begins there (all begin with 0xD3)")
         frame = data[begin : begin + size]

@@ -9,6 +9,8 @@ import pytest
 
 import aerokit
 from aerokit.apps.network import Publisher, publishing
+from aerokit.apps.network.mqtt_publisher import parse_broker
+from aerokit.errors import InvalidArgument
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import run_virtual
 
@@ -22,6 +24,15 @@ class Broken(Publisher):
     def put(self, name: str, data: bytes) -> None:
         self.puts += 1
         raise ConnectionError("the broker has gone")
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [("mqtt:///north/alpha", "the host is missing"), ("mqtt://10.0.0.5:0/north/alpha", "the port must not be 0")],
+)
+def test_broker_address_error_names_the_wrong_part(address: str, reason: str) -> None:
+    with pytest.raises(InvalidArgument, match=reason):
+        parse_broker(address)
 
 
 def test_publisher_error_does_not_end_connection(caplog: pytest.LogCaptureFixture) -> None:

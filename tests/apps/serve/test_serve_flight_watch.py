@@ -201,7 +201,7 @@ def sinking(from_m: float, brake_m_s2: float, stop_m: float, top_m_s: float = 9.
 def test_flying_vehicle_that_brakes_is_no_crash(brake_m_s2: float, stop_m: float, expected: bool) -> None:
     flight = FakeFlight()
     assert flight.fly(sinking(40 + stop_m, brake_m_s2, stop_m)) is expected
-    assert bool(flight.watch._impact.describe()) is (brake_m_s2 > 4)
+    assert bool(flight.watch._detector.describe()) is (brake_m_s2 > 4)
 
 
 def test_vehicle_that_moves_on_after_impact_is_no_crash() -> None:

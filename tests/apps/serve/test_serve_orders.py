@@ -133,6 +133,16 @@ async def test_hostile_requests_are_refused(content: bytes, headers: dict[str, s
         assert stage.flight.wire.commands(MavCmd.NAV_TAKEOFF) == []
 
 
+@pytest.mark.parametrize("seen_at", ["-100", "1e9"])
+async def test_state_of_another_time_is_refused_without_claiming_its_age(seen_at: str) -> None:
+    """An ``at_s`` in the future is that of another server, so it is not older than any limit."""
+    async with open_stage() as stage:
+        headers = {**BEARER, "Idempotency-Key": "12345678", "Host": HOST, "Aerokit-Seen-At": seen_at}
+        answer = await stage.client.post("/api/vehicles/1/take_off", json={"altitude_m": 10}, headers=headers)
+        assert answer.status_code == 409
+        assert "the client's state of the vehicle is not from the last 5 s; nothing was sent" in answer.text
+
+
 @pytest.mark.parametrize(
     ("order", "content"),
     [

@@ -65,9 +65,9 @@ def test_silence_at_the_end_is_in_summary(silent: FlightLog) -> None:
     text = summary_of(silent)
     assert text.startswith("Nothing was received from the vehicle for ")
     assert "on, until the log ends; it was last 20.0 m above home in GUIDED." in text.splitlines()[0]
-    assert "if it lost the ground station too: FS_GCS_ENABLE = 5 (lands)" in text
+    assert "If the vehicle also lost the ground station, it reacts as configured: FS_GCS_ENABLE = 5 (lands)" in text
     assert "20.0 m above home in GUIDED, " in text
-    assert "s before its end: the rest of the flight, and with it a landing or a crash, was not recorded" in text
+    assert "s before: the rest of the flight, and with it a landing or a crash, was not recorded" in text
 
 
 def test_loss_curve_of_silence_reaches_end_of_log(silent: FlightLog) -> None:

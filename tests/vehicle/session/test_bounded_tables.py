@@ -46,7 +46,7 @@ def test_subject_names_match() -> None:
     exchange.start(0.0)
     for number in range(MAX_PARAMETERS + 100):
         exchange.receive(ParamValue(f"P{number}", 1.0, 9, 65535, number % 10), 0.0)
-    assert len(exchange._names) == MAX_PARAMETERS
+    assert len(exchange._parameters) == MAX_PARAMETERS
 
 
 def test_parameter_beyond_table_limit_is_not_requested_repeatedly() -> None:

@@ -10,7 +10,7 @@ from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, connect_to, signing_of
 from aerokit.apps.cli.flight_recording import record_parameters, record_to_end
 from aerokit.apps.cli.output import DONE, FAILED, INTERRUPTED, add_json, emit, new_recording
-from aerokit.apps.cli.sim import faults_begin, simulated_vehicle
+from aerokit.apps.cli.sim import injecting_faults, simulated_vehicle
 from aerokit.apps.cli.supervised_flight import FlightReport, SupervisedFlight
 from aerokit.apps.cli.terminal import InterruptStack, on_interrupt
 from aerokit.errors import AerokitError, InvalidArgument, NotSupported, OperationRejected
@@ -94,7 +94,7 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
         async with report.running():
             flight = _SquareFlight(vehicle, report, interrupts)
             code = await flight.fly_square(options.altitude, options.side)
-            if flight.armed_by_us:
+            if flight.has_sent_arm_command:
                 await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
         report.print_summary(options.record)
     return code
@@ -116,7 +116,7 @@ async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
         text = f"simulated {options.vehicle} on {address}, speed {options.speedup:g}x"
         record = {"system_ids": [vehicle.system_id], "address": address, "speedup": options.speedup}
         emit(options, "simulated", record, text)
-        async with faults_begin([vehicle], options):
+        async with injecting_faults([vehicle], options):
             yield address
 
 
@@ -162,7 +162,7 @@ class _SquareFlight(SupervisedFlight):
         self._print(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
         await self._arm()
         self._print(f"armed; taking off to {altitude_m:g} m")
-        self._has_started = True  # from now on, a mode change by another party ends this program's control
+        self._has_changed_mode = True  # from now on, a mode change by another party ends this program's control
         await vehicle.take_off(altitude_m)
         self._print("at altitude; flying the square")
 

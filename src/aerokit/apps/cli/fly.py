@@ -88,7 +88,7 @@ class PlanFlight(SupervisedFlight):
         try:
             self._print("armed; starting the mission")
             await vehicle.mission.start()
-            self._has_started = True
+            self._has_changed_mode = True
             await vehicle.mission.wait_finished()
         finally:
             progress.cancel()
@@ -172,7 +172,7 @@ class PlanFlight(SupervisedFlight):
         await anyio.sleep(delay_s)
         vehicle = self._vehicle
         is_unexplained = vehicle.mode_name == mode and not self._is_in_our_mode and not vehicle.mission.explains_mode
-        if self._has_started and is_unexplained:
+        if self._has_changed_mode and is_unexplained:
             # The grace period is real time, but the text has the vehicle's time, which a simulation speeds up.
             seconds = self._report.speedup * (END_GRACE_S - delay_s)
             self._print(f"waiting {seconds:.2g} s for the end of {mode} or a report that the mission has ended")
@@ -191,7 +191,7 @@ class PlanFlight(SupervisedFlight):
     def _our_purposes(self) -> tuple[Purpose, ...]:
         # Modes for landing and returning are not included, because a failsafe may have set them. The mode for holding
         # is included only before the start, because a cancelled start of the mission ends in this mode.
-        return ("mission",) if self._has_started else ("mission", "hold")
+        return ("mission",) if self._has_changed_mode else ("mission", "hold")
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -244,7 +244,7 @@ async def run_fly(options: argparse.Namespace) -> int:
         code = await interrupts.run(lambda: _connect_and_fly(options, plan, interrupts, flights))
     if code is None:
         code = INTERRUPTED
-    if code == INTERRUPTED and not any(flight.armed_by_us for flight in flights):
+    if code == INTERRUPTED and not any(flight.has_sent_arm_command for flight in flights):
         sent_text = flights[-1].sent_text if flights else _NOTHING_SENT
         emit(options, "interrupted", {}, f"interrupted; {sent_text}")
     return code
@@ -302,9 +302,9 @@ async def _connect_and_fly(
                 code = FAILED
                 # A failsafe may still land the vehicle, even a simulated one. The recording should contain the landing.
                 continues_recording = True
-            if continues_recording and flight.armed_by_us and options.record is not None:
+            if continues_recording and flight.has_sent_arm_command and options.record is not None:
                 await record_to_end(vehicle, interrupts, report.print_line, report.speedup)
-        if flight.armed_by_us:
+        if flight.has_sent_arm_command:
             report.print_summary(options.record)
         if error is not None:
             raise error
@@ -313,7 +313,7 @@ async def _connect_and_fly(
 
 async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: AsyncExitStack) -> Link:
     """Start a simulated vehicle of the plan's vehicle type, at the place where the mission starts."""
-    from aerokit.apps.cli.sim import faults_begin, simulated_vehicle
+    from aerokit.apps.cli.sim import injecting_faults, simulated_vehicle
     from aerokit.sim import simulated_link
     from aerokit.sim.kinds import scale_timeouts
     from aerokit.sim.motion import HOME
@@ -329,7 +329,7 @@ async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: Asyn
     vehicle = simulated_vehicle(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S, **conditions(options))
     scale_timeouts([vehicle], options.speedup, leave=dict(options.parameters))
     link = await stack.enter_async_context(simulated_link(vehicle, speedup=options.speedup))
-    await stack.enter_async_context(faults_begin([vehicle], options))
+    await stack.enter_async_context(injecting_faults([vehicle], options))
     record = {"system_ids": [vehicle.system_id], "address": link.address, "speedup": options.speedup}
     text = f"simulated {kind} at {latitude_deg:.6f}, {longitude_deg:.6f}, speed {options.speedup:g}x"
     emit(options, "simulated", record, text)

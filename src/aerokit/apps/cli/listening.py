@@ -164,18 +164,18 @@ async def run_events(options: argparse.Namespace) -> int:
 async def _print_all(connection: Connection, options: argparse.Namespace) -> None:
     """Print the events of a connection until it ends, with a countdown before the first event."""
     unix_time_at_0 = connection.unix_time() - connection.now()
-    with connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS) as events:
+    # get() raises an error when the connection ends. The error is suppressed, because await_end() raises it as well.
+    with suppress(AerokitError), connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS) as events:
         missed = 0
         async with waiting(options, connection.link.address, _COUNTDOWN_S):
             event = await events.get()
-        with suppress(AerokitError):  # raised when the connection ends; await_end raises it again
-            while True:
-                if options.all or not isinstance(event, LinkReport):
-                    _emit_event(event, unix_time_at_0 + event.at, options)
-                if events.missed > missed:
-                    emit(options, "missed", {"events": events.missed - missed}, None)
-                    missed = events.missed
-                event = await events.get()
+        while True:
+            if options.all or not isinstance(event, LinkReport):
+                _emit_event(event, unix_time_at_0 + event.at, options)
+            if events.missed > missed:
+                emit(options, "missed", {"events": events.missed - missed}, None)
+                missed = events.missed
+            event = await events.get()
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:

@@ -199,7 +199,9 @@ class Parser(argparse.ArgumentParser):
                 hint = f"; to see the vehicle there: aerokit status {choice}"
             if choice.lower() in _ARMING_WORDS:
                 hint = "; `aerokit fly PLAN`, the web page of `aerokit serve` and Python programs arm and fly a vehicle"
-            message = f"unknown command {choice!r}{hint}; `aerokit` lists them" if is_command else message + hint
+            message = (
+                f"unknown command {choice!r}{hint}; `aerokit` lists the commands" if is_command else message + hint
+            )
         super().error(message)
 
 

@@ -89,7 +89,7 @@ def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) ->
     takes_connect = "--connect" in action_parser._option_string_actions
     address_words = ["--connect", address] if takes_connect else [address]
     line = shlex.join([*parser.prog.split(), action, *address_words, *arguments])
-    return f"{address!r} is an address, but an action comes first: {line}"
+    return f"{address!r} is an address; put it after the action: {line}"
 
 
 def _takes_value(parser: argparse.ArgumentParser, option: str) -> bool:

@@ -70,7 +70,10 @@ def plan_warnings(plan: Plan) -> list[str]:
 
 
 def _altitude_warnings(plan: Plan) -> list[str]:
-    """Return warnings about altitudes below home, which are usual only for submarines and for landings."""
+    """Return warnings about take-offs to 0 m, and about altitudes below home.
+
+    Altitudes below home are usual only for submarines and for landings.
+    """
     from aerokit.missions.item import canonical_frame
 
     if plan.vehicle_type == MavType.SUBMARINE:
@@ -78,8 +81,8 @@ def _altitude_warnings(plan: Plan) -> list[str]:
     warnings = []
     for index, item in enumerate(plan.mission.items):
         is_take_off = item.command in _TAKE_OFFS
-        # A take-off has an altitude even without a position. In other commands without a position, z is no altitude.
         is_relative_to_home = canonical_frame(item.frame) == MavFrame.GLOBAL_RELATIVE_ALT
+        # A take-off has an altitude even without a position. In other commands without a position, z is no altitude.
         has_altitude = is_relative_to_home and (is_take_off or item.position is not None)
         is_too_low = item.z < 0.0 or (is_take_off and item.z == 0.0)
         if has_altitude and is_too_low and item.command not in _LANDINGS:
@@ -111,7 +114,7 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
     """Upload the parts that the plan contains. Other parts on the vehicle stay unchanged.
 
     Raises:
-        InvalidArgument: a position is farther away than ``--max-distance-m``. The text names its item.
+        InvalidArgument: a position is farther than ``--max-distance-m`` from the vehicle. The text names its item.
     """
     for part in PARTS:
         content = getattr(plan, part)

@@ -106,7 +106,7 @@ def plain_text(error: BaseException) -> str:
     """Return the text of an error, in which the name of the call that raised it is replaced by words for users.
 
     ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Reasons
-    that only announce a mission item are left out.
+    that only announce a mission item, such as ``Mission: 3 WP``, are left out.
     """
     text = _MISSION_REASON.sub("", str(error))
     call = _CALL.match(text)
@@ -119,7 +119,10 @@ def plain_text(error: BaseException) -> str:
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Within the block, print aerokit's warnings without advice on code, which does not help users of a command."""
+    """Within the block, print aerokit's warnings without their source lines, and reword its log messages.
+
+    Users of a command have no code to change.
+    """
     import logging
     import warnings
 
@@ -142,7 +145,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _rewrite_for_commands(record: logging.LogRecord) -> bool:
-    """Logging filter that rewords warnings about the code of a program, which users of a command do not see."""
+    """Logging filter that rewords advice to change code, because users of a command have no code to change."""
     if str(record.msg).startswith("the async with block of vehicle %d was left: "):
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
@@ -211,7 +214,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def _requirement(extra: str) -> str:
-    """Return the argument for pip that adds an extra to this installation, from the source of the installation."""
+    """Return the pip argument that installs this package with an extra, from the source it was installed from."""
     from importlib.metadata import PackageNotFoundError, distribution
 
     try:
@@ -264,10 +267,11 @@ def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Check that a recording can be written. After the block, delete it if it is new and empty.
+    """Check that a recording can be written. After the block, delete it if it is empty.
 
-    The connection creates the file. It renames an existing file to a numbered name
-    (`aerokit.connection.frame_observers.keep_existing`). If ``path`` is None, nothing is done.
+    The connection creates the file when the first frame arrives, and renames an existing file to a numbered name
+    (`aerokit.connection.frame_observers.keep_existing`). A file that existed before the block is never deleted. If
+    ``path`` is None, nothing is done.
 
     Raises:
         PermissionError: the folder is not writable.

@@ -309,7 +309,7 @@ def _emit_results(
 ) -> int:
     """Print a line for each result, and return the exit code. ``known`` are names for suggestions.
 
-    The exit code is that of the first error with a code of its own, as for ``get``. If there is none, it is FAILED
+    The exit code is that of the first error whose code is not FAILED, as for ``get``. If there is none, it is FAILED
     after any error, or if a value differs from the requested value by more than rounding.
     """
     code = DONE

@@ -86,7 +86,7 @@ async def metadata_for_check(
 
 
 async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
-    """Return the vehicle's metadata; None, with a message on stderr, if it cannot be read."""
+    """Return the vehicle's metadata. Return None if it provides none or, with a message on stderr, if reading fails."""
     from aerokit.parameters.metadata import parse_metadata
 
     problem = f"time-out after {_READ_TIMEOUT_S:g} s"  # unless reading fails before the time-out

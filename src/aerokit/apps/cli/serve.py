@@ -29,7 +29,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=_run)
     add_address(command, what="address of the vehicles: ")
     command.add_argument(
-        "--sim", nargs="?", type=count, const=1, metavar="N", help="serve N simulated copters (1) instead"
+        "--sim", nargs="?", type=count, const=1, metavar="N", help="serve N simulated copters instead (--sim alone: 1)"
     )
     add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
     add_record(command)
@@ -42,7 +42,8 @@ def _add_web(command: argparse.ArgumentParser) -> None:
     web.add_argument(
         "--host",
         default=_LOOPBACK,
-        help=f"address to listen on ({_LOOPBACK}: this machine only); on others, reading needs the token too",
+        help=f"address to listen on (default: {_LOOPBACK}, for this machine only); on any other address, reading"
+        " needs the token, as orders always do",
     )
     web.add_argument("--port", type=port, default=8080, help="TCP port; 0: any free port (default: 8080)")
     web.add_argument("--token-file", metavar="FILE", help="file with the token (default: a random token at each start)")
@@ -191,7 +192,7 @@ def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
     # Browsers do not send the part after the #, so that the token never reaches a server log.
     page = url if options.read_only and _is_loopback(options.host) else f"{url}#token={app.token}"
-    source = f"{options.sim} simulated" if options.sim else options.address
+    source = f"simulated vehicles: {options.sim}" if options.sim else options.address
     record = {"url": url, "page": page, "token": app.token, "source": source, "read_only": options.read_only}
     emit(options, "serving", record, f"{source}: open {page} in a browser; Ctrl-C stops")
     if not _is_loopback(options.host):

@@ -55,7 +55,8 @@ _CLIENT_SCHEMES = {
     "zenohin": "zenoh",
 }
 
-_SERIAL_END = "the other end of the serial line"
+# Printed instead of an address that only the user knows.
+_SERIAL_LINE_PLACEHOLDER = "the other end of the serial line"
 
 
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
@@ -64,7 +65,8 @@ def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     Kinds without ``boot_text`` ignore this option.
 
     Raises:
-        InvalidArgument: the kind is unknown, or lacks one of the options or parameters.
+        InvalidArgument: the kind is unknown or does not have one of the options, or ``parameters`` (an option) has a
+            name that the kind does not have.
     """
     from aerokit.sim.kinds import kind_class, simulated
 
@@ -142,7 +144,7 @@ def _accepted_options(vehicle_class: type) -> set[str]:
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     command.set_defaults(run=run_sim)
-    kinds = "copter, plane, rover, sub (ArduPilot), px4, px4_plane; or a recording, flight.tlog (copter)"
+    kinds = "copter, plane, rover, sub (ArduPilot), px4, px4_plane; or a recording: flight.tlog (default: copter)"
     add_vehicle_kind(command, kinds)
     command.add_argument(
         "addresses",
@@ -153,7 +155,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="one or more addresses: udpout:127.0.0.1:14550, udpin:0.0.0.0:14550, tcpin:0.0.0.0:5760,"
         " /dev/ttyUSB0,57600, pty (a pseudo-terminal), pty:/tmp/ttyV0. Each address serves all vehicles; a template"
         " gives each vehicle its own address: pty:/tmp/ttyV{n}, udpout:127.0.0.1:{14550+n}; n counts from 0, id is"
-        f" the system id ({DEFAULT_SIM_ADDRESS})",
+        f" the system id (default: {DEFAULT_SIM_ADDRESS})",
     )
     command.add_argument(
         "--count", type=count, default=1, metavar="N", help="number of vehicles, 1 to 250 (default: 1)"
@@ -242,7 +244,7 @@ async def run_sim(options: argparse.Namespace) -> int:
     server = _server(vehicles, options.addresses, options.speedup)
     stop = asyncio.Event()
     with on_interrupt(stop.set):
-        async with server, faults_begin(vehicles, options):
+        async with server, injecting_faults(vehicles, options):
             _emit_addresses(server, options)
             real_duration_s = None if options.duration is None else options.duration / options.speedup
             with suppress(asyncio.TimeoutError):
@@ -258,7 +260,7 @@ async def run_sim(options: argparse.Namespace) -> int:
 
 
 @asynccontextmanager
-async def faults_begin(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> AsyncIterator[None]:
+async def injecting_faults(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> AsyncIterator[None]:
     """Within the block, each fault of ``--fault`` begins at its time."""
     injecting = asyncio.create_task(_inject(vehicles, options))
     try:
@@ -344,11 +346,11 @@ def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> Non
         text = f"{_systems(vehicles)} on {' and '.join(shared)}, speed {options.speedup:g}x"
         emit(options, "simulated", record, text if address == shared[0] else None)
     if not options.json:
-        first_vehicle, *other_vehicles = server.vehicles_on[0]
+        first_vehicle, *further_vehicles = server.vehicles_on[0]
         client = _client_address(server.addresses[0], options.addresses[0])
-        system_option = f" --system-id {first_vehicle.system_id}" if other_vehicles else ""
+        system_option = f" --system-id {first_vehicle.system_id}" if further_vehicles else ""
         print(f"try: aerokit demo --connect {client}{system_option}", flush=True)
-        if client != _SERIAL_END:
+        if client != _SERIAL_LINE_PLACEHOLDER:
             print(f"or:  aerokit status {client}, aerokit monitor {client}, aerokit serve {client}", flush=True)
 
 
@@ -359,7 +361,7 @@ def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
 
 
 def _client_address(address: str, argument: str) -> str:
-    """Return the address with which a client on this machine connects.
+    """Return the address with which a client on this machine connects; for a serial line, a placeholder.
 
     ``address`` is the address of the open link, ``argument`` the address or template in the command line.
     """
@@ -369,7 +371,7 @@ def _client_address(address: str, argument: str) -> str:
     if scheme == "pty":
         return location
     if scheme not in _CLIENT_SCHEMES:
-        return _SERIAL_END
+        return _SERIAL_LINE_PLACEHOLDER
     return f"{_CLIENT_SCHEMES[scheme]}:{location.replace('0.0.0.0', '127.0.0.1')}"
 
 

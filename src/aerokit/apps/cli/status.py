@@ -39,7 +39,7 @@ _REQUESTED = (
     ("position", GlobalPositionInt),
 )
 # How long to wait for the restoration of changed stream rates before the connection is closed.
-_RELEASE_TIME_S = 0.5
+_RESTORE_RATES_S = 0.5
 # How long to wait for a requested message after the vehicle has accepted the request.
 _MESSAGE_TIMEOUT_S = 0.3
 
@@ -229,7 +229,7 @@ async def run_status(options: argparse.Namespace) -> int:
             record = _vehicle_record(vehicle, checks)
             emit(options, "status", record, "\n".join(_vehicle_lines(vehicle, checks)))
         _emit_components(connection, options, vehicles_found)
-        await anyio.sleep(_RELEASE_TIME_S)
+        await anyio.sleep(_RESTORE_RATES_S)
     cannot_arm = any(
         checks.against_arming and checks.is_known and not vehicle.is_armed
         for vehicle, checks in zip(vehicles_found.values(), all_checks, strict=True)

@@ -17,7 +17,7 @@ import anyio
 
 from aerokit import events
 from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
-from aerokit.apps.readiness import arms_but, readiness
+from aerokit.apps.readiness import arms_but_cannot_fly_text, readiness
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
@@ -73,11 +73,11 @@ class SupervisedFlight(ABC):
         self._report = report
         self._print = report.print_line
         self._on_interrupt = on_interrupt
-        self.armed_by_us: bool = False
-        """True once this program has sent an arm command."""
+        self.has_sent_arm_command: bool = False
+        """True once this program has sent an arm command, even if the vehicle has refused it."""
         self._may_arm_late = False  # True while the result of a sent arm command is unknown
         self._modes_armed_in: set[str] = set()
-        self._has_started = False  # True once a command of this program has changed the mode after arming
+        self._has_changed_mode = False  # True once a command of this program has changed the mode after arming
 
     async def fly(self) -> int:
         """Perform the flight and return the exit code. After an error, make an armed vehicle safe and re-raise."""
@@ -91,12 +91,12 @@ class SupervisedFlight(ABC):
             self._print(f"failed: {text}")
             if HIT_GROUND in text:
                 self._report.record_impact()
-            if self.armed_by_us:
+            if self.has_sent_arm_command:
                 await self._make_safe(partial(self._after_failure, error))
             raise
         if code is None:
             self._print(f"interrupted, {self._vehicle.describe_now()}")
-            if self.armed_by_us:
+            if self.has_sent_arm_command:
                 await self._make_safe(self._after_interrupt)
             return INTERRUPTED
         return code
@@ -119,9 +119,9 @@ class SupervisedFlight(ABC):
     async def _arm(self) -> None:
         """Arm the vehicle, and record this before the command is sent, because its result may remain unknown."""
         self._check_disarmed()
-        self.armed_by_us = True
+        self.has_sent_arm_command = True
         self._may_arm_late = True
-        self._modes_armed_in.add(self._vehicle.mode_name)
+        self._modes_armed_in.add(self._vehicle.mode_name)  # `arm` may change the mode, so both modes are recorded
         try:
             await self._vehicle.arm()
         except CommandRejected:
@@ -145,7 +145,11 @@ class SupervisedFlight(ABC):
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
 
     async def _after_failure(self, error: Exception) -> int:
-        """Disarm on the ground, if this program still has control. In the air, leave control to pilot or failsafe."""
+        """Disarm on the ground, if this program still has control. In the air, leave control to pilot or failsafe.
+
+        If the vehicle is disarmed, wait for a late arming. The result, an exit code, is not used, because the error is
+        raised again.
+        """
         vehicle = self._vehicle
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
@@ -189,7 +193,10 @@ class SupervisedFlight(ABC):
         return DONE
 
     async def _watch_late_arming(self) -> None:
-        """Stay connected while an arm command may still take effect, so that aerokit can disarm the vehicle then."""
+        """Stay connected while an arm command may still take effect.
+
+        If the vehicle arms, `Vehicle.arm` disarms it again in the background. This method waits until it is disarmed.
+        """
         if not self._may_arm_late:
             return
         self._print(
@@ -199,7 +206,7 @@ class SupervisedFlight(ABC):
         armed = self._vehicle.armed
         with suppress(OperationTimeout):
             await armed.wait_until(bool, timeout=ARM_WATCH_S)
-            await armed.wait_until(lambda armed: not armed, timeout=_AUTO_DISARM_TIMEOUT_S)
+            await armed.wait_until(lambda is_armed: not is_armed, timeout=_AUTO_DISARM_TIMEOUT_S)
         self._print(self._vehicle.describe_now())
 
     async def _disarm(self) -> None:
@@ -223,7 +230,7 @@ class SupervisedFlight(ABC):
     @property
     def _is_in_our_mode(self) -> bool:
         vehicle = self._vehicle
-        if not self._has_started and vehicle.mode_name in self._modes_armed_in:
+        if not self._has_changed_mode and vehicle.mode_name in self._modes_armed_in:
             return True
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
@@ -344,7 +351,10 @@ class FlightReport:
         self._emit("flight_summary", record, "\n".join(lines))
 
     def _describe_armed(self, speed: float) -> str:
-        """Return "armed for 47 s", with notes on the time until an impact and on the speed of a simulation."""
+        """Return "armed for 47 s", with notes on the time until an impact and on the speed of a simulation.
+
+        ``speed`` is `speedup`, or the measured speed of a simulation that this program did not start.
+        """
         notes = []
         if self._impact_s is not None:
             notes.append(f"{_duration(speed * self._impact_s)} until the impact")
@@ -398,12 +408,12 @@ class FlightReport:
                 self.print_line(f"  silent for {seconds:.0f} s; last received: {vehicle.mode_name}{last}")
                 continue
             checks = None if vehicle.is_armed else readiness(vehicle, changes_mode=True)
-            if checks is not None and checks.against_arming:
+            if checks is not None and checks.against_arming:  # "cannot arm yet: …" or "not known whether it arms: …"
                 yet = " yet" if checks.is_known else ""
                 reasons = "; ".join([*checks.against_arming, *checks.against_flight])
                 self.print_line(f"  {checks.prefix}{yet}: {reasons}")
             elif checks is not None and checks.against_flight:
-                self.print_line(f"  {arms_but(vehicle)}: {'; '.join(checks.against_flight)}")
+                self.print_line(f"  {arms_but_cannot_fly_text(vehicle)}: {'; '.join(checks.against_flight)}")
             else:
                 self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
 
@@ -412,7 +422,7 @@ class FlightReport:
             self._fast_sink_at = self._vehicle.velocity.updated_at
 
     def _on_position(self, _: Position | None, position: Position) -> None:
-        """Measure the track while the vehicle is armed. Steps below a metre do not count, as in reports."""
+        """Measure the track while the vehicle is armed, between points at least a metre apart, as reports do."""
         if not self._vehicle.is_armed:
             self._previous_position = None
             return

@@ -238,7 +238,7 @@ class Monitor(App[None]):
 
     def _request_arming_checks(self) -> None:
         for vehicle in self._model.vehicles.values():
-            if self._arming_checks.are_due(vehicle):
+            if self._arming_checks.take_due(vehicle):
                 self._commands.start(partial(run_arming_checks, vehicle))
 
     def _has_changed(self, name: str, content: object) -> bool:

@@ -81,16 +81,18 @@ class VehicleText:
             width = columns - max(len(label) for label, _ in rows) - _LABEL_PADDING
             unused_lines = lines - len(rows)
             label = "missing" if self._failsafe is None else "failsafe"
-            rows[1] = (label, self._missing(1 + unused_lines, width))  # replaces the row that shows only one reason
+            # This replaces the second row, which shows only one reason. An active failsafe is the first of the reasons.
+            rows[1] = (label, self._missing(1 + unused_lines, width))
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
-        """Return the labels and values of the rows that are always shown."""
+        """Return the labels and values of the rows that are always shown. For a silent vehicle, "link" is second."""
         vehicle = self._vehicle
         cell = self.cell
+        second_row = ("link", self.silence()) if self._silent_s else ("missing", self._missing())
         rows = [
             ("mode", Text("  ").join([cell(vehicle.mode, _name, "bold"), self._armed()])),
-            ("link" if self._silent_s else "missing", self.silence() or self._missing()),
+            second_row,
             ("attitude", cell(vehicle.attitude, _attitude)),
             ("altitude", cell(vehicle.position, _altitude)),
             ("position", cell(vehicle.position, _coordinates)),
@@ -194,12 +196,15 @@ class VehicleText:
         if self._vehicle.armed.latest:
             failsafe = [f"failsafe: {text}" for text in self._failsafe or ()]
             return [*failsafe, *checks.against_arming, *checks.against_flight]
-        flight_prefix = "also missing for flight" if checks.against_arming else "arms, cannot fly by itself"
+        flight_prefix = "also missing for flight" if checks.against_arming else "can arm, but not fly by itself"
         against_arming = _with_prefix(checks.prefix, checks.against_arming)
         return against_arming + _with_prefix(flight_prefix, checks.against_flight)
 
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
-        """Return the first reason that prevents a flight, and as many others as fit into ``max_lines``."""
+        """Return the first reason that prevents a flight, and as many others as fit into ``max_lines``.
+
+        ``width`` is the number of columns of a line. It is not needed for a single line, which shows one reason.
+        """
         missing = self._reasons()
         if not missing:
             return Text("nothing")

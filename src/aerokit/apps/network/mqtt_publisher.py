@@ -84,8 +84,10 @@ def parse_broker(text: str, *schemes: str) -> BrokerAddress:
         host, port = parts.hostname, parts.port
     except ValueError:
         raise error("host and port cannot be parsed") from None
-    if not host or port == 0:
-        raise error("host or port is missing")
+    if not host:
+        raise error("the host is missing")
+    if port == 0:
+        raise error("the port must not be 0")
     if parts.query or parts.fragment:
         raise error("MQTT addresses have no options")
     fleet, _, name = parts.path.strip("/").partition("/")

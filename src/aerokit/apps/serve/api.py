@@ -171,7 +171,7 @@ def _operation(operation: Operation) -> dict[str, Any]:
         description["security"] = [{"token": []}] if is_order else [{"token": []}, {}]
     if is_order:
         description["responses"]["202"] = {"description": "running (wait=false)", "content": _json(answer)}
-    order_type = operation.order or operation.body
+    order_type = operation.order or operation.body_type
     if order_type is not None:
         description["requestBody"] = {
             "required": any(argument.is_required for argument in order_type.arguments.values()),
@@ -203,7 +203,8 @@ def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
 def _failures(operation: Operation) -> dict[str, Any]:
     if operation.is_open:
         return {}
-    impossible = set() if operation.order or operation.body else {"413", "415"}  # these statuses concern request bodies
+    # The statuses 413 and 415 concern request bodies.
+    impossible = set() if operation.order or operation.body_type else {"413", "415"}
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": text, "content": problem}
@@ -258,7 +259,7 @@ class Operation:
     """One HTTP method of one path.
 
     ``name`` is the operationId. ``order`` is the type of the order that the operation gives. An operation without an
-    order may have a ``body``, which is the order type whose request body it accepts.
+    order may have a ``body_type``, which is the order type whose request body it accepts.
     """
 
     method: str
@@ -267,7 +268,7 @@ class Operation:
     summary: str
     handler: Handler
     order: OrderType | None = None
-    body: OrderType | None = None
+    body_type: OrderType | None = None
     query: tuple[str, ...] = ()
     is_open: bool = False
     """True if the operation needs no token, because it reveals nothing about vehicles."""
@@ -317,7 +318,7 @@ class HttpApi:
                 self._list_orders,
             ),
             get("/api/orders/{key}", "order", "One order, by its Idempotency-Key", self._order),
-            Operation("POST", "/api/plan", "plan", "Check a plan; sends nothing", self._check_plan, body=UPLOAD),
+            Operation("POST", "/api/plan", "plan", "Check a plan; sends nothing", self._check_plan, body_type=UPLOAD),
             *(self._order_operation("POST", f"{path}/{order_type.name}", order_type) for order_type in ORDERS),
             self._order_operation("PUT", parameter_path, SET_PARAMETER),
         )

@@ -61,7 +61,7 @@ class FlightWatch:
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
-        self._impact = ImpactDetector(vehicle.telemetry)
+        self._detector = ImpactDetector(vehicle.telemetry)
         self._crash: dict[str, Any] | None = None
         # The last descent at IMPACT_M_S or faster.
         self._last_sink_at = -math.inf
@@ -102,7 +102,9 @@ class FlightWatch:
 
     @property
     def disarming(self) -> dict[str, Any] | None:
-        """The last disarming without a flight before it that no order of this server caused; None if there was none.
+        """The last time that the vehicle was disarmed without having flown, and without an order of this server.
+
+        It is None if there was none.
 
         ``age_s`` is the time since then, ``armed_for_s`` how long the vehicle was armed. ``parameter`` and ``delay_s``
         are the autopilot's setting for automatic disarming. ``is_automatic`` is true if the vehicle was armed for about
@@ -165,15 +167,18 @@ class FlightWatch:
                 self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
-        """Detect when an impact begins or is over, and evaluate it with each new velocity."""
+        """Detect when an impact begins or is over, and evaluate it with each new velocity.
+
+        An impact begins with the first slower velocity after a fast descent.
+        """
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
         at = self._vehicle.velocity.updated_at
         down_m_s = velocity.down_m_s
-        had_impact = bool(self._impact.describe())
-        self._impact.update()
-        has_impact = bool(self._impact.describe())
-        if down_m_s >= IMPACT_M_S:
+        had_impact = bool(self._detector.describe())
+        self._detector.update()
+        has_impact = bool(self._detector.describe())
+        if down_m_s >= IMPACT_M_S:  # While the vehicle sinks fast, only the sink rate is stored.
             self._last_sink_at = at
             self._last_sink_m_s = down_m_s
         elif not has_impact:
@@ -199,6 +204,7 @@ class FlightWatch:
         if self._crash is not None:
             self._moving_since = math.inf if is_still else min(self._moving_since, at)
             is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
+            # A slow vehicle must move for as long as it had to lie still to count as crashed.
             is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
             if self._vehicle.armed.latest and (is_moving or self._has_climbed):
                 self._dismiss_impact()  # the vehicle flies again
@@ -217,7 +223,7 @@ class FlightWatch:
         elif self._has_crashed(at):
             ago_s = self._now() - self._impact_at
             self._crash = {
-                "text": self._impact.describe(),
+                "text": self._detector.describe(),
                 "at_unix_s": round(self._vehicle.connection.unix_time() - ago_s, 1),
             }
 
@@ -260,7 +266,7 @@ class FlightWatch:
 
     def _reset(self) -> None:
         self._forget_impact()
-        self._impact = ImpactDetector(self._vehicle.telemetry)
+        self._detector = ImpactDetector(self._vehicle.telemetry)
 
     def _now(self) -> float:
         return self._vehicle.connection.now()

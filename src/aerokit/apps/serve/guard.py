@@ -247,9 +247,9 @@ class _HttpConnection(H11Protocol):
 
 
 class WebSocketConnection(WebSocketsSansIOProtocol):
-    """Class for the argument ``ws`` of `uvicorn.Config`. It records that the response to a refused handshake ends it.
+    """Class for the argument ``ws`` of `uvicorn.Config`: marks a handshake as complete when the app has refused it.
 
-    uvicorn 0.35 to 0.54 do not, and log the error "ASGI callable returned without completing handshake".
+    uvicorn 0.35 to 0.54 do not mark it, and log the error "ASGI callable returned without completing handshake".
     """
 
     async def send(self, message: Any) -> None:

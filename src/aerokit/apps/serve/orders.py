@@ -182,6 +182,7 @@ def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
 
 
 def _parse_plan_arguments(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the arguments to record (name, counts and hash of the plan), and the keyword arguments of the order."""
     name, text, plan = parse_plan_body(values)
     counts = {
         "mission_items": len(plan.mission),
@@ -363,8 +364,8 @@ class OrderRunner:
             raise HttpProblem(
                 409,
                 "Late",
-                f"the client's state of the vehicle is older than {STATE_MAX_AGE_S:g} s; nothing was sent: check the"
-                " current state, then repeat the order",
+                f"the client's state of the vehicle is not from the last {STATE_MAX_AGE_S:g} s; nothing was sent: check"
+                " the current state, then repeat the order",
             )
         if arguments.get("force") and order_type.name == "disarm" and self._served.crash(vehicle) is None:
             raise HttpProblem(
@@ -422,7 +423,7 @@ class OrderRunner:
             self._publish(record)
 
     def _replacing(self, record: OrderRecord, error: Exception) -> str | None:
-        """Return the key of the newest order that replaced this one; None if the order ended for another reason."""
+        """Return the key of the vehicle's newest motion order, if a later one has superseded this order; else None."""
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
         newest_key = None

@@ -210,7 +210,7 @@ class ServedVehicles:
     async def _request_arming_checks(self) -> None:
         while True:
             for vehicle in tuple(self._vehicles.values()):
-                if self._arming_checks.are_due(vehicle):
+                if self._arming_checks.take_due(vehicle):
                     self._background.start(partial(run_arming_checks, vehicle), "aerokit serve check")
             await anyio.sleep(TRACK_INTERVAL_S)
 

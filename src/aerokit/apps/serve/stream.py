@@ -104,7 +104,7 @@ class StateStream:
             await asyncio.wait_for(socket.close(code), 1.0)
 
     async def _send_messages(self, socket: WebSocket, period_s: float) -> None:
-        """Send the message ``hello``, then the state at each period, and all other messages at once."""
+        """Send the message ``hello``, then the state once per period, and each other message when it is published."""
         loop = asyncio.get_running_loop()
         queue: deque[dict[str, Any]] = deque()
         changed = asyncio.Event()

@@ -132,9 +132,9 @@ def convert(
     )
 
 
-def _writer_for(target: Path, tables: str) -> Callable[[Path, LogReader], _Writer]:
+def _writer_for(target: Path, table_format: str) -> Callable[[Path, LogReader], _Writer]:
     formats: dict[str, Any] = FORMATS if target.suffix else FOLDERS
-    key = target.suffix.lower() if target.suffix else tables
+    key = target.suffix.lower() if target.suffix else table_format
     if key not in formats:
         raise InvalidArgument(
             f"unknown format {key!r}; files: {', '.join(FORMATS)}; tables in folders: {' or '.join(FOLDERS)}"

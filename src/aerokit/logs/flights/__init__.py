@@ -129,7 +129,7 @@ def _armed_at_end_note(flight: FlightLog) -> str:
     mode = flight.mode_at(flight.duration_s)
     in_mode = f" in {mode}" if mode else ""
     is_silent = bool(flight.silences) and flight.silences[-1].ends_s >= flight.duration_s
-    when = f", {flight.duration_s - flight.silences[-1].begins_s:.0f} s before its end" if is_silent else ""
+    when = f", last heard {flight.duration_s - flight.silences[-1].begins_s:.0f} s before" if is_silent else ""
     state = f"{where}{in_mode}{motion}{when}"
     return f"{note}{state}: the rest of the flight, and with it a landing or a crash, was not recorded"
 

@@ -208,6 +208,8 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
 
     The reaction is the first mode change that was not commanded or, without one, disarming. If the log does not contain
     the cause of the change, an immediate change is attributed to the autopilot; a later change may be the pilot's.
+    Disarming is attributed to the autopilot only after evidence of a crash. Without a reaction, the text is empty.
+    ``time_s`` is the time of the first evidence in ``group``.
     """
     last_s = group[-1].time_s
     for change in flight.modes:

@@ -76,7 +76,10 @@ def falls(flight: FlightLog) -> list[Fall]:
 
 
 def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
-    """Yield the start and end of each fast descent, its highest sink rate near the end, and whether it was stopped."""
+    """Yield each fast descent that stops abruptly, or that lasts until the log ends.
+
+    The values are its start and end, its highest sink rate near the end, and True if it stopped.
+    """
     begin_s = -math.inf  # the last time at which the vehicle sank slowly, or not at all
     last_fast_s = -math.inf  # the last time at which it sank fast
     previous_s = -math.inf
@@ -108,11 +111,11 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
     if not lost_height_m >= _MIN_HEIGHT_M:  # `not >=` is also true if a height is NaN
         return None
     reasons = _reasons(flight, begin_s, end_s)
-    # Without an impact, the log ends during the descent. Then the height must be so small that the vehicle would reach
-    # the ground within two seconds.
+    # Without an impact, the log ends during the descent. The vehicle then counts as on the ground if it would reach the
+    # ground within two seconds.
     near_ground_m = 2 * sink_m_s
     is_on_ground = _stays_at_height(flight, end_s, end_height_m) if has_impact else end_height_m < near_ground_m
-    if not (is_on_ground or reasons):
+    if not (is_on_ground or reasons):  # Logged reasons suffice at any height.
         return None
     return Fall(
         time_s=end_s,

@@ -135,7 +135,10 @@ class BinReader(_RowReader):
             close_bin(self._reader)
 
     def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield a record for each row, except descriptions of tables. Report the progress to ``on_bytes``."""
+        """Yield a record for each row, except descriptions of tables and rows with an implausible time.
+
+        Report the progress to ``on_bytes``.
+        """
         count = 0
         while (message := self._next(reader)) is not None:
             count += 1
@@ -233,7 +236,7 @@ class UlogReader(_RowReader):
     """Reads a ``.ulg`` of PX4 with pyulog, which loads the whole log into memory."""
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all rows of all topics, ordered by time."""
+        """Yield the rows of all topics and the logged texts, ordered by time, except those with an implausible time."""
         try:
             # pyulog prints to stdout, which may be for JSON.
             with self.path.open("rb") as file, redirect_stdout(sys.stderr):

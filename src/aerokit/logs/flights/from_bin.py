@@ -296,7 +296,10 @@ class _Reader:
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
     def _add_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
-        """Add height set-points to the position set-points, which are logged at the same rate, or else as new rows."""
+        """Write height set-points into the rows of the position set-points, which are logged at the same rate.
+
+        If there are no position set-points, new rows are added.
+        """
         target = self._flight.position_target
         has_positions = len(target) > 0
         relative = target["altitude_relative_m"]

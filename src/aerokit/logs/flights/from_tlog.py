@@ -111,7 +111,7 @@ class _Reader:
             m.MissionCount: self._mission.on_count,
             m.FileTransferProtocol: self._mission.on_file_transfer,
         }
-        self._handlers_of_any_sender = {
+        self._handlers_of_other_senders = {
             _message_id_bytes(kind): call for kind, call in {**commands, **handlers}.items()
         }
         handlers.update(self._vehicle_handlers())
@@ -122,11 +122,11 @@ class _Reader:
         # This loop is optimised, because a log has millions of messages. Most of them are not decoded: only the fields
         # of the header are read.
         flight, source, link = self._flight, self._source, self._link
-        handlers_of_vehicle, handlers_of_any_sender = self._handlers_of_vehicle, self._handlers_of_any_sender
+        handlers_of_vehicle, handlers_of_other_senders = self._handlers_of_vehicle, self._handlers_of_other_senders
         records, damaged = 0, 0
         begins_at, ends_at = 0.0, 0.0
         new_frames = 0  # the vehicle's frames since the last call of link.count()
-        next_second, expected_sequence = 0.0, -1
+        next_second_unix_s, expected_sequence = 0.0, -1
         last_frame_at, last_frame_record = math.nan, 0  # time and number of the record with the vehicle's last frame
         with flight.path.open("rb") as file:
             for unix_s, raw in read_tlog(file):
@@ -144,20 +144,20 @@ class _Reader:
                 if sender == source:
                     new_frames += 1
                     # To save calls, frames are counted together until a frame is missing or a second ends.
-                    if sequence != expected_sequence or unix_s >= next_second:
+                    if sequence != expected_sequence or unix_s >= next_second_unix_s:
                         if unix_s - last_frame_at >= MIN_SILENCE_S:
                             link.add_silence(
                                 last_frame_at - begins_at, unix_s - begins_at, records - last_frame_record - 1
                             )
-                        next_s = link.count(unix_s - begins_at, sequence, expected_sequence, new_frames)
-                        next_second, new_frames = begins_at + next_s, 0
+                        next_second_s = link.count(unix_s - begins_at, sequence, expected_sequence, new_frames)
+                        next_second_unix_s, new_frames = begins_at + next_second_s, 0
                     last_frame_at, last_frame_record = unix_s, records
                     expected_sequence = (sequence + 1) & 0xFF
                     if message_id not in handlers_of_vehicle:
                         continue
                     handle = handlers_of_vehicle[message_id]
-                elif message_id in handlers_of_any_sender:
-                    handle = handlers_of_any_sender[message_id]
+                elif message_id in handlers_of_other_senders:
+                    handle = handlers_of_other_senders[message_id]
                 else:
                     if message_id == _HEARTBEAT_ID:
                         self._record_other_heartbeat(unix_s - begins_at, sender[0], raw)

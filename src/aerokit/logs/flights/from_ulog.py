@@ -164,7 +164,8 @@ class _Reader:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         for text in log.logged_messages:
-            # `log_level` is a digit: "6" is info. The Linux kernel's levels and MAV_SEVERITY have the same numbers.
+            # `log_level` is the character code of a digit: 54, the code of "6", is info. The Linux kernel's levels and
+            # MAV_SEVERITY have the same numbers.
             severity = max(0, min(7, int(text.log_level) - ord("0")))
             flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
         initial = [(log.start_timestamp, name, value) for name, value in log.initial_parameters.items()]

@@ -115,8 +115,8 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
     recorded_s = flight.duration_s
     flight.speed = speed
     flight.notes.append(
-        f"this is a simulation at {speed:.3g} times real speed, because the vehicle's clock differs from the"
-        f" recording's: all times and durations in this report are simulated; the recording took {recorded_s:.0f} s"
+        f"this is a simulation at {speed:.3g} times real speed, as the vehicle's clock shows: all times and durations"
+        f" in this report are simulated; the recording took {recorded_s:.0f} s"
     )
     for series in _all_series(flight):
         for row, time_s in enumerate(series.times):

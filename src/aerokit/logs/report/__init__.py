@@ -65,7 +65,7 @@ def write_report(
         on_progress: called from time to time with the number of bytes read so far; for two logs, it starts again at 0.
 
     Raises:
-        InvalidArgument: the file exists, or its name does not end in .html.
+        InvalidArgument: the file exists and ``force`` is False, or its name does not end in .html or .htm.
         FileFormatError: a file is not a flight log, or nothing in it can be read.
         OSError: a file cannot be read or written.
         ModuleNotFoundError: a package of the extra ``report`` is not installed.
@@ -75,7 +75,7 @@ def write_report(
         raise InvalidArgument(f"target = {str(target_path)!r} is not allowed: the name of a report must end in .html")
     logs = [log] if compare_with is None else [log, compare_with]
     for path in logs:
-        check_log_name(Path(path))  # before the target, whose default is derived from the log's name
+        check_log_name(Path(path))  # before the target, because callers may derive its name from that of the log
     if target_path.exists() and not force:
         raise InvalidArgument(f"{target_path} exists; use force (--force) to replace it")
     flights = [read_flight(path, system_id=system_id, on_progress=on_progress) for path in logs]

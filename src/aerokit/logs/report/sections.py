@@ -238,10 +238,14 @@ def _gps(flight: FlightLog) -> Section:
 
 
 def _link(flight: FlightLog) -> Section:
-    explanation = (
-        "Messages that the autopilot did not receive, by its own count. With several links, those of the busiest one."
-        if flight.path.suffix.lower() == ".ulg"
-        else "Lost messages in each second, by gaps in the sequence numbers; 100 % during silence."
+    explanations = {
+        ".ulg": "Messages that the autopilot did not receive, by its own count. With several links, those of the"
+        " busiest one.",
+        ".bin": "Reports of the telemetry radio. A .bin has no counts of lost messages.",
+    }
+    explanation = explanations.get(
+        flight.path.suffix.lower(),
+        "Lost messages in each second, by gaps in the sequence numbers; 100 % during silence.",
     )
     section = Section(
         "Link",
@@ -299,22 +303,23 @@ def _parameters(flight: FlightLog) -> Section:
         (clock(change.time_s), change.name, f"{change.before:g}", f"{change.after:g}")
         for change in changes[:_MAX_CHANGES]
     ]
-    parts: list[Part] = [Paragraphs(["No parameter changed during the log."])]
+    parts: list[Part] = [Paragraphs(["The pilot and programs changed no parameter during the log."])]
     if rows:
-        parts = [Table(("time", "parameter", "before", "after"), rows, f"{len(changes)} changes")]
+        parts = [Table(("time", "parameter", "before", "after"), rows, _title(len(rows), len(changes), "changes"))]
     hidden_count = len(flight.parameter_changes) - len(changes)
     if hidden_count:
         text = f"{hidden_count} changes by the autopilot itself, of counters and the like, are not shown."
         parts.append(Paragraphs([text]))
     parameters = [(name, f"{value:.9g}") for name, value in sorted(flight.parameters.items())]
-    parts.append(
-        Table(
-            ("parameter", "initial value"),
-            parameters[:_MAX_PARAMETERS],
-            f"all {len(parameters)} parameters",
-        )
-    )
+    shown = parameters[:_MAX_PARAMETERS]
+    title = _title(len(shown), len(parameters), "parameters")
+    parts.append(Table(("parameter", "initial value"), shown, title))
     return Section("Parameters", parts)
+
+
+def _title(shown_count: int, count: int, noun: str) -> str:
+    """Return a title for a table whose rows may have been cut off."""
+    return f"all {count} {noun}" if shown_count == count else f"first {shown_count} of {count} {noun}"
 
 
 def _mission(flight: FlightLog) -> Section | None:

@@ -26,10 +26,11 @@ _OTHER_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def silence_sentences(flight: FlightLog) -> list[str]:
-    """Return sentences about silences that began while the vehicle was armed, and about its ground station failsafe."""
+    """Return sentences about silences that began while the vehicle was armed, and about the ground station failsafe."""
     silences = [
         silence for silence in flight.silences if any(begin <= silence.begins_s <= end for begin, end in flight.armed)
     ]
+    # During a recorded silence, messages of other senders were recorded, so it was the vehicle that was silent.
     recorded = [silence for silence in silences if silence.is_recorded]
     sentences = [_sentence(flight, silence) for silence in recorded[:_MAX_LISTED]]
     more = len(recorded) - _MAX_LISTED
@@ -93,4 +94,4 @@ def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
     texts = {name: f"{name} = {value:g}" for name, value in values.items()}
     if decisive_name is not None and action is not None:
         texts[decisive_name] += f" ({action})"
-    return f"The vehicle's reaction, if it lost the ground station too: {', '.join(texts.values())}."
+    return f"If the vehicle also lost the ground station, it reacts as configured: {', '.join(texts.values())}."

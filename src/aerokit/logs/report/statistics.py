@@ -424,7 +424,10 @@ def _failsafes_sentence(flight: FlightLog) -> str:
 
 
 def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
-    """Return the parameters that decide on the reaction to these kinds of failsafes, if the log has none of them."""
+    """Return the parameters that decide on the reaction to these kinds of failsafes, if the log has none of a kind.
+
+    For each such kind, these are the parameters that choose or enable the action or, without any, all.
+    """
     unknown: list[str] = []
     for kind in dict.fromkeys(kinds):
         names = configured_by(flight, kind)

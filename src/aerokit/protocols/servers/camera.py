@@ -22,7 +22,7 @@ _TO_THE_END = -1
 def camera_builders(camera: CameraDevice) -> dict[int, Builder]:
     """Return a builder for each message id of the camera protocol.
 
-    Param 2 of REQUEST_MESSAGE selects a storage, a stream or the first image.
+    Param 2 of REQUEST_MESSAGE is the number of a storage or stream, or the index of the image to begin with.
     """
     return {
         m.CameraInformation.ID: lambda _: [_information(camera)],
@@ -114,10 +114,15 @@ def _stream_fields(camera: CameraDevice, stream: int) -> dict[str, Any]:
 
 def _flags(camera: CameraDevice, stream: int) -> int:
     flags: int = VideoStreamStatusFlags.RUNNING if stream in camera.running_streams else 0
-    is_thermal = camera.thermal_celsius is not None and stream == len(camera.streams)  # the last stream
+    is_thermal = camera.thermal_celsius is not None and stream == _thermal_stream(camera)
     if is_thermal:
         flags |= VideoStreamStatusFlags.THERMAL | VideoStreamStatusFlags.THERMAL_RANGE_ENABLED
     return flags
+
+
+def _thermal_stream(camera: CameraDevice) -> int:
+    """Return the number of the stream of the thermal camera, if there is one: the last stream."""
+    return len(camera.streams)
 
 
 def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
@@ -127,7 +132,7 @@ def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
     coldest, hottest = camera.thermal_celsius
     return [
         m.CameraThermalRange(
-            time_boot_ms=camera.host.time_boot_ms, stream_id=len(camera.streams), camera_device_id=0, max=hottest,
+            time_boot_ms=camera.host.time_boot_ms, stream_id=_thermal_stream(camera), camera_device_id=0, max=hottest,
             max_point_x=1.0, max_point_y=1.0, min=coldest, min_point_x=0.0, min_point_y=0.0,
         )
     ]  # fmt: skip

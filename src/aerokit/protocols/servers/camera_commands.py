@@ -79,10 +79,10 @@ class _Pictures:
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
         count = to_int(command.param3)
         sequence = to_int(command.param4)
-        in_wrong_mode = _has_wrong_mode(camera, CameraMode.VIDEO, _CAN_ALWAYS_CAPTURE)
+        in_wrong_mode = _has_wrong_mode(camera, wrong_mode=CameraMode.VIDEO, unless_can=_CAN_ALWAYS_CAPTURE)
         if not camera.can(CameraCapFlags.CAPTURE_IMAGE):
             return MavResult.UNSUPPORTED
-        if not _is_own(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
+        if not _selects_this(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
             return MavResult.DENIED
         is_repeated = count == 1 and sequence > 0 and sequence == self._last_sequence
         if is_repeated:
@@ -96,7 +96,7 @@ class _Pictures:
         return MavResult.ACCEPTED
 
     async def stop(self, command: ReceivedCommand) -> int:
-        if not _is_own(command.param1):
+        if not _selects_this(command.param1):
             return MavResult.DENIED
         self._camera.captures.stop()
         return MavResult.ACCEPTED
@@ -110,7 +110,7 @@ class _Pictures:
     async def format(self, command: ReceivedCommand) -> int:
         """Format the storage if param 2 is 1, and reset the image log if param 3 is 1."""
         camera, captures = self._camera, self._camera.captures
-        if not _is_own(command.param1):
+        if not _selects_this(command.param1):
             return MavResult.DENIED
         if captures.is_busy or captures.is_recording:
             return MavResult.TEMPORARILY_REJECTED
@@ -132,7 +132,8 @@ class _Videos:
         camera, captures = self._camera, self._camera.captures
         if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
             return MavResult.UNSUPPORTED
-        if _has_wrong_mode(camera, CameraMode.IMAGE, _CAN_ALWAYS_RECORD) or command.param2 < 0:
+        in_wrong_mode = _has_wrong_mode(camera, wrong_mode=CameraMode.IMAGE, unless_can=_CAN_ALWAYS_RECORD)
+        if in_wrong_mode or command.param2 < 0:
             return MavResult.DENIED
         if captures.is_recording:
             return MavResult.TEMPORARILY_REJECTED
@@ -224,11 +225,11 @@ class _Settings:
         return MavResult.ACCEPTED
 
 
-def _is_own(device: float) -> bool:
-    """Return True if param 1 selects this camera: 0 (all), 1 (this camera), or NaN, which MAVSDK sends."""
-    return math.isnan(device) or device in (0.0, 1.0)
+def _selects_this(number: float) -> bool:
+    """Return True if param 1 selects this camera or its storage: 0 (all), 1 (the first), or NaN, which MAVSDK sends."""
+    return math.isnan(number) or number in (0.0, 1.0)
 
 
-def _has_wrong_mode(camera: CameraDevice, wrong_mode: int, works_in_any_mode: int) -> bool:
-    """Return True if the camera is in ``wrong_mode``, and lacks the CAMERA_CAP_FLAGS ``works_in_any_mode``."""
-    return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong_mode and not camera.can(works_in_any_mode)
+def _has_wrong_mode(camera: CameraDevice, *, wrong_mode: int, unless_can: int) -> bool:
+    """Return True if the camera is in ``wrong_mode``, and lacks the CAMERA_CAP_FLAGS ``unless_can``."""
+    return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong_mode and not camera.can(unless_can)

@@ -128,20 +128,20 @@ class CommandDispatcher:
         handler = self._handlers.get(command.command)
         return MavResult.UNSUPPORTED if handler is None else handler(command)
 
-    def report(self, command: ReceivedCommand, progress: CommandProgress, answer: Callable[[], None]) -> None:
-        """Send IN_PROGRESS with each percentage, then call ``finish`` and ``answer``."""
+    def report(self, command: ReceivedCommand, progress: CommandProgress, send_result: Callable[[], None]) -> None:
+        """Send IN_PROGRESS with each percentage, then call ``progress.finish`` and ``send_result``."""
         for index, percent in enumerate(progress.percents):
             self._host.call_later(
                 index * progress.interval_s,
                 lambda percent=percent: self.answer(command, MavResult.IN_PROGRESS, percent),  # type: ignore[misc]
             )
 
-        def finish() -> None:
+        def complete() -> None:
             if progress.finish is not None:
                 progress.finish()
-            answer()
+            send_result()
 
-        self._host.call_later(max(1, len(progress.percents)) * progress.interval_s, finish)
+        self._host.call_later(max(1, len(progress.percents)) * progress.interval_s, complete)
 
     def answer(self, command: ReceivedCommand, result: int, progress: int = 0, detail: int = 0) -> None:
         """Send an acknowledgement; ``detail`` is its ``result_param2``."""

@@ -25,7 +25,7 @@ class DefinedParameterServer(ExtendedParameterServer):
     def __init__(self, host: ServerHost, definition: CameraDefinition) -> None:
         self.definition = definition
         self.names: list[str] = [name for name, setting in definition.settings.items() if not setting.write_only]
-        """Names of the settings that are listed."""
+        """Names of the settings that PARAM_EXT_REQUEST_LIST lists, in the order of their indices."""
         self.values: dict[str, SettingValue] = {}
         """Current values; assign them at any time."""
         self.slow: dict[str, float] = {}
@@ -34,7 +34,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         While it is being changed, requests to set it are answered with IN_PROGRESS.
         """
         self._pending: set[str] = set()  # names of slow settings that are being changed
-        super().__init__(host, self)
+        super().__init__(host, parameters=self)
         self.reset()
 
     def reset(self) -> None:

@@ -351,7 +351,7 @@ class FileTree:
     def _parent(self, path: str) -> tuple[_Folder, str]:
         """Return the folder that contains a path, and the last part of the path, which need not exist."""
         parts = _parts(path)
-        if not parts:
+        if not parts:  # the root, which exists and cannot be created, replaced or removed
             raise FileFault(EEXIST)
         folder = self._find("/".join(parts[:-1]))
         if not isinstance(folder, dict):

@@ -33,8 +33,8 @@ class FtpSession:
     file: FileHandle
     size: int
     is_writing: bool
-    burst: FtpPacket | None = field(default=None, repr=False)
-    """Sequence number and offset of the next block."""
+    next_block: FtpPacket | None = field(default=None, repr=False)
+    """Sequence number and offset of the next block of the running burst; None if none runs."""
     burst_sent: int = 0
     """Number of bytes that the current burst has sent."""
 
@@ -51,7 +51,7 @@ class FtpPeer:
     request: FtpPacket | None = None
     """The latest request that was executed."""
     reply: FtpPacket | None = None
-    checksum: FtpPacket | None = None
+    checksum_request: FtpPacket | None = None
     """CalcFileCRC32 request that is being executed."""
 
 
@@ -61,8 +61,8 @@ class SessionFtpServer(Generic[FilesT]):
     A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
     ``burst_interval_s`` seconds, and none while ``is_congested()``. A burst ends after 35 kB, and the client must
     request the next burst, so that a single request with a forged sender cannot cause a whole file to be sent. If a
-    request is repeated, a reply without file content is sent again. Subclasses for firmware that behaves differently
-    override methods.
+    request is repeated, its stored reply is sent again. Replies with file content are not stored, but made anew.
+    Subclasses for firmware that behaves differently override methods.
     """
 
     burst: int = _BURST_BLOCKS
@@ -122,15 +122,15 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the key under which the state of this request's client is stored."""
         return request.client
 
-    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
-        """Return True if this request repeats the latest one, and ``last`` is the reply to the latest one.
+    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, reply: FtpPacket) -> bool:
+        """Return True if this request repeats the latest one, and ``reply`` is the reply to the latest one.
 
-        Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. The last reply
-        may be the end of a burst, which does not replace the blocks of the burst.
+        Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. If ``reply``
+        ended a burst, its sequence number is not the one after the request, so the whole burst is sent again.
         """
         is_same = peer.request is not None and request.repeats(peer.request)
         reply_sequence = (request.sequence + 1) & 0xFFFF
-        return is_same and request.opcode == last.request_opcode and reply_sequence == last.sequence
+        return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         """Return the number for a new session.
@@ -149,7 +149,7 @@ class SessionFtpServer(Generic[FilesT]):
         """Return the state of a client; None if there are too many clients with open files."""
         key = self._key(request, channel)
         if key not in self._peers and len(self._peers) >= self.max_clients:
-            idle = (other for other, peer in self._peers.items() if not peer.sessions and peer.checksum is None)
+            idle = (other for other, peer in self._peers.items() if not peer.sessions and peer.checksum_request is None)
             idle_key = next(idle, None)
             if idle_key is None:
                 return None
@@ -167,8 +167,8 @@ class SessionFtpServer(Generic[FilesT]):
         peer.used_at = self._host.now
         if request.size > DATA_SIZE:
             self._reply(peer, request.refuse(MavFtpErr.INVALIDDATASIZE))
-        elif (last := peer.reply) is not None and self._is_repeated(peer, request, last):
-            self._reply(peer, last)
+        elif (reply := peer.reply) is not None and self._is_repeated(peer, request, reply):
+            self._reply(peer, reply)
         else:
             self._answer(peer, request)
 
@@ -216,7 +216,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _terminate(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         session = self._session_of(peer, request)
         del peer.sessions[request.session]
-        session.burst = None
+        session.next_block = None
         session.file.close()
         return request.acknowledge()
 
@@ -230,7 +230,7 @@ class SessionFtpServer(Generic[FilesT]):
         peer.sessions.clear()
         fault = None
         for session in sessions:
-            session.burst = None
+            session.next_block = None
             try:
                 session.file.close()
             except FileFault as error:
@@ -277,7 +277,7 @@ class SessionFtpServer(Generic[FilesT]):
                 return
             peer.reply = None
             del peer.sessions[session.number]
-            session.burst = None
+            session.next_block = None
             with suppress(FileFault):
                 session.file.close()
 
@@ -297,9 +297,9 @@ class SessionFtpServer(Generic[FilesT]):
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
         """Start a burst, or move a running one to another offset. Return None, because the blocks are the answer."""
         session = self._session_of(peer, request)
-        is_running = session.burst is not None
+        is_running = session.next_block is not None
         first_sequence = (request.sequence + 1) & 0xFFFF
-        session.burst = request.replace(sequence=first_sequence)
+        session.next_block = request.replace(sequence=first_sequence)
         session.burst_sent = 0
         if not is_running:
             self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
@@ -309,10 +309,10 @@ class SessionFtpServer(Generic[FilesT]):
         """Send the next blocks of a burst, none while the link is congested, until the burst has ended."""
         max_blocks = 0 if self._is_congested() else self.burst
         for number in range(max_blocks):
-            if session.burst is None:
+            if session.next_block is None:
                 return
-            self._send_block(peer, session, session.burst, may_end=number == self.burst - 1)
-        if session.burst is None:
+            self._send_block(peer, session, session.next_block, may_end=number == self.burst - 1)
+        if session.next_block is None:
             return
         self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
@@ -332,7 +332,7 @@ class SessionFtpServer(Generic[FilesT]):
             peer.errno = fault.errno
             refusal = refusal.replace(data=bytes([MavFtpErr.FAILERRNO, peer.errno]), size=2)
         if not data:
-            session.burst = None
+            session.next_block = None
             self._reply(peer, refusal)
             return
         session.burst_sent += len(data)
@@ -340,7 +340,7 @@ class SessionFtpServer(Generic[FilesT]):
         self._reply(peer, answer.replace(data=data, size=len(data), burst_complete=is_complete))
         next_sequence = (burst.sequence + 1) & 0xFFFF
         next_block = burst.replace(sequence=next_sequence, offset=burst.offset + len(data))
-        session.burst = None if is_complete else next_block
+        session.next_block = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         """Answer with the folder's entries from number ``offset`` on: as many as fit into one message."""
@@ -378,10 +378,10 @@ class SessionFtpServer(Generic[FilesT]):
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
         """Compute a checksum in slices, so that a large file does not block the event loop."""
         path = self._path(request)
-        is_repeated = peer.checksum is not None and request.repeats(peer.checksum)
+        is_repeated = peer.checksum_request is not None and request.repeats(peer.checksum_request)
         if not is_repeated:  # The running computation also answers a repeated request.
             file = self.files.open(path)
-            peer.checksum = request
+            peer.checksum_request = request
             self._continue_crc32(peer, request, file, offset=0, checksum=0)
         return None
 
@@ -400,13 +400,13 @@ class SessionFtpServer(Generic[FilesT]):
         except FileFault as fault:
             has_more = False
             answer = self._answer_fault(peer, request, fault)
-        if peer.checksum is request and has_more:
+        if peer.checksum_request is request and has_more:
             self._host.call_later(_CRC_PAUSE_S, lambda: self._continue_crc32(peer, request, file, offset, checksum))
             return
         with suppress(FileFault):
             file.close()
-        if peer.checksum is request:  # A newer request may have replaced this one, which then gets no answer.
-            peer.checksum = None
+        if peer.checksum_request is request:  # A newer request may have replaced this one, which then gets no answer.
+            peer.checksum_request = None
             peer.used_at = self._host.now
             self._reply(peer, self._adapted(peer, request, answer))
 

@@ -27,7 +27,7 @@ ALL_CAPABILITIES = (
     | _Can.HAS_YAW_AXIS | _Can.HAS_YAW_FOLLOW | _Can.HAS_YAW_LOCK
     | _Can.SUPPORTS_YAW_IN_EARTH_FRAME
 )  # fmt: skip
-_FIRMWARE = 1 << 24
+_VERSION = 1 << 24
 
 
 Owner = tuple[int, int]
@@ -154,7 +154,7 @@ def _device_information(gimbal: GimbalMount) -> m.GimbalDeviceInformation:
     (roll_min, roll_max), (pitch_min, pitch_max), (yaw_min, yaw_max) = gimbal.limits
     return m.GimbalDeviceInformation(
         time_boot_ms=gimbal.host.time_boot_ms, vendor_name=gimbal.vendor, model_name=gimbal.model, custom_name="",
-        firmware_version=_FIRMWARE, hardware_version=_FIRMWARE, uid=gimbal.device_id, cap_flags=gimbal.capabilities,
+        firmware_version=_VERSION, hardware_version=_VERSION, uid=gimbal.device_id, cap_flags=gimbal.capabilities,
         custom_cap_flags=0, roll_min=roll_min, roll_max=roll_max, pitch_min=pitch_min, pitch_max=pitch_max,
         yaw_min=yaw_min, yaw_max=yaw_max,
     )  # fmt: skip
@@ -173,7 +173,7 @@ def _manager_information(gimbal: GimbalMount) -> m.GimbalManagerInformation:
 
 
 _UNCHANGED, _SENDER, _RELEASE = -1, -2, -3
-_RETRACTED_ANGLES = (0.0, 0.0, 0.0)
+_REST_ANGLES = (0.0, 0.0, 0.0)
 _ABSOLUTE_FRAMES = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
@@ -252,14 +252,14 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
-        """Retract the gimbal if ``flags`` say so. Otherwise apply the angles or, if one of them is NaN, the rates.
+        """Move to the rest position if ``flags`` contain RETRACT or NEUTRAL. Otherwise apply the angles or the rates.
 
-        Return False if a rate is NaN, too.
+        The rates are applied if an angle is NaN. Return False if a rate is NaN, too.
         """
         gimbal = self._gimbal
         locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
         if flags & (Flags.RETRACT | Flags.NEUTRAL):
-            gimbal.point(_RETRACTED_ANGLES, flags, locked=False)
+            gimbal.point(_REST_ANGLES, flags, locked=False)
         elif not any(map(math.isnan, angles)):
             gimbal.point(angles, flags, locked=locked)
         elif not any(map(math.isnan, rates)):

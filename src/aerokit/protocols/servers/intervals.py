@@ -101,6 +101,7 @@ class MessageStreams:
         return MavResult.ACCEPTED if is_accepted else MavResult.TEMPORARILY_REJECTED
 
     def _get_interval(self, command: ReceivedCommand) -> int:
+        """Send MESSAGE_INTERVAL, as MAV_CMD_GET_MESSAGE_INTERVAL requests, and return the MAV_RESULT."""
         message_id = to_int(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED

@@ -80,9 +80,9 @@ class MissionServer:
 
     An upload that ``validate`` has accepted replaces the whole list. A missing item is requested again every
     ``retry_interval_s`` seconds. An upload without progress for ``timeout_s`` seconds ends with OPERATION_CANCELLED.
-    During an upload, other clients are DENIED. While ``validate`` decides on a MISSION_CLEAR_ALL, uploads and other
-    requests to clear are DENIED, but a repeated request is ignored. Subclasses for firmware that behaves
-    differently override methods.
+    During an upload, uploads of other clients and requests to clear are DENIED; downloads are answered. While
+    ``validate`` decides on a MISSION_CLEAR_ALL, uploads and other requests to clear are DENIED, but a repeated request
+    is ignored. Subclasses for firmware that behaves differently override methods.
     """
 
     retry_interval_s: ClassVar[float] = 0.5
@@ -106,7 +106,7 @@ class MissionServer:
         """Index of the current item of the mission."""
         self._host = host
         self._validate = validate
-        self._may_set_current = on_set_current
+        self._may_set_current = on_set_current  # returns False to refuse a MISSION_SET_CURRENT
         self._capacity = capacity
         self._uploads: dict[int, ListUpload] = {}
         self._clearing: m.MissionClearAll | None = None
@@ -379,27 +379,28 @@ class MissionServer:
             self._clear(non_empty if kind == MavMissionType.ALL else [kind], request, channel)
 
     def _clear(self, kinds: list[int], request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear these lists one after the other, as long as ``validate`` accepts."""
+        """Clear these lists one after the other, as long as ``validate`` accepts. Then acknowledge."""
+        if not kinds:
+            self._end_clearing(_Result.ACCEPTED, request, channel)
+            return
+        kind, *other_kinds = kinds
 
         def answer(result: int) -> None:
-            if self._clearing is not request:  # The server was reset before the answer arrived.
-                return
-            if result == _Result.ACCEPTED and kinds:
-                cleared_kind, *other_kinds = kinds
-                self.store(cleared_kind, ())
+            if result == _Result.ACCEPTED and self._clearing is request:
+                self.store(kind, ())
                 self._clear(other_kinds, request, channel)
-                return
-            self._clearing = None
-            self._acknowledge(sender_of(request), request.mission_type, result, channel)
+            else:
+                self._end_clearing(result, request, channel)
 
-        if not kinds:
-            answer(_Result.ACCEPTED)
-            return
-        next_kind = kinds[0]
         try:
-            self._validate(next_kind, (), answer)
+            self._validate(kind, (), answer)
         except InvalidArgument:
             answer(_Result.INVALID)
+
+    def _end_clearing(self, result: int, request: m.MissionClearAll, channel: Channel) -> None:
+        if self._clearing is request:  # Otherwise, the server was reset before the answer arrived.
+            self._clearing = None
+            self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
         if not self.set_current(request.seq):

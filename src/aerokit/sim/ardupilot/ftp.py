@@ -86,9 +86,9 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         return None  # Like the firmware, use a single state for all clients.
 
-    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
-        is_same_session = request.client == last.client and request.session == last.session
-        return is_same_session and request.sequence + 1 == last.sequence
+    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, reply: FtpPacket) -> bool:
+        is_same_session = request.client == reply.client and request.session == reply.session
+        return is_same_session and request.sequence + 1 == reply.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         return request.session

@@ -32,8 +32,8 @@ class Px4Ftp(SessionFtpServer[FileTree]):
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
         return channel
 
-    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, last: FtpPacket) -> bool:
-        return request.sequence + 1 == last.sequence and request.client == last.client
+    def _is_repeated(self, peer: FtpPeer, request: FtpPacket, reply: FtpPacket) -> bool:
+        return request.sequence + 1 == reply.sequence and request.client == reply.client
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         return 0
