@@ -102,7 +102,7 @@ class Bus:
         def on_first(frame: Frame) -> None:
             entries_before = self._entries(frame)
             create()
-            detach_all()  # `detach_all` is defined below, before the first frame can arrive.
+            detach_all()  # This function is defined further down. No frame arrives until then.
             # The delivery of this frame uses the sinks from before `create()`, so the new sinks are called here.
             for entry in self._entries(frame):
                 if entry not in entries_before:

@@ -40,7 +40,7 @@ class SignatureGate:
         self._encoder, self._unix_time, self._publish = encoder, unix_time, publish
         self._reported: set[Refusal] = set()  # reasons that were already logged
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
-        self._is_handing_over = False  # True until the `with` block of key_handover() ends
+        self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # None if the file of ``Signing(keep=…)`` could be written
         self.is_open: bool = True
         """True while all frames are admitted without a check."""

@@ -378,8 +378,7 @@ class MemberConnections:
                 self._connected[index] = (network, vehicle)
                 self._changed.set()
                 await self._close.wait()
-                # Leave connect() by an exception, so that it closes the vehicle as after a failed block.
-                if self._has_block_failed:
+                if self._has_block_failed:  # connect() must close the vehicle as after an error in its own block.
                     raise _BlockFailed
         except _BlockFailed:
             pass

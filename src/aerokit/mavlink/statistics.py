@@ -37,13 +37,13 @@ class SourceStatistics(SourceFields):
         "_alternations",
         "_last_expected",
         "_late_run",
-        "_late_sequence",
         "_missing",
         "_missing_base",
         "_other_at",
         "_other_count",
         "_other_expected",
-        "_received_at_late",
+        "_received_at_repetition",
+        "_repeated_sequence",
         "_returns",
         "_skipped_over",
         "_stream_start",
@@ -67,13 +67,13 @@ class SourceStatistics(SourceFields):
         """Number of lost frames. A frame that arrives late no longer counts as lost."""
         self.expected = sequence
         """Sequence number of the next frame. Does not wrap at 255; the low byte is the number on the wire."""
-        # Number of steps by which `expected` has advanced without a received frame. `received` is `expected` minus this
-        # number, so a received frame only has to increase `expected`.
+        # The first sequence number, plus the steps by which `expected` has advanced without a received frame.
+        # `received` is `expected` minus this number, so a received frame only has to increase `expected`.
         self._unreceived = sequence
         self._missing = 0  # bit n is set if the frame n + 1 before `_missing_base` is missing
         self._missing_base = sequence  # value of `expected` to which `_missing` refers
-        self._late_sequence = -1  # sequence number of the last repeated frame
-        self._received_at_late = -1  # value of `received` when that frame arrived
+        self._repeated_sequence = -1  # sequence number of the last repeated frame
+        self._received_at_repetition = -1  # value of `received` when that frame arrived
         self._other_expected = -1  # next sequence number of a second stream with the same ids; -1 if there is none
         self._stream_start = 0  # value of `received` at the beginning of the current stream
         self._alternations = 0  # how often the two streams have alternated
@@ -161,8 +161,8 @@ class SourceStatistics(SourceFields):
 
         A single old number is a repetition. Several in direct succession show that the sender rebooted.
         """
-        follows = sequence == (self._late_sequence + 1) & 0xFF
-        is_direct_succession = follows and self._received_at_late == self.received
+        follows = sequence == (self._repeated_sequence + 1) & 0xFF
+        is_direct_succession = follows and self._received_at_repetition == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
         is_near = (self.expected - sequence) & 0xFF <= _MAX_GAP
         # A link may repeat two or three recent frames, so a longer run of recent numbers is required. It hardly ever
@@ -180,8 +180,8 @@ class SourceStatistics(SourceFields):
             self._alternations = 0
             self._alternated_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
-        self._late_sequence = sequence
-        self._received_at_late = self.received
+        self._repeated_sequence = sequence
+        self._received_at_repetition = self.received
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:

@@ -286,7 +286,10 @@ class CommandExchange(Exchange[CommandAck]):
         return self._answer_count
 
     def expire(self, now: float) -> None:
-        """Repeat the command. Fail after the last attempt, or when progress reports have stopped."""
+        """After the deadline, repeat the command. Fail after the last attempt, or if progress reports have stopped.
+
+        A command with an ``order_status`` is handled by `_expire_order`.
+        """
         if self.deadline is None or now < self.deadline:
             return
         if self._in_progress:

@@ -253,7 +253,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._outbox += self.cancellation()
         # Numbered as the caller does, without home.
         missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)
-        has_count = bool(self._indices)  # `_count` is None after a restart
+        has_count = bool(self._indices)  # A restart resets `_count` to None.
         details = f"missing: {format_ranges(missing) or 'home'}" if has_count else "no MISSION_COUNT was received"
         self._fail(
             MissionTimeout(

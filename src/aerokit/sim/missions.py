@@ -38,7 +38,7 @@ class MissionStore(Protocol):
         ...
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Replace the items at once, as a file upload does, and return the MAV_MISSION_RESULT."""
+        """Replace all items in one step, as the upload of a file does, and return the MAV_MISSION_RESULT."""
         ...
 
 

@@ -121,7 +121,7 @@ class FixedWing(Motion):
         was_on_ground = self.is_on_ground
         velocity_before = (self.velocity_north, self.velocity_east, self.velocity_down)
         if was_on_ground and not self._lifts_off(powered=powered):
-            self._roll_on_ground(dt, powered=powered)
+            self._taxi(dt, powered=powered)
         else:
             self._fly(dt, powered=powered)
             if self.is_on_ground and self.velocity_down >= 0.0 and not was_on_ground:
@@ -136,8 +136,8 @@ class FixedWing(Motion):
     def _lifts_off(self, *, powered: bool) -> bool:
         return powered and self._wanted_climb > 0.0 and self._speed >= self.wing_limits.airspeed_min_m_s
 
-    def _roll_on_ground(self, dt: float, *, powered: bool) -> None:
-        """Roll along the nose on the level ground. Without power, the plane brakes."""
+    def _taxi(self, dt: float, *, powered: bool) -> None:
+        """Move on the wheels over level ground, in the direction of the nose. Without power, the plane brakes."""
         wanted_speed = self._wanted_airspeed if powered else 0.0
         self._change_airspeed(wanted_speed, dt)
         self.throttle = 1.0 if powered and wanted_speed > self._speed else 0.0

@@ -99,7 +99,7 @@ def content_policy(tiles: str | None) -> str:
             raise InvalidArgument(
                 f"tiles = {tiles!r} is not a tile URL, such as https://tiles.example/{{z}}/{{x}}/{{y}}.png"
             )
-        # Leaflet replaces a tile that is no longer needed by an empty image, a data URL, to end its download.
+        # To end the download of a tile that is no longer needed, Leaflet replaces the tile's URL with a data URL.
         image_sources += f" {url.scheme}://{url.netloc} data:"
     return (
         f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {image_sources}; connect-src 'self';"

@@ -142,7 +142,8 @@ class _Tables:
             raise FileFormatError(
                 f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        _, time_us = min(first_rows)  # the first row; the lowest time could be that of a damaged row
+        # min() compares the positions in the file. The lowest time could be that of a damaged row.
+        _, time_us = min(first_rows)
         return int(time_us)
 
 

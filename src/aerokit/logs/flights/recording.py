@@ -91,10 +91,13 @@ class LinkCounter:
             self._series.add(ends_s, *_ALL_LOST)
 
     def _add_row(self, second: int) -> None:
-        """Add a row for the counted second, and start to count ``second``. No frames arrived in the seconds between."""
+        """Add a row for the counted second, and start to count ``second``.
+
+        The seconds between, in which no frames arrived, get two rows: one for the first and one for the last of them.
+        """
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
-        if second - self._second > 1:  # the first and the last second without frames
+        if second - self._second > 1:
             self._series.add(self._second + 1, *_ALL_LOST)
             self._series.add(second - 1, *_ALL_LOST)
         self._second, self._received, self._lost = second, 0, 0

@@ -124,7 +124,7 @@ def _maps(flights: Sequence[FlightLog]) -> Section:
             traces.append({"x": east, "y": north, **_line_style(number)})
     if not traces:
         return Section("Tracks", missing="Neither log has positions.")
-    chart = Chart("maps", traces, map_layout(traces), height=520, label="both tracks from above, north is up")
+    chart = Chart("maps", traces, map_layout(traces), height=520, label="tracks from above, north is up")
     return Section(
         "Tracks",
         [chart, *simplification_note(max(deviations))],

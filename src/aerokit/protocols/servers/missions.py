@@ -242,16 +242,16 @@ class MissionServer:
         if message.count > self.capacity(kind):
             self._refuse_size(message, channel)
             return
-        upload = self._begin(message, channel, first=0, end=message.count)
+        upload = self._register_upload(message, channel, first=0, end=message.count)
         if message.count:
-            self._start(upload)
+            self._request_first_item(upload)
         else:
             self._finish(upload)
 
     def _refuse_size(self, message: m.MissionCount, channel: Channel) -> None:
         self._acknowledge(sender_of(message), message.mission_type, _Result.NO_SPACE, channel)
 
-    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
+    def _register_upload(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
         """Register an upload of the items from ``first`` to before ``end``. Nothing is sent."""
         upload = ListUpload(
             client=sender_of(message), channel=channel, mission_type=message.mission_type, next=first, end=end,
@@ -260,7 +260,7 @@ class MissionServer:
         self._uploads[self._key(upload.mission_type)] = upload
         return upload
 
-    def _start(self, upload: ListUpload) -> None:
+    def _request_first_item(self, upload: ListUpload) -> None:
         self._request_item(upload)
         self._watch(upload)
 

@@ -166,11 +166,11 @@ class ArduPilotMissionServer(MissionServer):
         super()._refuse_size(message, channel)
         self._warn(f"Only {self.capacity(message.mission_type)} items are supported")
 
-    def _begin(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
+    def _register_upload(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
         """Prepare the list for an upload. ``first`` and ``end`` are the range of the uploaded items."""
         if isinstance(message, m.MissionCount):
             self._lists[message.mission_type].begin(message.count)
-        return super()._begin(message, channel, first, end)
+        return super()._register_upload(message, channel, first, end)
 
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         """Start the upload of some items of a list."""
@@ -185,11 +185,11 @@ class ArduPilotMissionServer(MissionServer):
             return
         self._lists[kind].begin_update()
         first, after_last = start, end + 1
-        self._start(self._begin(request, channel, first, after_last))
+        self._request_first_item(self._register_upload(request, channel, first, after_last))
 
-    def _start(self, upload: ListUpload) -> None:
+    def _request_first_item(self, upload: ListUpload) -> None:
         self._warnings -= {(kind, upload.mission_type) for kind in (m.MissionItem, m.MissionRequest)}
-        super()._start(upload)
+        super()._request_first_item(upload)
 
     def _drop(self, upload: ListUpload) -> None:
         super()._drop(upload)

@@ -226,8 +226,9 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _land_by_mission(self) -> bool:
         """Start the landing sequence of the mission. Return False without a DO_LAND_START, or if AUTO is refused."""
         plane = self.vehicle
-        items = enumerate(plane.missions.commands.items())
-        land_start = next((index for index, item in items if item.command == MavCmd.DO_LAND_START), None)
+        stored_items = plane.missions.commands.items()
+        land_starts = (seq for seq, item in enumerate(stored_items) if item.command == MavCmd.DO_LAND_START)
+        land_start = next(land_starts, None)
         if land_start is None:
             self.warn("Unable to start landing sequence")
             return False

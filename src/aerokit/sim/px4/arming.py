@@ -176,7 +176,7 @@ class Px4Arming:
             reasons.append("No valid position estimate")
         if self.is_terminated:
             reasons.append("Flight termination active")
-        return [f"Preflight Fail: {reason}" for reason in reasons] + px4.failsafes.arming_reasons()
+        return [f"Preflight Fail: {reason}" for reason in reasons] + px4.failsafes.arming_obstacles()
 
     def report_reasons(self) -> None:
         for reason in self.reasons():

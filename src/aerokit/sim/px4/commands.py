@@ -266,7 +266,10 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def _destination(self, command: ReceivedCommand) -> tuple[float, float, float]:
-        """Return the position in a command. Values that are NaN or INT32_MAX mean the vehicle's present position."""
+        """Return the position in a command.
+
+        The place stays if latitude or longitude is NaN or INT32_MAX, and the height stays if the altitude is NaN.
+        """
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
         has_place = math.isfinite(command.x) and math.isfinite(command.y) and _INT32_MAX not in (command.x, command.y)

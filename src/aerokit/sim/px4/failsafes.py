@@ -237,7 +237,7 @@ class Px4Failsafes:
         must_land = action == _BATTERY_LAND or state == MavBatteryChargeState.EMERGENCY
         return Action.LAND if must_land else Action.RETURN
 
-    def arming_reasons(self) -> list[str]:
+    def arming_obstacles(self) -> list[str]:
         """Return the texts of the failures that prevent arming."""
         reasons = list(self.fence.breaches)
         level = self._battery_level()

@@ -220,7 +220,10 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
-        """Count a refused frame. Return a notice, or nothing if a notice about this message was sent recently."""
+        """Count a refused frame, and return a notice.
+
+        Without an answer in the notice, nothing is returned if a notice about this message was sent recently.
+        """
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
         answer = b"" if message is None or is_late else _answer(frame, message, reason)

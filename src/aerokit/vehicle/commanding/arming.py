@@ -129,8 +129,8 @@ class ArmingActions(VehicleBase):
         command is sent again. In all other cases the command is sent only once, because a repetition might arm a
         vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
         still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open. If
-        this command arms the vehicle after all, aerokit disarms it. Arming is attributed to this command if the vehicle
-        accepts the command, or reports armed in the next HEARTBEAT without a takeover. A vehicle that was armed
+        this command arms the vehicle after all, aerokit disarms it. This command counts as the cause if the vehicle
+        accepts it, or if the next HEARTBEAT reports armed and no pilot has taken over. A vehicle that was armed
         otherwise stays armed. Logger "aerokit" warns about the outcome.
 
         Args:

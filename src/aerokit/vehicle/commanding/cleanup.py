@@ -218,7 +218,7 @@ class FlightCleanup:
 
     @property
     def is_hold_pending(self) -> bool:
-        """True while a hold after an abandoned flight is not confirmed."""
+        """True from the moment at which a flight is abandoned until the vehicle confirms the hold that ends it."""
         return self._task.is_open
 
     async def finish(self) -> None:

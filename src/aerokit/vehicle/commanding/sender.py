@@ -51,7 +51,7 @@ class OrderSender:
         """Send one command of an order until it is acknowledged or its effect is reported.
 
         The effect is reported once the vehicle has changed to one of ``modes`` or to ``armed``, or ``is_done()``
-        returns True. Each command after the first one of an order that steers waits for a recent HEARTBEAT.
+        returns True. In a steering order, each command but the first one waits for a recent HEARTBEAT.
 
         Raises:
             OperationRejected: the order has ended: it was superseded or taken over. Or the computer slept before a
@@ -61,7 +61,8 @@ class OrderSender:
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
         self.raise_if_ended(order)
-        if order.was_sent and STEERING in order.ended_by:
+        is_steering = STEERING in order.ended_by  # A newer steering order would end this order.
+        if order.was_sent and is_steering:
             await self.await_recent_state(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
         started = self._session.connection.now()

@@ -221,7 +221,7 @@ class SimpleOrder(Snapshot):
 
 
 def _supersession(order: Order | None) -> str | None:
-    """Return a clause if a newer order has replaced this one."""
+    """Return the part of an error text that says that a newer order has replaced this order; None if none has."""
     return SUPERSEDED if order is not None and not order.is_newest else None
 
 

@@ -119,9 +119,10 @@ class MissionEndDetector:
         return not reports_state and last is not None and self._tracker.reached == last
 
     def _has_stayed_complete(self) -> bool:
-        """Return True if the mission has been complete for ``END_GRACE_S``.
+        """Return True if the mission has been complete for ``END_GRACE_S``. Call this only while it is complete.
 
-        PX4 reports completion when a return or a landing begins. HEARTBEAT may report the new mode a little later.
+        The first call starts the time. PX4 reports completion when a return or a landing begins. HEARTBEAT may report
+        the new mode a little later.
         """
         now = self._session.connection.now()
         if self._completed_at is None:

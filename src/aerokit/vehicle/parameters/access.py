@@ -193,7 +193,7 @@ class ParameterAccess:
         return ParameterTable(parameters)
 
     async def _download_list(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
-        """Request the list by PARAM_REQUEST_LIST, one message for each parameter, and then the missing parameters."""
+        """Send PARAM_REQUEST_LIST, to which the vehicle answers with all parameters, and then request those missing."""
         from aerokit.protocols.parameter_list import ParameterList
 
         transfers = self._transfers
