@@ -255,7 +255,7 @@ async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., Simul
         await vehicle.go_to(center.offset(north_m=300), timeout=120)  # ArduPlane keeps the radius.
 
 
-async def test_figure_eight_of_plane_has_axis_from_minus_pi_to_pi() -> None:
+async def test_figure_eight_axis_is_within_pi() -> None:
     plane = SimulatedPx4Plane(boot_time_s=0.0)
     axes_rad: list[float] = []
 
