@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from flight_harness import Flight
 
-from aerokit.errors import ParameterRejected
+from aerokit.errors import OperationTimeout, ParameterRejected
 from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamSet, ParamValue
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.vehicle.parameters.writing import outcome_of
@@ -83,4 +83,26 @@ async def test_echo_of_previous_write_confirms_nothing(grounded: Flight) -> None
     copter.handlers[ParamSet.ID] = lose_first
     assert (await parameters.set("LAND_SPEED", 61)).outcome == "set"
     assert lost
+    assert copter.parameters["LAND_SPEED"] == 61
+
+
+async def test_echo_of_cancelled_write_confirms_nothing(grounded: Flight) -> None:
+    """Another station undoes a cancelled write. Its late echo arrives when the same value is written again."""
+    copter, parameters = grounded.copter, grounded.vehicle.parameters
+    await parameters.get("LAND_SPEED")
+    on_set = copter.handlers[ParamSet.ID]
+    lost: list[ParamSet] = []
+
+    def lose_two(message: ParamSet, channel: Any) -> None:
+        if len(lost) == 2:
+            on_set(message, channel)
+            return
+        lost.append(message)
+        if len(lost) == 2:
+            copter.send(ParamValue("LAND_SPEED", 61, message.param_type, len(copter.parameters), 65535))
+
+    copter.handlers[ParamSet.ID] = lose_two
+    with pytest.raises(OperationTimeout):
+        await parameters.set("LAND_SPEED", 61, timeout=0.01)
+    assert (await parameters.set("LAND_SPEED", 61)).outcome == "set"
     assert copter.parameters["LAND_SPEED"] == 61

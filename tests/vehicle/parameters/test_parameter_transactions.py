@@ -12,6 +12,7 @@ from aerokit import messages
 from aerokit.errors import (
     InvalidArgument,
     LinkLost,
+    OperationTimeout,
     ParameterRejected,
     RollbackFailed,
     VerificationFailed,
@@ -65,6 +66,19 @@ async def test_value_changed_by_program_is_restored() -> None:
         parameters = flight.vehicle.parameters
         async with parameters.temporarily({"RTL_ALT": 2000}):
             await parameters.set("RTL_ALT", 3000)
+        assert values(flight) == BEFORE
+
+
+async def test_value_of_cancelled_upload_is_restored() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        async with parameters.temporarily({"RTL_ALT": 2000}):
+            flight.copter.faults.mute_parameters = {"RTL_ALT"}
+            with pytest.raises(OperationTimeout):
+                await parameters.upload({"RTL_ALT": 3000}, method="ftp", timeout=2.0)
+            flight.copter.faults.mute_parameters = set()
+            assert values(flight)[0] == 3000
         assert values(flight) == BEFORE
 
 

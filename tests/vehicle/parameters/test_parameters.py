@@ -128,6 +128,17 @@ async def test_download_with_dropped_mavftp_soon_uses_the_list() -> None:
             await flight.vehicle.parameters.download(method="ftp", refresh=True)
 
 
+async def test_mavftp_answers_to_another_station_do_not_delay_the_list() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        await flight.vehicle.version.wait_until(lambda _: True)
+        answer = messages.FileTransferProtocol(0, 77, 190, b"")
+        simulated.handlers[messages.FileTransferProtocol.ID] = lambda *_: simulated.send(answer)
+        began = anyio.current_time()
+        assert len(await flight.vehicle.parameters.download()) == 120
+        assert anyio.current_time() - began < 5
+
+
 async def test_missing_file_is_tried_once_until_reboot() -> None:
     async with open_px4(px4()) as flight:
         parameters = flight.vehicle.parameters
@@ -446,6 +457,35 @@ async def test_unconfirmed_write_times_out() -> None:
 
 
 # ------------------------------------------------------------------------------------ uploading
+
+
+async def test_upload_by_file_keeps_value_set_during_read_back() -> None:
+    async with open_flight(copter()) as flight:
+        simulated, parameters = flight.copter, flight.vehicle.parameters
+        await parameters.download()
+        on_read = simulated.handlers[messages.ParamRequestRead.ID]
+        writes: list[asyncio.Task[Any]] = []
+
+        def set_at_first_read(message: messages.ParamRequestRead, channel: Any) -> None:
+            if writes:
+                on_read(message, channel)
+            else:  # This request is lost, so the value is read after the other task has written it.
+                writes.append(asyncio.create_task(parameters.set("RTL_ALT", 3000)))
+
+        simulated.handlers[messages.ParamRequestRead.ID] = set_at_first_read
+        result = (await parameters.upload({"RTL_ALT": 2000}, method="ftp"))["RTL_ALT"]
+        assert (result.outcome, result.value) == ("set", 2000)
+        assert (await writes[0]).outcome == "set"
+        assert simulated.parameters["RTL_ALT"] == 3000
+
+
+async def test_upload_by_file_of_previous_value_updates_the_table() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        await parameters.set("RTL_ALT", 2000)
+        await parameters.upload({"RTL_ALT": 1500}, method="ftp")
+        assert flight.copter.parameters["RTL_ALT"] == parameters.table["RTL_ALT"].value == 1500
 
 
 @pytest.mark.parametrize("method", ["auto", "ftp", "set"])
