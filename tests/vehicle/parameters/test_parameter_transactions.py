@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 import anyio
 import pytest
@@ -59,6 +60,24 @@ async def test_value_changed_by_another_station_stays(is_received: bool, caplog:
         assert values(flight) == (2500.0, 50.0)
         assert "RTL_ALT is not restored: another station has changed it from 2000 to 2500" in caplog.text
         assert "LAND_SPEED" not in caplog.text
+
+
+async def test_parameter_shown_by_another_one_is_restored() -> None:
+    """Like ArduPilot's …_ENABLE: the copter has LAND_SPEED only after RTL_ALT was set."""
+    simulated = copter()
+    simulated.parameters.remove("LAND_SPEED")
+    on_set = simulated.handlers[messages.ParamSet.ID]
+
+    def show(message: messages.ParamSet, channel: Any) -> None:
+        if message.param_id == "RTL_ALT" and "LAND_SPEED" not in simulated.parameters:
+            simulated.parameters.add("LAND_SPEED", 50)
+        on_set(message, channel)
+
+    simulated.handlers[messages.ParamSet.ID] = show
+    async with open_flight(simulated) as flight:
+        async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}):
+            assert values(flight) == (2000, 60)
+        assert values(flight) == BEFORE
 
 
 async def test_value_changed_by_program_is_restored() -> None:
@@ -218,6 +237,16 @@ async def test_successful_transaction_keeps_values() -> None:
         assert values(flight) == (2500, 60)
         with pytest.raises(InvalidArgument, match="not open"):
             await transaction.set("RTL_ALT", 1)
+
+
+async def test_transaction_changes_include_cancelled_call() -> None:
+    async with open_flight(copter()) as flight, flight.vehicle.parameters.transaction() as transaction:
+        await transaction.set("LAND_SPEED", 60)
+        flight.copter.faults.mute_parameters = {"LAND_SPEED"}
+        with anyio.move_on_after(1.0) as scope:
+            await transaction.set_many({"RTL_ALT": 2000, "LAND_SPEED": 70})
+        assert scope.cancelled_caught
+        assert [change.name for change in transaction.changes] == ["LAND_SPEED", "RTL_ALT"]
 
 
 async def fail_after_writing(parameters: Parameters, error: Exception) -> None:

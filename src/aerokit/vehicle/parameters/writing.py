@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Literal
 
 from aerokit._internal.formatting import did_you_mean
@@ -15,8 +15,6 @@ from aerokit.parameters import Parameter, ParameterType, check_name, checked_val
 from aerokit.parameters.parameter import same_value
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from aerokit.parameters import ParameterTable
     from aerokit.parameters.renames import Renamed
     from aerokit.protocols.exchange import OnProgress
@@ -225,6 +223,7 @@ def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) 
 MAX_ROUNDS = 3
 
 NoteOf = Callable[[str, float], str]
+Resolve = Callable[[Iterable[str], float], Awaitable[dict[str, ResolvedParameter | ParameterFailure]]]
 
 
 class _PlannedWrite(Snapshot):
@@ -257,17 +256,20 @@ class ParameterWriter:
         values: Mapping[str, float],
         *,
         upload: UploadMethod | None = None,
+        resolve: Resolve | None = None,
         idle_timeout_s: float,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
         """Write the values; return a result for each, in order.
 
-        With ``upload``, send only values that differ from the known ones, by the method ``upload``.
+        With ``upload``, send only values that differ from the known ones, by the method ``upload``. ``resolve`` is
+        called before each round of writes instead of :meth:`NameResolver.resolve`.
         """
+        resolve = resolve or self.names.resolve
         results: dict[str, ParameterWrite] = {}
         pending = check_values(values)
         for attempt in range(MAX_ROUNDS):
-            resolved = await self.names.resolve(pending, idle_timeout_s)
+            resolved = await resolve(pending, idle_timeout_s)
             count_before = self._access.store.count
             plans, errors = self._plan_writes(resolved, pending, is_first=attempt == 0)
             answers = await self._send(plans, upload, idle_timeout_s, on_progress)
