@@ -26,6 +26,7 @@ from aerokit.errors import (
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpErr
 from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterTable, ParameterType
+from aerokit.parameters.pack import pack_parameters
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink
@@ -477,6 +478,20 @@ async def test_upload_by_file_keeps_value_set_during_read_back() -> None:
         assert (result.outcome, result.value) == ("set", 2000)
         assert (await writes[0]).outcome == "set"
         assert simulated.parameters["RTL_ALT"] == 3000
+
+
+async def test_upload_by_file_has_each_parameter_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    uploaded: list[Parameter] = []
+
+    def pack(parameters: tuple[Parameter, ...]) -> bytes:
+        uploaded.extend(parameters)
+        return pack_parameters(parameters)
+
+    monkeypatch.setattr("aerokit.parameters.pack.pack_parameters", pack)
+    async with open_flight(copter()) as flight:
+        results = await flight.vehicle.parameters.upload({"RTL_ALT": 2000, "rtl_alt": 2000}, method="ftp")
+        assert {name: result.value for name, result in results.items()} == {"RTL_ALT": 2000, "rtl_alt": 2000}
+        assert [parameter.name for parameter in uploaded] == ["RTL_ALT"]
 
 
 async def test_upload_by_file_of_previous_value_updates_the_table() -> None:
