@@ -2572,7 +2572,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2766,7 +2766,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2875,7 +2875,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
