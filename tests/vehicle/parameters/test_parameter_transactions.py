@@ -80,6 +80,16 @@ async def test_parameter_shown_by_another_one_is_restored() -> None:
         assert values(flight) == BEFORE
 
 
+async def test_value_that_another_station_has_just_undone_is_restored() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.set("RTL_ALT", 2000)
+        flight.copter.parameters["RTL_ALT"] = 1500.0
+        async with parameters.temporarily({"RTL_ALT": 3000}):
+            assert values(flight)[0] == 3000
+        assert values(flight) == BEFORE
+
+
 async def test_value_changed_by_program_is_restored() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters

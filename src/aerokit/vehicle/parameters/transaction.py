@@ -75,18 +75,20 @@ class _Block:
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
         unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
         answers = await self._access.read(unread_names, idle_timeout_s)
+        current: dict[str, Parameter] = {}
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
+            # The answer may be a float that lacks the last bits of the store's value. Another value in the store is
+            # wrong: another station has just undone our last write, and the store took this for a delayed message.
+            known = self._access.store.get(name) or answer
+            current[name] = known if same_value(float(known.value), float(answer.value)) else answer
             if name not in self._saved:
-                # The read has updated the store. The store's value is preferred, because it is exact, whereas the
-                # answer may be a float that lacks the last bits.
-                self._saved[name] = self._access.store.get(name) or answer
+                self._saved[name] = current[name]
                 self._registry.add(name, self)
         for result in resolved:
-            known = self._access.store.get(result.name)
-            if known is not None:
-                results[result.requested] = result.replace(parameter=known)
+            if result.name in current:
+                results[result.requested] = result.replace(parameter=current[result.name])
         return results
 
     def _take_saved(self) -> list[Parameter]:
