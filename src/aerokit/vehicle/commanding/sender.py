@@ -11,7 +11,7 @@ import anyio
 from aerokit._internal.arguments import check_range
 from aerokit.errors import CommandRejected, CommandTimeout, HeartbeatTimeout, NotSupported, OperationRejected
 from aerokit.mavlink.enums import MavCmd, MavResult
-from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, MAX_ATTEMPTS, rejection
+from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
 from aerokit.vehicle.commanding.ground import ImpactDetector
 from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, REQUEST_COMMANDS
@@ -177,7 +177,7 @@ class OrderSender:
                 component_id=component_id,
             )
         except CommandRejected as error:
-            is_for_autopilot = component_id in (None, self._session.component_id)
+            is_for_autopilot = component_id in (None, BROADCAST, self._session.component_id)
             if error.result != MavResult.UNSUPPORTED or not is_for_autopilot:  # SET_MODE has no target component.
                 raise
             self.raise_if_ended(order)
