@@ -110,6 +110,15 @@ def test_order_is_not_resent_after_old_heartbeat(now: float, expected: list[int]
     assert machine.done is (now > 4.0)
 
 
+def test_order_is_not_resent_after_its_time() -> None:
+    """The event loop was blocked, and a HEARTBEAT arrived after it."""
+    machine = order(Status(heartbeat_at=13.9))
+    assert confirmations(machine) == [0]
+    machine.expire(14.0)
+    assert machine.done
+    assert confirmations(machine) == []
+
+
 def test_order_waits_for_last_sending() -> None:
     order_status = Status(heartbeat_at=0.75)
     machine = order(order_status, attempts=2)

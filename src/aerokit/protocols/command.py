@@ -306,14 +306,15 @@ class CommandExchange(Exchange[CommandAck]):
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
             return
+        # The time is checked first: if the event loop was blocked, a recent HEARTBEAT must not cause a late repetition.
+        give_up_at = self._started_at + self._attempts * self._attempt_timeout
+        if now >= give_up_at:
+            self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_repeated()))
+            return
         # A HEARTBEAT after this time shows that the link to the vehicle works, so the order may be repeated.
         min_heartbeat_at = max(self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout, now - MAX_HEARTBEAT_AGE_S)
         if self._sent_count < self._attempts and order_status.heartbeat_at >= min_heartbeat_at:
             self._send(now)
-            return
-        give_up_at = self._started_at + self._attempts * self._attempt_timeout
-        if now >= give_up_at:
-            self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_repeated()))
         else:
             self.deadline = min(now + POLL_INTERVAL_S, give_up_at)
 

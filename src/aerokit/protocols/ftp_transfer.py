@@ -230,9 +230,10 @@ class FtpDownload(FtpExchange[int]):
     def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
         offset = sent.offset
         self._requests.on_answer(offset, now, sent_at=sent.at)
-        if reply.is_ack and reply.data:
+        if reply.is_ack and reply.data and not self._is_past_size(offset):
             self._add(offset, reply.data, now)
-        # An ACK without data also means that the offset is not before the end of the file.
+        # An ACK without data also means that the offset is not before the end of the file. Data after the known size
+        # means that the file has grown, so it is dropped.
         elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
             self._end_at(offset)
         else:

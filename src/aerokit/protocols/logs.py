@@ -76,12 +76,13 @@ class LogDownload(Transfer[int]):
         self._stream = MessageStream(self.round_trip)
         self._is_streaming = False
         self._range_end = into.position
-        self._latest_offset = self._range_end  # largest offset received in the current range
+        self._latest_offset = self._range_end  # largest offset received in the range, or the block before the range
         self._max_range_blocks = FIRST_RANGE
         self._requested_blocks = 0  # number of requested blocks of the current range
         self._received_blocks = 0
         self._early_ends = 0  # number of short blocks before the end of the log
-        self._has_checked_gaps = True  # False while the last range may have long gaps
+        # False while the last range, or an earlier download into the same `Reassembly`, may have left long gaps.
+        self._has_checked_gaps = not into.gaps
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -131,7 +132,13 @@ class LogDownload(Transfer[int]):
             self._is_streaming = offset + LOG_BLOCK < self._range_end
         # If the log has grown since it was listed, PX4 sends a full block at the listed end. The rest is cut off.
         length = min(message.count, self._size - offset)
-        if self._reassembly.add(offset, bytes(message.data[:length])):
+        try:
+            is_new = self._reassembly.add(offset, bytes(message.data[:length]))
+        except Exception as error:  # Writing failed, e.g. because the disk is full.
+            self._fail(error)
+            self._send_end()
+            return
+        if is_new:
             self._report_progress(now, self._reassembly.done, self._size)
         self._requests.on_answer(offset, now)
 
