@@ -154,6 +154,16 @@ def test_unrepeatable_order_is_sent_once(command: int) -> None:
     assert text_of(machine).endswith(f"within 4.0 s; not sent again, because a repetition {what}")
 
 
+def test_unrepeatable_command_without_order_is_sent_once() -> None:
+    message = command_long(1, 1, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, (1.0,))
+    machine = CommandExchange(message, own_system=255, own_component=190)
+    machine.start(0.0)
+    assert machine.deadline == 4.0
+    machine.expire(4.0)
+    assert machine.done
+    assert confirmations(machine) == [0]
+
+
 def test_unrepeatable_order_ends_with_its_effect() -> None:
     order_status = Status()
     machine = order(order_status, arm=1.0)
