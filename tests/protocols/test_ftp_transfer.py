@@ -228,7 +228,7 @@ def test_download_drops_read_block_after_old_size() -> None:
     exchange.receive(as_message(reply_to(burst, code=MavFtpErr.UNKNOWNCOMMAND)), 0.1)
     reads = {request.offset: request for request in requests_in(exchange.take_outbox())}
     exchange.receive(as_message(reply_to(reads[478], bytes(239), offset=478)), 0.2)
-    assert download.into.done == 0
+    assert download.into.received_bytes == 0
     for offset in (239, 0):
         exchange.receive(as_message(reply_to(reads[offset], content(600)[offset:][:239], offset=offset)), 0.3)
     assert exchange.result() == 300

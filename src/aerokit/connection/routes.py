@@ -229,7 +229,10 @@ class Routes:
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Return True if ``peer`` takes over the route of this frame's sender; see the class for the rules."""
+        """Record the claim of ``peer`` to the route of this frame's sender; return True if the route was moved to it.
+
+        See the class for the rules. A claim that is refused, and a move, are published.
+        """
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
@@ -320,6 +323,7 @@ class Routes:
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         """Send to ``peer`` from now on, and drop all claims to the route, because they refer to the old owner."""
         before, route.peer = route.peer, peer
+        # The frame counts as a heartbeat, so that the new peer has time for its first one.
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id

@@ -96,8 +96,8 @@ class _BlockRequest:
 class BlockRequests:
     """Requests for blocks, keyed by offset. An adaptive window limits the number of requests in flight.
 
-    The first ``burst_size`` requests are sent at once, further ones ``spacing_s`` seconds apart. A request is repeated
-    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
+    The first ``burst_size`` requests are sent without delay, further ones ``spacing_s`` seconds apart. A request is
+    repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, burst_size: int = BURST_SIZE, spacing_s: float = SPACING_S) -> None:
@@ -259,7 +259,7 @@ class Reassembly:
         self._bytes_ahead = 0
 
     @property
-    def done(self) -> int:
+    def received_bytes(self) -> int:
         """Number of bytes received, including those before ``start``."""
         return self.position + self._bytes_ahead
 

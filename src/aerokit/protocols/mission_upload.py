@@ -215,18 +215,22 @@ class MissionUpload(MissionExchange[UploadResult]):
                     self._wait(now)
         elif result == MavMissionResult.OPERATION_CANCELLED:
             self._restart(result, now)
-        elif result == MavMissionResult.ERROR and not self._is_partial_refusal:
+        elif result == MavMissionResult.ERROR and not self._is_refusal_of_partial_upload:
             self._on_error(now)
         else:
             self._fail_as_refused(result)
 
     @property
-    def _is_partial_refusal(self) -> bool:
+    def _is_refusal_of_partial_upload(self) -> bool:
         """True if an ERROR refuses MISSION_WRITE_PARTIAL_LIST."""
         return self._is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
-        """Process an ERROR that may be temporary: repeat an item first, and end the upload after a second ERROR."""
+        """Process an ERROR that may be temporary.
+
+        Before the first request, wait and announce the items again. Then repeat an item, unless it is in flight. At a
+        second ERROR fail, or end without a confirmation if all items were sent.
+        """
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
         # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
         # therefore repeated. A second ERROR that arrives within a round trip may answer what was sent before the
@@ -260,7 +264,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         """Begin again, because ``result`` shows that the vehicle's transfer has expired or was cancelled."""
         if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
             return
-        # A partial upload does not begin again, because some of the old items may already have been replaced.
+        # A partial upload does not begin again. The differences were computed from the vehicle's plan, which another
+        # station may have changed since.
         if self._is_partial or self._restarts >= MAX_RESTARTS:
             self._fail_as_refused(result)
             return
@@ -308,13 +313,13 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
-        """Call `_send` for all unconfirmed items, except those in flight, and for ``ahead`` items after them.
+        """Repeat the items that were sent but not confirmed, except those in flight, and send ``ahead`` more.
 
-        The vehicle's requests for these items may have been lost.
+        The vehicle's requests for the repeated items may have been lost.
         """
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # Not only the last item is repeated. PX4 takes any repeated item for the mission's last item, and confirms
-            # the upload. This confirmation does not prove that PX4 has all items.
+            # Not only the last item may be repeated. PX4 takes any repeated item for the mission's last item, and
+            # confirms the upload. This confirmation does not prove that PX4 has all items.
             self._was_tail_repeated = True
         # One more than the window, because the vehicle may already have the first unconfirmed item.
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)
