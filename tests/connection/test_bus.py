@@ -89,6 +89,22 @@ def test_failed_creation_is_retried_with_next_message(caplog: pytest.LogCaptureF
     assert len(caplog.records) == 1
 
 
+def test_created_sink_that_raises_keeps_first_message_for_others(caplog: pytest.LogCaptureFixture) -> None:
+    bus, received = Bus(), list[Message]()
+
+    def fail(_: Message) -> None:
+        raise ValueError("the sink fails")
+
+    def create() -> None:
+        bus.attach(Heartbeat, fail)
+        bus.attach(Heartbeat, received.append)
+
+    bus.create_on_first([Heartbeat.ID], create)
+    bus.deliver(frame(HEARTBEAT))
+    assert received == [HEARTBEAT]
+    assert "fail" in caplog.text
+
+
 def test_wanted_ids_are_live() -> None:
     bus, framer = Bus(), Framer()
     framer.wanted = bus.wanted

@@ -174,7 +174,7 @@ async def test_lost_link_while_waiting_is_raised_at_once() -> None:
         ({"baud": 0}, "baud = 0"),
         ({"rates": {Attitude: 0}}, "rate_hz of ATTITUDE = 0"),
         ({"rates": {Attitude: 1001}}, "rate_hz of ATTITUDE = 1001"),
-        ({"dialect": Dialect("mine", [Attitude])}, "'mine' has no HEARTBEAT"),
+        ({"dialect": Dialect("mine", [Attitude])}, "'mine' lacks aerokit's HEARTBEAT"),
         ({"dialect": Dialect("mine", [Heartbeat]), "rates": {Attitude: 1}}, "ATTITUDE is not in the dialect"),
     ],
     ids=lambda value: "" if isinstance(value, dict) else value,

@@ -116,12 +116,17 @@ async def test_own_ids_out_of_range_are_refused(wrong: dict[str, int], text: str
         Connection(link, **wrong)  # type: ignore[arg-type]
 
 
+class OtherHeartbeat(Heartbeat):
+    """A class of another dialect with the same message id."""
+
+
 async def test_subscribe_refuses_types_outside_the_dialect() -> None:
     few = Dialect("heartbeats", [Heartbeat])
     async with far_end() as (near, _, _), open_connection(near, dialect=few) as connection:
         connection.check_types((Heartbeat, LinkClosed))
         for types, text in (
             ((Attitude,), "ATTITUDE is not in this connection's dialect"),
+            ((OtherHeartbeat,), "HEARTBEAT is not in this connection's dialect"),
             ((str,), "neither a message class nor an event class"),
             ((), "at least one"),
         ):

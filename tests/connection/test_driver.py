@@ -127,6 +127,18 @@ async def test_run_ends_when_the_exchange_fails(pair: Pair) -> None:
     assert len(pair.far.questions) == 5
 
 
+async def test_exchange_without_deadline_is_not_called(pair: Pair) -> None:
+    class Pausing(Counting):
+        def receive(self, message: Message, now: float) -> None:
+            super().receive(message, now)
+            self.deadline = None
+
+    later(0.5, pair.far.answer)
+    later(5.0, pair.far.answer)
+    assert await pair.run(Pausing(answers=2)) == 2
+    assert len(pair.far.questions) == 1
+
+
 async def test_ended_exchange_has_no_deadline(pair: Pair) -> None:
     """The answer and the deadline wait for a loop that was blocked; the answer comes first."""
     exchange = Counting()

@@ -94,9 +94,10 @@ class Bus:
     def create_on_first(
         self, message_ids: Iterable[int], create: Callable[[], object], *, system_id: int = EVERY_SYSTEM
     ) -> Detach:
-        """Call ``create()`` once, when the first of these messages arrives, and before the message is delivered.
+        """Call ``create()`` when the first of these messages arrives, and before the message is delivered.
 
-        Sinks that ``create()`` attaches get that first message too. Returns a function that cancels the call.
+        If ``create()`` raises, it is called again with the next message; otherwise it is called once. Sinks that it
+        attaches get the first message too. Returns a function that cancels the call.
         """
 
         def on_first(frame: Frame) -> None:
@@ -107,7 +108,10 @@ class Bus:
             for entry in self._entries(frame):
                 if entry not in entries_before:
                     kind, sink = entry
-                    sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
+                    try:
+                        sink(self.dialect.decode(frame) if kind == MESSAGE else frame)
+                    except Exception:
+                        _report(sink)
 
         detachers = [self._attach((system_id, message_id), (FRAME, on_first), ahead=True) for message_id in message_ids]
 

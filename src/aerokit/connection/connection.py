@@ -95,7 +95,7 @@ class Connection:
         _check_version(mavlink_version)
         if dialect.get(Heartbeat.ID) is not Heartbeat:
             raise InvalidArgument(
-                f"dialect {dialect.name!r} has no HEARTBEAT: pass the standard dialect, or one extended from it"
+                f"dialect {dialect.name!r} lacks aerokit's HEARTBEAT: pass the standard dialect or an extension of it"
             )
         self.link = link
         self.bus: Bus = Bus(dialect)
@@ -320,7 +320,7 @@ class Connection:
         for item in types:
             if not isinstance(item, type) or not issubclass(item, (Message, Event)):
                 raise InvalidArgument(f"{item!r} is neither a message class nor an event class")
-            if issubclass(item, Message) and self.bus.dialect.get(item.ID) is None:
+            if issubclass(item, Message) and self.bus.dialect.get(item.ID) is not item:
                 raise InvalidArgument(f"{item.NAME} is not in this connection's dialect")
 
     def on_end(self, callback: Callable[[Exception], None]) -> Detach:

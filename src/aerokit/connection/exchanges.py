@@ -101,6 +101,9 @@ class ExchangeRun(Generic[ResultT]):
             self._connection.deadlines.cancel(self._expire)
             if not self._ended.done():
                 self._ended.set_result(None)
-        elif exchange.deadline is not None and exchange.deadline != self._deadline:
+        elif exchange.deadline != self._deadline:
             self._deadline = exchange.deadline
-            self._connection.deadlines.set(self._expire, self._deadline)
+            if self._deadline is None:
+                self._connection.deadlines.cancel(self._expire)
+            else:
+                self._connection.deadlines.set(self._expire, self._deadline)

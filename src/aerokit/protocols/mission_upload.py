@@ -78,7 +78,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     ) -> None:
         super().__init__(target_system, target_component, **options)
         self._items = items
-        self._is_partial = first is not None
+        self.is_partial: bool = first is not None
         self._first = first or 0
         self._end = self._first + len(items)
         self._window = window
@@ -106,7 +106,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def may_have_changed_items(self) -> bool:
         """True if the vehicle may have overwritten old items. False until the vehicle has requested an item."""
         # If a partial upload fails after its first item alone, the vehicle has refused this item and replaced nothing.
-        has_sent_only_first = self._is_partial and self._sent_end == self._first + 1
+        has_sent_only_first = self.is_partial and self._sent_end == self._first + 1
         return self.was_started and not has_sent_only_first
 
     @property
@@ -156,7 +156,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def link_changed(self, now: float) -> None:
         """Announce the items again, because PX4 accepts items only over the port that received MISSION_COUNT."""
-        if self._is_requesting and not self._is_partial and not self.done:
+        if self._is_requesting and not self.is_partial and not self.done:
             self._reset()
             self._announce(now)
 
@@ -223,7 +223,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     @property
     def _is_refusal_of_partial_upload(self) -> bool:
         """True if an ERROR refuses MISSION_WRITE_PARTIAL_LIST."""
-        return self._is_partial and not self._is_requesting
+        return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
         """Process an ERROR that may be temporary.
@@ -266,7 +266,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             return
         # A partial upload does not begin again. The differences were computed from the vehicle's plan, which another
         # station may have changed since.
-        if self._is_partial or self._restarts >= MAX_RESTARTS:
+        if self.is_partial or self._restarts >= MAX_RESTARTS:
             self._fail_as_refused(result)
             return
         self._restarts += 1
@@ -305,7 +305,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         target = (self.target_system, self.target_component)
         if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
             self._outbox += self.cancellation()
-        if self._is_partial:
+        if self.is_partial:
             partial = MissionWritePartialList(*target, self._first, self._end - 1, self.mission_type)
             self._outbox.append(partial)
         else:

@@ -2290,7 +2290,10 @@ class Parameters(TwinOf["AsyncParameters"]):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set the vehicle's parameters to those of a table, a dict or a parameter file; equal values are not sent.
+        """Set the vehicle's parameters to those of a table, a dict or a parameter file.
+
+        Values that equal those in ``table`` are not sent, and get the outcome ``"unchanged"``. If another station may
+        have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
@@ -2319,8 +2322,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     ) -> TemporaryParameters:
         """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
-        They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If one
-        value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
+        They are also restored if the block raises or is cancelled, which takes at most three times ``idle_timeout_s``.
+        If one value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
         overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
         before the first block. A value that another station has changed meanwhile stays, and a warning of logger
         "aerokit" names the parameter.
@@ -2569,7 +2572,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2763,7 +2766,7 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.
@@ -2872,7 +2875,7 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         )
 
     def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.

@@ -459,7 +459,7 @@ async def test_go_to_without_any_altitude_sends_nothing(flying: Flight) -> None:
     here = flying.vehicle.position.value
     low = Position(here.latitude_deg, here.longitude_deg, altitude_amsl_m=594.0)
     flying.vehicle.telemetry.position.set(low, Source(1, 1, "GLOBAL_POSITION_INT"))
-    with pytest.raises(InvalidArgument, match="has no altitude, and the vehicle's own altitude is unknown"):
+    with pytest.raises(InvalidArgument, match="has no altitude, and the vehicle's altitude above home is unknown"):
         await flying.vehicle.go_to(Position(here.latitude_deg, here.longitude_deg))
     assert not flying.wire.commands(MavCmd.DO_REPOSITION)
 

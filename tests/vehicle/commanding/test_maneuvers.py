@@ -255,6 +255,25 @@ async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., Simul
         await vehicle.go_to(center.offset(north_m=300), timeout=120)  # ArduPlane keeps the radius.
 
 
+async def test_figure_eight_axis_is_within_pi() -> None:
+    plane = SimulatedPx4Plane(boot_time_s=0.0)
+    axes_rad: list[float] = []
+
+    def record(message: Any, _: object) -> None:
+        if message.command == MavCmd.DO_FIGURE_EIGHT:
+            axes_rad.append(message.param4)
+
+    plane.observe(m.CommandInt, record)
+    async with simulated_link(plane) as link, aerokit.connect(link) as vehicle:
+        await vehicle.wait_ready()
+        await vehicle.arm()
+        await vehicle.take_off(50.0, timeout=120)
+        center = vehicle.position.value.offset(north_m=200).replace(altitude_amsl_m=None, altitude_relative_m=60.0)
+        with pytest.raises(CommandRejected):  # The usual builds of PX4 do not have the command.
+            await vehicle.figure_eight(center, major_radius_m=200, minor_radius_m=80, axis_deg=270)
+    assert axes_rad == [pytest.approx(-math.pi / 2)]
+
+
 @pytest.mark.sampled(2)
 @BOTH
 async def test_follow_stays_behind_a_moving_leader(kind: Callable[..., Kind]) -> None:

@@ -196,6 +196,48 @@ async def test_rejected_partial_upload() -> None:
         assert holds(flight, long_mission(30))
 
 
+async def test_ignored_partial_upload_leaves_previous_items() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(30))
+        flight.copter.handlers[m.MissionWritePartialList.ID] = lambda *_: None
+        with pytest.raises(MissionTimeout, match=r"no item was requested.*still has its previous items"):
+            await flight.vehicle.mission.upload(changed(long_mission(30), 7), idle_timeout_s=4)
+
+
+async def test_plan_cut_after_partial_upload_is_verification_failed() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.mission.upload(long_mission(30))
+
+        def cut(message: Any) -> None:
+            if message.type == Result.ACCEPTED:
+                flight.copter.missions.replace(0, long_mission(7).to_items(home_is_item_0=True))
+
+        flight.wire.clear()
+        flight.vehicle.connection.bus.attach(m.MissionAck, cut)
+        with pytest.raises(VerificationFailed) as caught:
+            await flight.vehicle.mission.upload(changed(long_mission(30), 5, 6, 7))
+        assert flight.wire.all(m.MissionWritePartialList)
+        assert caught.value.differences[0] == "there are 2 items instead of 3"
+
+
+async def test_ambiguous_upload_without_read_back_is_unknown() -> None:
+    async with open_flight(latency_s=0.02) as flight:
+        handlers = flight.copter.handlers
+
+        def refuse_last(message: m.MissionItemInt, channel: Any) -> None:
+            if message.seq == 3:
+                flight.copter.send(m.MissionAck(255, 190, Result.ERROR, 0))
+            else:
+                on_item(message, channel)
+
+        on_item = handlers[m.MissionItemInt.ID]
+        handlers[m.MissionItemInt.ID] = refuse_last
+        handlers[m.MissionRequestList.ID] = lambda *_: None
+        with pytest.raises(MissionTimeout, match="no MISSION_COUNT was received"):
+            await flight.vehicle.mission.upload(long_mission(3), method="items", idle_timeout_s=4)
+        assert flight.vehicle.mission._context.caches[0].items is None
+
+
 async def test_too_many_items_has_the_vehicles_reasons() -> None:
     async with open_flight() as flight:
         with pytest.raises(MissionRejected, match="items are supported") as caught:

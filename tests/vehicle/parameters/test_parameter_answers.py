@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 from flight_harness import Flight
 
-from aerokit.errors import ParameterRejected
+from aerokit.errors import OperationTimeout, ParameterRejected, ParameterTimeout
 from aerokit.mavlink.messages import ParamError, ParamRequestRead, ParamSet, ParamValue
 from aerokit.parameters import Parameter, ParameterType
 from aerokit.vehicle.parameters.writing import outcome_of
@@ -26,6 +27,7 @@ INT, REAL = ParameterType.INT32, ParameterType.REAL32
         (INT, 1, 7, 8, "clamped"),
         (INT, 1, 100, 50, "clamped"),
         (INT, 1, -7, 7, "clamped"),
+        (INT, 1, 16_777_217, 16_777_216, "rounded"),
         (REAL, 1.0, 100.0, 100.1, "rounded"),
         (REAL, 1.0, -100.0, -100.05, "rounded"),
         (REAL, 1.0, 100.0, 100.2, "clamped"),
@@ -43,6 +45,18 @@ def test_unchanged_value_is_a_refusal() -> None:
     assert str(error).startswith("P = 7 was refused: the vehicle keeps 1")
 
 
+@pytest.mark.parametrize(
+    ("type_", "wanted", "kept", "text"),
+    [
+        (INT, 1234567, 1234568, "P = 1234567 was refused: the vehicle keeps 1234568"),
+        (REAL, 0.1, math.nan, "P = 0.1 was refused: the vehicle keeps nan"),
+    ],
+)
+def test_refusal_shows_all_digits(type_: ParameterType, wanted: float, kept: float, text: str) -> None:
+    error = outcome_of(Parameter("P", wanted, type_), Parameter("P", kept, type_), Parameter("P", kept, type_))
+    assert str(error) == text
+
+
 async def test_param_error_without_name_is_ignored(grounded: Flight) -> None:
     """PX4 leaves arbitrary values in unused fields of PARAM_ERROR."""
     copter = grounded.copter
@@ -55,6 +69,19 @@ async def test_param_error_without_name_is_ignored(grounded: Flight) -> None:
     copter.handlers[ParamRequestRead.ID] = doubtful
     assert await grounded.vehicle.parameters.get("LAND_SPEED", timeout=5) == 50
     assert (await grounded.vehicle.parameters.set("LAND_SPEED", 60, timeout=5)).outcome == "set"
+
+
+async def test_read_times_out_if_only_one_name_is_rejected(grounded: Flight) -> None:
+    """The vehicle may have the parameter under the name that it does not answer."""
+    copter = grounded.copter
+
+    def reject_new_name(message: ParamRequestRead, channel: Any) -> None:
+        if message.param_id == "WP_SPD":
+            copter.send(ParamError(255, 190, "WP_SPD", 0, 1))
+
+    copter.handlers[ParamRequestRead.ID] = reject_new_name
+    with pytest.raises(ParameterTimeout):
+        await grounded.vehicle.parameters.get("WP_SPD", idle_timeout_s=2)
 
 
 async def test_ardupilot_names_are_sent_in_upper_case(grounded: Flight) -> None:
@@ -83,4 +110,26 @@ async def test_echo_of_previous_write_confirms_nothing(grounded: Flight) -> None
     copter.handlers[ParamSet.ID] = lose_first
     assert (await parameters.set("LAND_SPEED", 61)).outcome == "set"
     assert lost
+    assert copter.parameters["LAND_SPEED"] == 61
+
+
+async def test_echo_of_cancelled_write_confirms_nothing(grounded: Flight) -> None:
+    """Another station undoes a cancelled write. Its late echo arrives when the same value is written again."""
+    copter, parameters = grounded.copter, grounded.vehicle.parameters
+    await parameters.get("LAND_SPEED")
+    on_set = copter.handlers[ParamSet.ID]
+    lost: list[ParamSet] = []
+
+    def lose_two(message: ParamSet, channel: Any) -> None:
+        if len(lost) == 2:
+            on_set(message, channel)
+            return
+        lost.append(message)
+        if len(lost) == 2:
+            copter.send(ParamValue("LAND_SPEED", 61, message.param_type, len(copter.parameters), 65535))
+
+    copter.handlers[ParamSet.ID] = lose_two
+    with pytest.raises(OperationTimeout):
+        await parameters.set("LAND_SPEED", 61, timeout=0.01)
+    assert (await parameters.set("LAND_SPEED", 61)).outcome == "set"
     assert copter.parameters["LAND_SPEED"] == 61

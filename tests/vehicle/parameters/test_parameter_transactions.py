@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 import anyio
 import pytest
@@ -12,6 +13,7 @@ from aerokit import messages
 from aerokit.errors import (
     InvalidArgument,
     LinkLost,
+    OperationTimeout,
     ParameterRejected,
     RollbackFailed,
     VerificationFailed,
@@ -60,11 +62,52 @@ async def test_value_changed_by_another_station_stays(is_received: bool, caplog:
         assert "LAND_SPEED" not in caplog.text
 
 
+async def test_parameter_shown_by_another_one_is_restored() -> None:
+    """Like ArduPilot's …_ENABLE: the copter has LAND_SPEED only after RTL_ALT was set."""
+    simulated = copter()
+    simulated.parameters.remove("LAND_SPEED")
+    on_set = simulated.handlers[messages.ParamSet.ID]
+
+    def show(message: messages.ParamSet, channel: Any) -> None:
+        if message.param_id == "RTL_ALT" and "LAND_SPEED" not in simulated.parameters:
+            simulated.parameters.add("LAND_SPEED", 50)
+        on_set(message, channel)
+
+    simulated.handlers[messages.ParamSet.ID] = show
+    async with open_flight(simulated) as flight:
+        async with flight.vehicle.parameters.temporarily({"RTL_ALT": 2000, "LAND_SPEED": 60}):
+            assert values(flight) == (2000, 60)
+        assert values(flight) == BEFORE
+
+
+async def test_value_that_another_station_has_just_undone_is_restored() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.set("RTL_ALT", 2000)
+        flight.copter.parameters["RTL_ALT"] = 1500.0
+        async with parameters.temporarily({"RTL_ALT": 3000}):
+            assert values(flight)[0] == 3000
+        assert values(flight) == BEFORE
+
+
 async def test_value_changed_by_program_is_restored() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         async with parameters.temporarily({"RTL_ALT": 2000}):
             await parameters.set("RTL_ALT", 3000)
+        assert values(flight) == BEFORE
+
+
+async def test_value_of_cancelled_upload_is_restored() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        async with parameters.temporarily({"RTL_ALT": 2000}):
+            flight.copter.faults.mute_parameters = {"RTL_ALT"}
+            with pytest.raises(OperationTimeout):
+                await parameters.upload({"RTL_ALT": 3000}, method="ftp", timeout=2.0)
+            flight.copter.faults.mute_parameters = set()
+            assert values(flight)[0] == 3000
         assert values(flight) == BEFORE
 
 
@@ -204,6 +247,16 @@ async def test_successful_transaction_keeps_values() -> None:
         assert values(flight) == (2500, 60)
         with pytest.raises(InvalidArgument, match="not open"):
             await transaction.set("RTL_ALT", 1)
+
+
+async def test_transaction_changes_include_cancelled_call() -> None:
+    async with open_flight(copter()) as flight, flight.vehicle.parameters.transaction() as transaction:
+        await transaction.set("LAND_SPEED", 60)
+        flight.copter.faults.mute_parameters = {"LAND_SPEED"}
+        with anyio.move_on_after(1.0) as scope:
+            await transaction.set_many({"RTL_ALT": 2000, "LAND_SPEED": 70})
+        assert scope.cancelled_caught
+        assert [change.name for change in transaction.changes] == ["LAND_SPEED", "RTL_ALT"]
 
 
 async def fail_after_writing(parameters: Parameters, error: Exception) -> None:

@@ -26,6 +26,7 @@ from aerokit.errors import (
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavFtpErr
 from aerokit.parameters import Parameter, ParameterRenamedWarning, ParameterTable, ParameterType
+from aerokit.parameters.pack import pack_parameters
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink
@@ -126,6 +127,17 @@ async def test_download_with_dropped_mavftp_soon_uses_the_list() -> None:
         assert flight.wire.all(messages.FileTransferProtocol)
         with pytest.raises(FileTimeout):
             await flight.vehicle.parameters.download(method="ftp", refresh=True)
+
+
+async def test_mavftp_answers_to_another_station_do_not_delay_the_list() -> None:
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        await flight.vehicle.version.wait_until(lambda _: True)
+        answer = messages.FileTransferProtocol(0, 77, 190, b"")
+        simulated.handlers[messages.FileTransferProtocol.ID] = lambda *_: simulated.send(answer)
+        began = anyio.current_time()
+        assert len(await flight.vehicle.parameters.download()) == 120
+        assert anyio.current_time() - began < 5
 
 
 async def test_missing_file_is_tried_once_until_reboot() -> None:
@@ -446,6 +458,49 @@ async def test_unconfirmed_write_times_out() -> None:
 
 
 # ------------------------------------------------------------------------------------ uploading
+
+
+async def test_upload_by_file_keeps_value_set_during_read_back() -> None:
+    async with open_flight(copter()) as flight:
+        simulated, parameters = flight.copter, flight.vehicle.parameters
+        await parameters.download()
+        on_read = simulated.handlers[messages.ParamRequestRead.ID]
+        writes: list[asyncio.Task[Any]] = []
+
+        def set_at_first_read(message: messages.ParamRequestRead, channel: Any) -> None:
+            if writes:
+                on_read(message, channel)
+            else:  # This request is lost, so the value is read after the other task has written it.
+                writes.append(asyncio.create_task(parameters.set("RTL_ALT", 3000)))
+
+        simulated.handlers[messages.ParamRequestRead.ID] = set_at_first_read
+        result = (await parameters.upload({"RTL_ALT": 2000}, method="ftp"))["RTL_ALT"]
+        assert (result.outcome, result.value) == ("set", 2000)
+        assert (await writes[0]).outcome == "set"
+        assert simulated.parameters["RTL_ALT"] == 3000
+
+
+async def test_upload_by_file_has_each_parameter_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    uploaded: list[Parameter] = []
+
+    def pack(parameters: tuple[Parameter, ...]) -> bytes:
+        uploaded.extend(parameters)
+        return pack_parameters(parameters)
+
+    monkeypatch.setattr("aerokit.parameters.pack.pack_parameters", pack)
+    async with open_flight(copter()) as flight:
+        results = await flight.vehicle.parameters.upload({"RTL_ALT": 2000, "rtl_alt": 2000}, method="ftp")
+        assert {name: result.value for name, result in results.items()} == {"RTL_ALT": 2000, "rtl_alt": 2000}
+        assert [parameter.name for parameter in uploaded] == ["RTL_ALT"]
+
+
+async def test_upload_by_file_of_previous_value_updates_the_table() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        await parameters.download()
+        await parameters.set("RTL_ALT", 2000)
+        await parameters.upload({"RTL_ALT": 1500}, method="ftp")
+        assert flight.copter.parameters["RTL_ALT"] == parameters.table["RTL_ALT"].value == 1500
 
 
 @pytest.mark.parametrize("method", ["auto", "ftp", "set"])

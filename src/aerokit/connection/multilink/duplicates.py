@@ -140,6 +140,10 @@ class _Stream:
         # Acknowledgement's payload → how often each link delivered it since the last switch to another link.
         self.acknowledgements: dict[bytes, list[int]] = {}
 
+    def has_newer(self, frame: Frame) -> bool:
+        """Return True if a frame with a newer sequence number was already accepted."""
+        return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
+
     def is_repeated(self, payload: bytes, link: int) -> bool:
         """Count an acknowledgement of this link. Return True if another link delivered it at least as often."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
@@ -207,7 +211,9 @@ class MergedStreams:
             is_repeated = stream.is_repeated(frame.payload, link)
             if is_repeated and link != choice.used.link:
                 return False
-        stream.newest_sequence = frame.sequence
+        # An answer that another link delivers late must not make older telemetry of this link acceptable.
+        if link == choice.used.link or not stream.has_newer(frame):
+            stream.newest_sequence = frame.sequence
         self.copies.accept()
         return True
 
@@ -230,9 +236,7 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
     if choice.is_shared(candidate, frame.received_at):
         # Both links carry the same stream. The link in use has lost this frame, or delivers it later. Telemetry is
         # refused if a newer frame was already accepted; an answer is valid in any case.
-        newest = stream.newest_sequence
-        is_overtaken = newest >= 0 and (frame.sequence - newest) & 0xFF >= 128
-        return is_answer or not is_overtaken
+        return is_answer or not stream.has_newer(frame)
     # The links carry separate streams. The frame is needed if only this link reaches the component, or if it answers a
     # request that was sent before the switch to the link in use.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S

@@ -153,7 +153,8 @@ class ManeuverActions(VehicleBase):
         flight = RoundFlight(self._context, "figure_eight", travel_target(center), counter, rounds, limits)
         if is_flown_by_px4:
             major_m = major_radius_m if clockwise else -major_radius_m
-            params = (major_m, minor_radius_m, 0, math.radians(axis_deg))
+            axis_rad = math.radians(math.remainder(axis_deg, 360))  # The command allows -pi to pi.
+            params = (major_m, minor_radius_m, math.nan, axis_rad)
             mode = self._sender.mode_for("figure_eight", "hold")
             await flight.fly_by_command(MavCmd.DO_FIGURE_EIGHT, params, mode, holds_at_end=False)
         else:

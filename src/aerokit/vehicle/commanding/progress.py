@@ -339,8 +339,8 @@ class VehiclePosition:
         altitude = relative_m if relative_m is not None else amsl_m
         if altitude is None:
             raise InvalidArgument(
-                f"{name} = {target} is not allowed: the {name} has no altitude, and the vehicle's own altitude is"
-                f" unknown; give the {name} altitude_relative_m or altitude_amsl_m"
+                f"{name} = {target} is not allowed: the {name} has no altitude, and the vehicle's altitude above home"
+                f" is unknown; give the {name} altitude_relative_m or altitude_amsl_m"
             )
         check_range("altitude", altitude, -12_000, 100_000)
         if is_relative and not self.accepts_relative_altitude:

@@ -177,7 +177,8 @@ class OrderSender:
                 component_id=component_id,
             )
         except CommandRejected as error:
-            if error.result != MavResult.UNSUPPORTED:
+            is_for_autopilot = component_id in (None, self._session.component_id)
+            if error.result != MavResult.UNSUPPORTED or not is_for_autopilot:  # SET_MODE has no target component.
                 raise
             self.raise_if_ended(order)
             # While the vehicle is silent, a takeover may be unreported, so the older message is not sent.
@@ -345,8 +346,8 @@ class OrderSender:
             names = self._session.telemetry.mode_names
             modes = self._session.autopilot.modes_of_command(command, params, names)
             armed: bool | None = None  # True if the command arms the vehicle, False if it disarms the vehicle.
-            if command == MavCmd.COMPONENT_ARM_DISARM and params:
-                armed = params[0] == 1
+            if command == MavCmd.COMPONENT_ARM_DISARM:
+                armed = bool(params) and params[0] == 1  # A missing parameter is sent as 0.
             with (
                 self._raw_order(command, modes) as order,
                 self._arbiter.sending(order, modes=modes, armed=armed) as sent,

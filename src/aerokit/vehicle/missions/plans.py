@@ -110,7 +110,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             return plan
 
     async def clear(self, *, idle_timeout_s: float = 10.0, timeout: float | None = None) -> None:
-        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot refuses to clear a mission in flight.
+        """Clear the plan on the vehicle, and verify that it is empty. ArduPilot does not clear a mission that it flies.
 
         Raises:
             InvalidArgument: an argument is invalid. Nothing was sent.

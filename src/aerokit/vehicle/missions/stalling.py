@@ -59,7 +59,10 @@ class MissionStallDetector:
         self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:
-        """Return a clause about the standstill; None if the vehicle moves, may stand still here, or is disarmed."""
+        """Return a clause about a standstill that is a fault.
+
+        None if the vehicle moves, may stand still here, is paused or is disarmed.
+        """
         progress, current = self._tracker.progress.latest, self._tracker.current.latest
         is_paused = self._is_paused() or (progress is not None and progress.state == MissionState.PAUSED)
         if is_paused or not self._session.telemetry.is_armed:
@@ -67,6 +70,7 @@ class MissionStallDetector:
             return None
         should_move = self._should_move(current)
         standstill = self._stall()  # None unless the vehicle has stood still for 12 s
+        # After a fast descent, a standstill is a fall. On the ground, it is one at any item.
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.
@@ -77,7 +81,10 @@ class MissionStallDetector:
         return self._stall(MISSION_STALL_TIMEOUT_S) if is_late else None
 
     def _should_move(self, current: int | None) -> bool:
-        """Return True if the vehicle flies its mission, and is at a take-off or a waypoint without a hold."""
+        """Return True if the vehicle flies its mission, and its current item requires movement.
+
+        Such an item is a take-off, or a waypoint without a hold.
+        """
         if current is None or current >= len(self._items):
             return False
         if self._tracker.is_complete or not self._session.telemetry.is_in(self._mode):

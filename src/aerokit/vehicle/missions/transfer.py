@@ -66,7 +66,10 @@ class PlanChannel:
         return await self._run(await self._new_upload(items, window=1))
 
     async def send_part(self, items: Sequence[MissionItem], first_seq: int) -> UploadResult | None:
-        """Replace the items from ``first_seq`` on; return None if the vehicle does not support partial uploads."""
+        """Replace as many items as are given, from ``first_seq`` on. The other items of the vehicle's plan stay.
+
+        Returns None if the vehicle does not support partial uploads.
+        """
         exchange = await self._new_upload(items, window=1, first_seq=first_seq)
         try:
             result = await self._run(exchange)
@@ -161,11 +164,13 @@ class PlanChannel:
         try:
             return await self._context.transfers.run(exchange)
         except MissionRejected as error:
+            self._record_changes(exchange)
             await anyio.sleep(REFUSAL_TEXT_DELAY_S)
             texts = self._context.session.texts_since(started_at)
             message = f"{error}{self._describe_items_on_vehicle(exchange, refused_item=error.item)}"
             raise MissionRejected(message, result=error.result, item=error.item, reasons=texts) from None
         except MissionTimeout as error:
+            self._record_changes(exchange)
             # Change only the text, so that the error keeps its attribute `missing`.
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
             raise
@@ -174,13 +179,17 @@ class PlanChannel:
                 for cancellation in exchange.cancellation():
                     connection.send(cancellation)
 
+    def _record_changes(self, exchange: MissionExchange[Any]) -> None:
+        """Record whether a failed upload may have changed items on the vehicle."""
+        if isinstance(exchange, MissionUpload):
+            self._has_changed |= exchange.may_have_changed_items
+
     def _describe_items_on_vehicle(
         self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused_item: int | None = None
     ) -> str:
         """Return a clause for the error of an upload: which items, old or new, the vehicle has now."""
         if not isinstance(exchange, MissionUpload):
             return ""
-        self._has_changed |= exchange.may_have_changed_items
         overwrites_in_place = self.mission_type in self._context.autopilot.overwrites_plans_in_place
         is_partly_overwritten = overwrites_in_place and self._has_changed
         if is_silent and exchange.was_sent_completely:
@@ -190,7 +199,7 @@ class PlanChannel:
             return f"; on the vehicle, {new_items} now, and all later items are old: upload again, or clear"
         if is_partly_overwritten:
             return "; the vehicle now has some new and some old items: upload again, or clear"
-        if overwrites_in_place and is_silent:
+        if overwrites_in_place and is_silent and not exchange.is_partial:  # MISSION_COUNT cuts a longer plan.
             return "; if the vehicle received the request, it has cut its plan to the new number of items"
         return "; the vehicle still has its previous items"
 
@@ -306,7 +315,8 @@ class PlanTransfer(Generic[PlanT]):
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
         """Send all items; read them back to verify them, or if the vehicle's answers to the upload were ambiguous."""
         result = await self._channel.send(items)
-        self._cache.set(items, self._context.now())
+        if result.is_confirmed:
+            self._cache.set(items, self._context.now())
         if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
         received = await self._read(method)
@@ -414,8 +424,8 @@ class PlanTransfer(Generic[PlanT]):
         """Raise VerificationFailed unless the items read back are those that were sent. Both are keyed by seq."""
         differences = []
         if len(sent) != len(received):
-            received_count = max(0, len(received) - self._offset)
-            differences = [f"there are {received_count} items instead of {len(sent) - self._offset}"]
+            sent_count, received_count = (sum(seq >= self._offset for seq in seqs) for seqs in (sent, received))
+            differences = [f"there are {received_count} items instead of {sent_count}"]
         is_single_precision = self._channel.is_single_precision
         for seq in sorted(sent.keys() & received.keys()):
             if seq >= self._offset:

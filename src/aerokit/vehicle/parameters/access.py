@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import anyio
 
-from aerokit.errors import FileError, FileTimeout, NotSupported, RemoteProtocolError
+from aerokit.errors import FileError, FileTimeout, RemoteProtocolError
 from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavProtocolCapability
 from aerokit.mavlink.messages import FileTransferProtocol, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
@@ -121,7 +121,7 @@ class ParameterAccess:
                 with probe:
                     await self._download_pack(idle_timeout_s, on_progress)
                 return
-            except (FileError, FileTimeout, NotSupported, RemoteProtocolError) as error:
+            except (FileError, FileTimeout, RemoteProtocolError) as error:
                 if method == "ftp":
                     raise
                 # The next download may succeed if the file was damaged, or if the vehicle had another file open.
@@ -133,15 +133,22 @@ class ParameterAccess:
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Raise FileTimeout in the block if no MAVFTP answer arrives soon, because some relays drop only MAVFTP."""
+        """Cancel the block and raise FileTimeout if no MAVFTP answer arrives soon: some relays drop only MAVFTP."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
-        answers: list[object] = []
-        detach = connection.bus.attach(FileTransferProtocol, answers.append, system_id=self._transfers.system_id)
+        has_answer = False
+
+        def on_message(message: FileTransferProtocol) -> None:
+            nonlocal has_answer
+            # The vehicle also answers other stations.
+            is_our_system = message.target_system in (0, connection.source_system)
+            has_answer |= is_our_system and message.target_component in (0, connection.source_component)
+
+        detach = connection.bus.attach(FileTransferProtocol, on_message, system_id=self._transfers.system_id)
         with anyio.CancelScope() as scope:
 
             def cancel_without_answer() -> None:
-                if not answers:
+                if not has_answer:
                     scope.cancel()
 
             timer = asyncio.get_running_loop().call_later(timeout_s, cancel_without_answer)
@@ -280,46 +287,57 @@ class ParameterAccess:
         self, parameters: Iterable[Parameter], idle_timeout_s: float, on_progress: OnProgress | None = None
     ) -> dict[str, ParameterAnswer]:
         """Set parameters and return the vehicle's values. Writes by other tasks wait until this one is done."""
-        parameters = tuple(parameters)
+        async with self._write_lock:
+            return await self._write(tuple(parameters), idle_timeout_s, on_progress)
+
+    async def _write(
+        self, parameters: tuple[Parameter, ...], idle_timeout_s: float, on_progress: OnProgress | None
+    ) -> dict[str, ParameterAnswer]:
         if not parameters:
             return {}
         from aerokit.protocols.parameter_requests import ParameterWrites
 
         transfers = self._transfers
-        async with self._write_lock:
-            names = _names(parameters)
-            known = [self.store.get(name) for name in names]
-            old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
-            for name in names:
-                self.written.pop(name, None)
-                self.store.clear_replaced(name)
-            # Recently written parameters are read back, so their answers take as long as those of reads.
-            recent = self._recently_written() & set(names)
-            exchange = ParameterWrites(
-                transfers.system_id,
-                transfers.component_id,
-                parameters,
-                bytewise=self.store.bytewise,
-                before=old_values,
-                recent=recent,
-                own_system=transfers.connection.source_system,
-                round_trip=self._read_round_trip if recent else transfers.round_trip,
-                idle_timeout_s=idle_timeout_s,
-                on_progress=on_progress,
-            )
-            # Many reads need the raised rate.
-            boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
+        names = _names(parameters)
+        known = [self.store.get(name) for name in names]
+        old_values = {parameter.name: parameter.value for parameter in known if parameter is not None}
+        self._forget_written(names)
+        # Recently written parameters are read back, so their answers take as long as those of reads.
+        recent = self._recently_written() & set(names)
+        exchange = ParameterWrites(
+            transfers.system_id,
+            transfers.component_id,
+            parameters,
+            bytewise=self.store.bytewise,
+            before=old_values,
+            recent=recent,
+            own_system=transfers.connection.source_system,
+            round_trip=self._read_round_trip if recent else transfers.round_trip,
+            idle_timeout_s=idle_timeout_s,
+            on_progress=on_progress,
+        )
+        # Many reads need the raised rate.
+        boost_after_s = 0.0 if len(recent) > MAX_READS_UNBOOSTED else math.inf
+        try:
             with self._boosted(after_s=boost_after_s):
                 answers = await transfers.run(exchange)
-            for name, answer in answers.items():
-                self._written_at[name] = transfers.connection.now()
-                if not isinstance(answer, Parameter):
-                    continue
-                self.written[name] = answer.value
-                # A late answer with the previous value must not replace the new one in the store.
-                if name in old_values and answer.value != old_values[name]:
-                    self.store.mark_replaced(name, old_values[name])
-            return answers
+        finally:
+            # Answers to a write that was cancelled or failed may also arrive late.
+            self._written_at.update(dict.fromkeys(names, transfers.connection.now()))
+        for name, answer in answers.items():
+            if not isinstance(answer, Parameter):
+                continue
+            self.written[name] = answer.value
+            # A late answer with the previous value must not replace the new one in the store.
+            if name in old_values and answer.value != old_values[name]:
+                self.store.mark_replaced(name, old_values[name])
+        return answers
+
+    def _forget_written(self, names: Iterable[str]) -> None:
+        """Forget what earlier writes have set, because the vehicle may have another value from now on."""
+        for name in names:
+            self.written.pop(name, None)
+            self.store.clear_replaced(name)
 
     def _recently_written(self) -> set[str]:
         """Return the names for which a late answer to a write may arrive. Their next write is therefore read back."""
@@ -334,25 +352,30 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
-        """Write parameters in one file if possible; set the values that the vehicle did not apply one by one."""
+        """Write parameters in one file if possible. Then set, one by one, those that the vehicle did not apply.
+
+        Writes by other tasks wait until all is done. Otherwise, a value that another task writes during the read-back
+        would be overwritten, because it is not the one in the file.
+        """
         parameters = tuple(parameters)
         if method == "auto" and (len(parameters) < MIN_PACK_SIZE or not await self.has_pack()):
             method = "set"
         if method == "set":
             return await self.write(parameters, idle_timeout_s, on_progress)
         answers: dict[str, ParameterAnswer] = {}
-        try:
-            async with self._write_lock:
+        async with self._write_lock:
+            self._forget_written(_names(parameters))
+            try:
                 await self._upload_pack(parameters, idle_timeout_s, on_progress)
-            answers = await self._read_back(parameters, idle_timeout_s)
-        except (FileError, FileTimeout, NotSupported):  # With "auto", all parameters are set one by one instead.
-            if method == "ftp":
-                raise
-        not_applied = [param for param in parameters if not self._was_applied(param, answers.get(param.name))]
-        applied = [param for param in parameters if param not in not_applied]
-        self.written.update({param.name: param.value for param in applied})
-        later_answers = await self.write(not_applied, idle_timeout_s, on_progress)
-        return {param.name: answers[param.name] for param in applied} | later_answers
+                answers = await self._read_back(parameters, idle_timeout_s)
+            except (FileError, FileTimeout):  # With "auto", all parameters are set one by one instead.
+                if method == "ftp":
+                    raise
+            not_applied = tuple(param for param in parameters if not self._was_applied(param, answers.get(param.name)))
+            applied = [param for param in parameters if param not in not_applied]
+            self.written.update({param.name: param.value for param in applied})
+            later_answers = await self._write(not_applied, idle_timeout_s, on_progress)
+            return {param.name: answers[param.name] for param in applied} | later_answers
 
     async def _upload_pack(
         self, parameters: tuple[Parameter, ...], idle_timeout_s: float, on_progress: OnProgress | None

@@ -218,7 +218,10 @@ class Parameters(ReadOnly):
         timeout: float | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Set the vehicle's parameters to those of a table, a dict or a parameter file; equal values are not sent.
+        """Set the vehicle's parameters to those of a table, a dict or a parameter file.
+
+        Values that equal those in ``table`` are not sent, and get the outcome ``"unchanged"``. If another station may
+        have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
@@ -246,8 +249,8 @@ class Parameters(ReadOnly):
     ) -> TemporaryParameters:
         """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
-        They are also restored if the block raises or is cancelled, which takes up to ``idle_timeout_s`` seconds. If one
-        value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
+        They are also restored if the block raises or is cancelled, which takes at most three times ``idle_timeout_s``.
+        If one value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
         overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
         before the first block. A value that another station has changed meanwhile stays, and a warning of logger
         "aerokit" names the parameter.

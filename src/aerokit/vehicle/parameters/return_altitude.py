@@ -18,37 +18,37 @@ MAX_RETURN_ALTITUDE_M = 3000
 
 async def read_return_altitude(parameters: Parameters, session: VehicleSession) -> float:
     """Read the altitude; see :meth:`aerokit.Vehicle.return_altitude`."""
-    _, value, scale = await _find_parameter("return_altitude", parameters, session)
-    return round(value / scale, 3)
+    _, value, units_per_metre = await _find_parameter("return_altitude", parameters, session)
+    return round(value / units_per_metre, 3)
 
 
 def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vtol: bool) -> float | None:
     """Return the altitude if its parameter was read, without requesting it; otherwise None."""
-    for name, scale in autopilot.return_altitude_parameters(is_vtol=is_vtol):
+    for name, units_per_metre in autopilot.return_altitude_parameters(is_vtol=is_vtol):
         if (known := parameters.known(name)) is not None:
-            return round(known.value / scale, 3)
+            return round(known.value / units_per_metre, 3)
     return None
 
 
 async def write_return_altitude(parameters: Parameters, session: VehicleSession, altitude_m: float) -> None:
     """Write the altitude; see :meth:`aerokit.Vehicle.set_return_altitude`."""
     check_range("altitude_m", altitude_m, 0, MAX_RETURN_ALTITUDE_M, above=True)
-    name, _, scale = await _find_parameter("set_return_altitude", parameters, session)
-    await parameters.set(name, altitude_m if scale == 1 else round(altitude_m * scale))
+    name, _, units_per_metre = await _find_parameter("set_return_altitude", parameters, session)
+    await parameters.set(name, altitude_m if units_per_metre == 1 else round(altitude_m * units_per_metre))
 
 
 async def _find_parameter(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
-    """Return name, value and scale of the altitude parameter that the vehicle has."""
+    """Return the altitude parameter that the vehicle has: name, value and parameter units per metre."""
     autopilot = session.autopilot
-    names_and_scales = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
-    if not names_and_scales:
+    names_and_units = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
+    if not names_and_units:
         raise NotSupported(f"{action}: {autopilot.firmware} does not climb for a return; nothing was sent")
-    answers = await parameters.probe(*(name for name, _ in names_and_scales))
+    answers = await parameters.probe(*(name for name, _ in names_and_units))
     failures: list[ParameterRejected | ParameterTimeout] = []
-    for name, scale in names_and_scales:
+    for name, units_per_metre in names_and_units:
         answer = answers[name]
         if not isinstance(answer, (ParameterRejected, ParameterTimeout)):
-            return name, answer.value, scale
+            return name, answer.value, units_per_metre
         failures.append(answer)
     # A time-out takes precedence, because the vehicle may have this parameter.
     raise next((failure for failure in failures if isinstance(failure, ParameterTimeout)), failures[0])

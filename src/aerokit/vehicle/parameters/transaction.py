@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import anyio
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from aerokit.parameters import ParameterDifference
     from aerokit.vehicle.parameters.access import ParameterAccess
-    from aerokit.vehicle.parameters.writing import ParameterWrite, ParameterWriter
+    from aerokit.vehicle.parameters.writing import ParameterFailure, ParameterWrite, ParameterWriter
 
 __all__ = ["TemporaryParameters", "Transaction"]
 
@@ -60,24 +60,36 @@ class _Block:
         self._saved: dict[str, Parameter] = {}  # parameters before their first write in this block
 
     async def _write(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
-        await self._save_previous(values)
-        return await self._writer.write(values, idle_timeout_s=self._idle_timeout_s)
+        return await self._writer.write(values, resolve=self._resolve_and_save, idle_timeout_s=self._idle_timeout_s)
 
-    async def _save_previous(self, values: Mapping[str, float]) -> None:
-        """Save the parameters before their first write. They are read again, because the store may be outdated."""
-        answers_by_name = await self._writer.names.resolve(values, self._idle_timeout_s)
-        resolved = [answer for answer in answers_by_name.values() if isinstance(answer, ResolvedParameter)]
+    async def _resolve_and_save(
+        self, names: Iterable[str], idle_timeout_s: float
+    ) -> dict[str, ResolvedParameter | ParameterFailure]:
+        """Resolve names, and save the parameters before their first write.
+
+        They are read again, because the store may be outdated. The writer calls this before each of its rounds, so that
+        parameters that appear after the first round are saved too.
+        """
+        results = await self._writer.names.resolve(names, idle_timeout_s)
+        resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
         unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
-        answers = await self._access.read(unread_names, self._idle_timeout_s)
+        answers = await self._access.read(unread_names, idle_timeout_s)
+        current: dict[str, Parameter] = {}
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
+            # The answer may be a float that lacks the last bits of the store's value. Another value in the store is
+            # wrong: another station has just undone our last write, and the store took this for a delayed message.
+            known = self._access.store.get(name) or answer
+            current[name] = known if same_value(float(known.value), float(answer.value)) else answer
             if name not in self._saved:
-                # The read has updated the store. The store's value is preferred, because it is exact, whereas the
-                # answer may be a float that lacks the last bits.
-                self._saved[name] = self._access.store.get(name) or answer
+                self._saved[name] = current[name]
                 self._registry.add(name, self)
+        for result in resolved:
+            if result.name in current:
+                results[result.requested] = result.replace(parameter=current[result.name])
+        return results
 
     def _take_saved(self) -> list[Parameter]:
         """Return the parameters that this block must restore.
@@ -111,10 +123,10 @@ class _Block:
         reason = ""
         with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
             try:
-                changed = await self._changed_by_others(saved)
+                unreadable, changed = await self._unreadable_and_changed(saved)
                 # Keep values that another station has set. Parameters that cannot be read count as not restored.
-                saved = [param for param in saved if not isinstance(changed.get(param.name), Parameter)]
-                to_write = [param for param in saved if param.name not in changed]
+                saved = [param for param in saved if param.name not in changed]
+                to_write = [param for param in saved if param.name not in unreadable]
                 answers = await self._access.write(to_write, self._idle_timeout_s)
             except AerokitError as error:
                 reason = f" ({error})"
@@ -123,22 +135,22 @@ class _Block:
             values = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
             raise RollbackFailed(f"could not restore{reason}: {values}", not_restored=not_restored) from cause
 
-    async def _changed_by_others(self, saved: list[Parameter]) -> dict[str, object]:
-        """Return the parameters that cannot be read, and those that another station has changed since the write.
+    async def _unreadable_and_changed(self, saved: list[Parameter]) -> tuple[set[str], set[str]]:
+        """Return the names that cannot be read, and those that another station has changed since the write.
 
         Changes by another station are logged.
         """
         written = self._access.written
         names = [param.name for param in saved if param.name in written]
-        changed: dict[str, object] = {}
+        unreadable, changed = set[str](), set[str]()
         for name, answer in (await self._access.read(names, self._idle_timeout_s)).items():
             if not isinstance(answer, Parameter):
-                changed[name] = answer
+                unreadable.add(name)
             elif float(answer.value) != float(written[name]):
-                changed[name] = answer
+                changed.add(name)
                 text = "%s is not restored: another station has changed it from %r to %r"
                 logger.warning(text, name, written[name], answer.value)
-        return changed
+        return unreadable, changed
 
 
 class TemporaryParameters(_Block):
@@ -228,11 +240,13 @@ class Transaction(_Block):
         """Set several parameters. If some fail, the first error is raised after all were tried."""
         if not self._is_open:
             raise InvalidArgument("this transaction is not open: it has ended, or was not entered yet")
-        results = await self._write(values)
-        for name in self._saved:
-            known = self._access.store.get(name)
-            if known is not None:
-                self._new_values[name] = known.value
+        try:
+            results = await self._write(values)
+        finally:  # Some values may be set, even if others could not be read or written.
+            for name in self._saved:
+                known = self._access.store.get(name)
+                if known is not None:
+                    self._new_values[name] = known.value
         _raise_first_error(results)
         clamped = [result for result in results.values() if result.outcome == "clamped"]
         if clamped:

@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Literal
 
 from aerokit._internal.formatting import did_you_mean
 from aerokit._internal.values import Snapshot
 from aerokit.errors import AerokitError, InvalidArgument, ParameterRejected, ParameterTimeout
 from aerokit.parameters import Parameter, ParameterType, check_name, checked_value
-from aerokit.parameters.parameter import same_value
+from aerokit.parameters.encoding import number_text
+from aerokit.parameters.parameter import same_value, to_float32
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from aerokit.parameters import ParameterTable
     from aerokit.parameters.renames import Renamed
     from aerokit.protocols.exchange import OnProgress
@@ -130,13 +129,16 @@ class NameResolver:
             return ResolvedParameter(name, direct, is_fresh=name in answers)
         from aerokit.parameters.renames import Renamed, find_rename, other_names
 
+        failure = direct
         for other_name in other_names(name):
             answer = answers.get(other_name, self._access.store.get(other_name))
             rename = find_rename(name, other_name)
             if isinstance(answer, Parameter) and rename is not None:
                 renamed = Renamed(name, other_name, rename)
                 return ResolvedParameter(name, answer, is_fresh=other_name in answers, renamed=renamed)
-        return self._with_hint(direct or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
+            if isinstance(answer, ParameterTimeout) and not isinstance(failure, ParameterTimeout):
+                failure = answer  # The vehicle may have the parameter under this name.
+        return self._with_hint(failure or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
 
     def _with_hint(self, answer: ParameterFailure) -> ParameterFailure:
         """Add a hint to the error: similar names, or the name that replaced this one."""
@@ -208,11 +210,12 @@ def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) 
     is_old_value = old is not None and same_value(old.value, answer.value)
     if same_value(answer.value, sent.value):
         return "unchanged" if is_old_value else "set"
-    if is_old_value:
-        text = f"{sent.name} = {sent.value:g} was refused: the vehicle keeps {answer.value:g}"
+    if is_old_value:  # This takes precedence over rounding, because PX4 transfers integers exactly.
+        kept = number_text(answer.value) if math.isfinite(answer.value) else answer.value
+        text = f"{sent.name} = {number_text(sent.value)} was refused: the vehicle keeps {kept}"
         return ParameterRejected(text, name=sent.name)
-    if same_value(float(answer.value), float(sent.value)):
-        return "rounded"  # The requested value is an integer that a float cannot represent exactly.
+    if to_float32(answer.value) == to_float32(sent.value):
+        return "rounded"  # The requested value is an integer that a 32-bit float cannot represent exactly.
     difference = abs(answer.value - sent.value)
     if answer.type.is_integer:
         is_near = difference < MAX_INTEGER_ROUNDING
@@ -225,6 +228,7 @@ def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) 
 MAX_ROUNDS = 3
 
 NoteOf = Callable[[str, float], str]
+Resolve = Callable[[Iterable[str], float], Awaitable[dict[str, ResolvedParameter | ParameterFailure]]]
 
 
 class _PlannedWrite(Snapshot):
@@ -257,17 +261,20 @@ class ParameterWriter:
         values: Mapping[str, float],
         *,
         upload: UploadMethod | None = None,
+        resolve: Resolve | None = None,
         idle_timeout_s: float,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
         """Write the values; return a result for each, in order.
 
-        With ``upload``, send only values that differ from the known ones, by the method ``upload``.
+        With ``upload``, send only values that differ from the known ones, by the method ``upload``. ``resolve`` is
+        called before each round of writes instead of :meth:`NameResolver.resolve`.
         """
+        resolve = resolve or self.names.resolve
         results: dict[str, ParameterWrite] = {}
         pending = check_values(values)
         for attempt in range(MAX_ROUNDS):
-            resolved = await self.names.resolve(pending, idle_timeout_s)
+            resolved = await resolve(pending, idle_timeout_s)
             count_before = self._access.store.count
             plans, errors = self._plan_writes(resolved, pending, is_first=attempt == 0)
             answers = await self._send(plans, upload, idle_timeout_s, on_progress)
@@ -288,9 +295,10 @@ class ParameterWriter:
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
         """Send the planned values, and return the vehicle's answers by the names on the vehicle."""
-        if upload is None:
+        if upload is None:  # `ParameterWrites` sends each name once, even if two plans have it.
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
-        changed = [plan.to_send for plan in plans if not plan.is_unchanged]
+        # Two names may mean the same parameter, which must be in the file only once.
+        changed = {plan.to_send.name: plan.to_send for plan in plans if not plan.is_unchanged}.values()
         unchanged: dict[str, ParameterAnswer] = {plan.old.name: plan.old for plan in plans if plan.is_unchanged}
         return unchanged | await self._access.write_pack(changed, upload, idle_timeout_s, on_progress)
 
