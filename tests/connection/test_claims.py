@@ -113,6 +113,16 @@ def test_known_clock_must_be_confirmed(right: bool, takes: bool) -> None:
     assert stage.claims(5.1, 1, message=attitude(5100 if right else 99_000)) is takes
 
 
+def test_rate_ignores_interval_without_counters() -> None:
+    stage = Stage()
+    for at, has_counters in ((2.0, False), (3.0, True)):
+        for number in range(9):
+            stage.copter.send(at - 0.9 + number / 10)
+        frame, counters = stage.copter.send(at)
+        assert stage.routes.record_heartbeat(frame, HOME, counters if has_counters else None)
+    assert stage.routes._routes[1, 1].rate == pytest.approx(10.0)
+
+
 def test_system_without_vehicle_object_is_taken_after_silence() -> None:
     assert Stage(attached=set()).claims(5.0, -100)
     assert not Stage(attached=set()).claims(2.0, -100)

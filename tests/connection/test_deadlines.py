@@ -88,6 +88,42 @@ def test_alarm_may_set_and_cancel_others() -> None:
     run_virtual(program())
 
 
+def test_alarm_may_postpone_another_that_is_due() -> None:
+    async def program() -> None:
+        alarms = Alarms()
+        other: list[Callable[[], None]] = []
+
+        def alarm() -> None:
+            alarms.move(other[0], 3.0)
+
+        alarms.move(alarm, 1.0)
+        other.append(alarms.at("other", 1.0))
+        await asyncio.sleep(10)
+        assert alarms.rung == [("other", 3.0)]
+
+    run_virtual(program())
+
+
+def test_alarm_that_raises_does_not_stop_others() -> None:
+    async def program() -> None:
+        reported: list[object] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: reported.append(context["exception"]))
+        alarms = Alarms()
+        error = RuntimeError("an alarm's error")
+
+        def alarm() -> None:
+            raise error
+
+        alarms.move(alarm, 1.0)
+        alarms.at("same time", 1.0)
+        alarms.at("later", 2.0)
+        await asyncio.sleep(10)
+        assert reported == [error]
+        assert alarms.rung == [("same time", 1.0), ("later", 2.0)]
+
+    run_virtual(program())
+
+
 def test_alarm_that_sets_itself_does_not_delay_others() -> None:
     async def program() -> None:
         alarms = Alarms()

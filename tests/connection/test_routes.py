@@ -119,6 +119,13 @@ async def test_system_broadcast_goes_to_all_peers_of_system(link: PeersLink, con
     assert link.peers_of(Timesync) == ["other"]
 
 
+async def test_system_broadcast_goes_to_all_peers_despite_component_0(link: PeersLink, connection: Connection) -> None:
+    link.receive("autopilot", (1, 1), COPTER)
+    link.receive("companion", (1, 0), Heartbeat(18, 8, 0, 0, 4))
+    connection.send(command(1, 0))
+    assert sorted(map(str, link.peers_of(CommandLong))) == ["autopilot", "companion"]
+
+
 async def test_broadcast_and_unknown_targets_go_to_all_peers(link: PeersLink, connection: Connection) -> None:
     link.receive("one", (1, 1), COPTER)
     connection.send(RequestDataStream(9, 1, 0, 4, 1))

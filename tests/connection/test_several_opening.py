@@ -45,6 +45,15 @@ async def test_duplicate_address_is_refused_before_opening(one: str, again: str)
         far.close()
 
 
+@pytest.mark.parametrize("has_link_object", [True, False])
+async def test_peers_that_filter_no_sender_are_refused(has_link_object: bool) -> None:
+    near, _ = memory_link_pair()
+    addresses = ["udpin:127.0.0.1:0", near] if has_link_object else ["udpout:127.0.0.1:1", "tcp:127.0.0.1:1"]
+    with pytest.raises(InvalidArgument, match="peers = … is not allowed"):
+        async with open_connection(addresses, peers="127.0.0.1"):
+            pass
+
+
 async def test_duplicate_link_object_is_refused() -> None:
     near, far = memory_link_pair()
     with pytest.raises(InvalidArgument, match="is listed twice"):

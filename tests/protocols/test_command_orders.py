@@ -110,6 +110,15 @@ def test_order_is_not_resent_after_old_heartbeat(now: float, expected: list[int]
     assert machine.done is (now > 4.0)
 
 
+def test_order_is_not_resent_after_its_time() -> None:
+    """The event loop was blocked, and a HEARTBEAT arrived after it."""
+    machine = order(Status(heartbeat_at=13.9))
+    assert confirmations(machine) == [0]
+    machine.expire(14.0)
+    assert machine.done
+    assert confirmations(machine) == []
+
+
 def test_order_waits_for_last_sending() -> None:
     order_status = Status(heartbeat_at=0.75)
     machine = order(order_status, attempts=2)
@@ -143,6 +152,16 @@ def test_unrepeatable_order_is_sent_once(command: int) -> None:
     assert now == 4.0
     assert confirmations(machine) == [0]
     assert text_of(machine).endswith(f"within 4.0 s; not sent again, because a repetition {what}")
+
+
+def test_unrepeatable_command_without_order_is_sent_once() -> None:
+    message = command_long(1, 1, MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, (1.0,))
+    machine = CommandExchange(message, own_system=255, own_component=190)
+    machine.start(0.0)
+    assert machine.deadline == 4.0
+    machine.expire(4.0)
+    assert machine.done
+    assert confirmations(machine) == [0]
 
 
 def test_unrepeatable_order_ends_with_its_effect() -> None:

@@ -220,6 +220,21 @@ def test_download_of_grown_file_ends_at_old_size() -> None:
     assert download.content == content(600)[:300]
 
 
+def test_download_drops_read_block_after_old_size() -> None:
+    download = Download(300)
+    exchange = download.exchange
+    exchange.start(0.0)
+    (burst,) = requests_in(exchange.take_outbox())
+    exchange.receive(as_message(reply_to(burst, code=MavFtpErr.UNKNOWNCOMMAND)), 0.1)
+    reads = {request.offset: request for request in requests_in(exchange.take_outbox())}
+    exchange.receive(as_message(reply_to(reads[478], bytes(239), offset=478)), 0.2)
+    assert download.into.received_bytes == 0
+    for offset in (239, 0):
+        exchange.receive(as_message(reply_to(reads[offset], content(600)[offset:][:239], offset=offset)), 0.3)
+    assert exchange.result() == 300
+    assert download.content == content(600)[:300]
+
+
 def test_download_of_empty_blocks_times_out() -> None:
     """After three such bursts only newly arrived data counts as progress."""
     download = Download(1000, idle_timeout_s=2.0)

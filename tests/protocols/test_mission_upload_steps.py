@@ -73,6 +73,14 @@ def test_upload_error_repeated_after_round_trip_fails() -> None:
     assert str(rejected(exchange)).startswith("mission: the vehicle refused item 1: ")
 
 
+def test_upload_repeated_error_before_first_round_trip_is_ignored() -> None:
+    exchange = upload(round_trip=RoundTrip())
+    request_item(exchange, 0, 1.0)
+    acknowledge(exchange, Result.ERROR, 1.1)
+    acknowledge(exchange, Result.ERROR, 1.15)
+    assert not exchange.done
+
+
 def test_upload_error_followed_by_request_is_ignored() -> None:
     exchange = upload()
     request_item(exchange, 0, 1.0)
@@ -148,6 +156,14 @@ def test_partial_upload_is_not_restarted() -> None:
     assert request_item(exchange, 3, 0.1) == [3]
     assert acknowledge(exchange, Result.OPERATION_CANCELLED, 0.2) == []
     assert rejected(exchange).result == Result.OPERATION_CANCELLED
+
+
+def test_expired_upload_without_restarts_reports_error() -> None:
+    exchange = upload(idle_timeout_s=100.0)
+    for number in range(4):
+        request_item(exchange, 0, 10.0 * number)
+        acknowledge(exchange, Result.ERROR, 10.0 * number + 5.0)
+    assert rejected(exchange).result == Result.ERROR
 
 
 @pytest.mark.parametrize(("silence_s", "answer"), [(4.4, [0]), (4.5, ["MISSION_COUNT"])])

@@ -305,6 +305,7 @@ def test_parameter_list_accepts_unstable_list_after_retries(count: int, names: l
     lose_once(channel, 2)
     table: ParameterTable = channel.run(listing())
     assert list(table) == names
+    assert [parameter.index for parameter in table.values()] == [0, 2, 3][: len(names)]
     assert repeated_requests(channel) == asked
 
 

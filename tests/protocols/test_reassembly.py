@@ -16,7 +16,7 @@ def test_reassembly_orders_blocks() -> None:
     assert (into.missing(12), bytes(written)) == (((0, 4), (8, 4)), b"")
     assert not into.add(4, b"efgh")
     assert into.add(0, b"abcd")
-    assert (bytes(written), into.position, into.done) == (b"abcdefgh", 8, 8)
+    assert (bytes(written), into.position, into.received_bytes) == (b"abcdefgh", 8, 8)
     assert into.missing() == ((8, 0),)
 
 
@@ -24,9 +24,9 @@ def test_reassembly_ends_at_short_block() -> None:
     into, written = blocks()
     into.add(12, b"mnop")
     into.add(8, b"ijkl")
-    assert into.done == 8
+    assert into.received_bytes == 8
     into.add(4, b"ef")
-    assert (into.end, into.done, into.missing()) == (6, 2, ((0, 4),))
+    assert (into.end, into.received_bytes, into.missing()) == (6, 2, ((0, 4),))
     assert not into.add(8, b"ijkl")
     assert not into.add(6, b"")
     into.add(0, b"abcd")
@@ -48,4 +48,4 @@ def test_reassembly_resumes() -> None:
     assert not into.add(0, b"abcd")
     into.add(4, b"efgh")
     into.end_at(8)
-    assert (bytes(written), into.missing(), into.done) == (b"efgh", (), 8)
+    assert (bytes(written), into.missing(), into.received_bytes) == (b"efgh", (), 8)

@@ -75,8 +75,9 @@ def test_several_messages_are_split() -> None:
         (b"", "no RTCM 3 message begins there"),
         (b"no rtcm at all", "no RTCM 3 message begins there"),
         (EXAMPLE_1005[:-1], "25 bytes, but only 24 were given"),
-        (EXAMPLE_1005 + b"\xd3", "the message is incomplete: it ends in its header"),
-        (EXAMPLE_1005[:3], "the message is incomplete: it ends in its header"),
+        (b"\xd3\xff\x00\x00", "all begin with 0xD3 and six zero bits"),
+        (EXAMPLE_1005 + b"\xd3", "the message is incomplete: it ends in or after its header"),
+        (EXAMPLE_1005[:3], "the message is incomplete: it ends in or after its header"),
         (EXAMPLE_1005[:-1] + b"\0", "CRC-24Q"),
         (rtcm(721), "721 bytes"),
     ],
@@ -98,6 +99,13 @@ def test_reader_finds_messages_in_any_pieces(sizes: list[int], noise: bytes, cut
         stream = stream[size:]
     assert found == messages
     assert reader.skipped_bytes == len(noise) * (len(messages) + 1)
+
+
+def test_reader_keeps_incomplete_message_if_caller_stops_early() -> None:
+    reader = RtcmReader()
+    for _ in reader.feed(EXAMPLE_1005 + rtcm(100)[:50]):
+        break
+    assert list(reader.feed(rtcm(100)[50:])) == [rtcm(100)]
 
 
 @given(st.lists(st.binary(max_size=2000), max_size=5))

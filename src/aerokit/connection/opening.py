@@ -38,6 +38,13 @@ ground station with that id has gone.
 """
 
 
+# Kinds of links that filter their senders by ``peers``.
+FILTERING_KINDS = ("udpin", "udpbcast", "tcpin")
+PEERS_WITH_LINK_OBJECT = (
+    "peers = … is not allowed with a link object: pass an address, or pass them to UdpListen or TcpListen"
+)
+
+
 @checked
 @async_block
 async def open_connection(
@@ -144,9 +151,7 @@ def _create_link(
             " or an aerokit.transport.ReconnectingLink"
         )
     if peers is not None:
-        raise InvalidArgument(
-            "peers = … is not allowed with a link object: pass an address, or pass them to UdpListen or TcpListen"
-        )
+        raise InvalidArgument(PEERS_WITH_LINK_OBJECT)
     return address
 
 
@@ -164,6 +169,8 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
 
     targets = [address if isinstance(address, Link) else parse_address(address) for address in addresses]
     _check_distinct(addresses, targets)
+    if peers is not None:
+        _check_that_peers_apply(targets)
     factories: list[Callable[[], Link]] = []
     costly: set[int] = set()
     for index, (address, target) in enumerate(zip(addresses, targets)):  # noqa: B905 - equal lengths
@@ -177,10 +184,18 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
                 f"{address} is not allowed among several links: a recording cannot replace a link to a vehicle"
             )
         # Only listening links get the filter, because other kinds of links refuse the argument.
-        peer_filter = peers if target.kind in ("udpin", "udpbcast", "tcpin") else None
+        peer_filter = peers if target.kind in FILTERING_KINDS else None
         # A lost link is reopened while another one works, even without ``reconnect``.
         factories.append(partial(ReconnectingLink, partial(create_link, target, baud=baud, peers=peer_filter)))
     return MultiLink(factories, costly=costly, survives_loss=reconnect)
+
+
+def _check_that_peers_apply(targets: Sequence[Link | LinkAddress]) -> None:
+    """Raise InvalidArgument if ``peers`` is given for links that would not filter their senders."""
+    if any(isinstance(target, Link) for target in targets):
+        raise InvalidArgument(PEERS_WITH_LINK_OBJECT)
+    if not any(getattr(target, "kind", None) in FILTERING_KINDS for target in targets):
+        raise InvalidArgument("peers = … is not allowed: none of the addresses is udpin, udpbcast or tcpin")
 
 
 def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | LinkAddress]) -> None:
@@ -200,13 +215,13 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return a key that is equal for addresses of the same port or socket; None if each opening gets a new one."""
+    """Return a key that is equal for addresses that cannot both be open; None if the system chooses the port or pty."""
     if isinstance(target, Link):
         return id(target)
-    opens_new_socket = (target.kind in ("udpin", "tcpin") and not target.port) or (
+    gets_new_endpoint = (target.kind in ("udpin", "tcpin") and not target.port) or (
         target.kind == "pty" and not target.path
     )
-    if opens_new_socket:
+    if gets_new_endpoint:
         return None
     # On zenoh networks, the same name with other endpoints is another vehicle.
     endpoints = [(name, value) for name, value in target.options if name in ("connect", "listen")]
@@ -263,6 +278,8 @@ class _Diagnosis:
         is_mostly_framed = 2 * self._bad_bytes < self._bytes
         if self._unknown_frames and is_mostly_framed:
             numbers = ", ".join(map(str, sorted(self._unknown_messages)[:MAX_LISTED_IDS]))
+            if len(self._unknown_messages) > MAX_LISTED_IDS:
+                numbers += ", …"
             return (
                 f"{received}, with {self._unknown_frames} frames of an unknown dialect (messages {numbers}) and no"
                 " known message: pass dialect=Dialect.from_xml(...)"

@@ -136,7 +136,8 @@ class _Route:
     heartbeat_at: float
     silent_since: float  # `heartbeat_at`, or later if the event loop was blocked after that time
     sequence: int  # sequence number of the last heartbeat
-    expected: int  # `counters.expected` at the last heartbeat, from which `rate` is computed
+    # `counters.expected` at the last heartbeat, from which `rate` is computed. It counts on beyond 255.
+    expected: int
 
     def __init__(self) -> None:
         self.counters: SourceStatistics | None = None  # the component's counters, which the peer's framer updates
@@ -187,12 +188,10 @@ class Routes:
             if len(self._routes) >= MAX_ROUTES and not self._sweep(frame.received_at):
                 return False
             route = self._routes[source] = _Route()
-        if counters is not None:
-            # The rate needs two heartbeats with the same counters. A new framer has new counters.
-            is_first = route.counters is not counters
-            if not is_first and frame.received_at > route.heartbeat_at:
-                route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
-            route.counters, route.expected = counters, counters.expected
+        # The rate needs two heartbeats with the same counters. A new framer has new counters.
+        if counters is not None and route.counters is counters and frame.received_at > route.heartbeat_at:
+            route.rate = (counters.expected - route.expected) / (frame.received_at - route.heartbeat_at)
+        route.counters, route.expected = counters, 0 if counters is None else counters.expected
         route.peer, route.sequence = peer, frame.sequence
         route.heartbeat_at = route.silent_since = frame.received_at
         return True
@@ -215,13 +214,14 @@ class Routes:
         """
         if system_id == 0:
             return EVERY_PEER
-        try:
-            return (self._routes[system_id, component_id].peer,)
-        except KeyError:
-            peers = {route.peer for (system, _), route in self._routes.items() if system == system_id}
-            if len(peers) > 1:
-                peers -= self._peers_of_duplicate_autopilots(system_id)
-            return peers or EVERY_PEER
+        # A sender may use the component id 0, but a message to component 0 is for all components.
+        route = self._routes.get((system_id, component_id)) if component_id else None
+        if route is not None:
+            return (route.peer,)
+        peers = {route.peer for (system, _), route in self._routes.items() if system == system_id}
+        if len(peers) > 1:
+            peers -= self._peers_of_duplicate_autopilots(system_id)
+        return peers or EVERY_PEER
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
         """Return True if the frame arrived on another peer than the one that owns the route of its sender."""
@@ -229,7 +229,10 @@ class Routes:
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Return True if ``peer`` takes over the route of this frame's sender; see the class for the rules."""
+        """Record the claim of ``peer`` to the route of this frame's sender; return True if the route was moved to it.
+
+        See the class for the rules. A claim that is refused, and a move, are published.
+        """
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
         is_silent = now - route.silent_since > ROUTE_TIMEOUT_S or not self._link.has_peer(route.peer)
@@ -320,6 +323,7 @@ class Routes:
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
         """Send to ``peer`` from now on, and drop all claims to the route, because they refer to the old owner."""
         before, route.peer = route.peer, peer
+        # The frame counts as a heartbeat, so that the new peer has time for its first one.
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
@@ -329,7 +333,10 @@ class Routes:
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
-        """Publish, once for each claim, that a second sender uses the ids, and that its claim is refused."""
+        """Publish that a second sender uses the ids (once for each peer), and that its claim is refused.
+
+        The refusal is published once for each silence of the owner.
+        """
         source = frame.system_id, frame.component_id
         may_be_owner = is_same_host and claim.may_continue_owner  # The owner may just have changed its port.
         if not claim.is_duplicate_reported and not may_be_owner:

@@ -42,6 +42,7 @@ class SignatureGate:
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # None if the file of ``Signing(keep=…)`` could be written
+        # The owner calls `set_signing` before the first frame, which updates `is_open`.
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = lambda: None
@@ -97,12 +98,12 @@ class SignatureGate:
             return True
         try:
             if is_of_handover and not _is_signed_with_a_key(frame):
-                # During the handover, the vehicle may remove its key as requested. Its unsigned frames are therefore
-                # neither reported nor counted as refused.
+                # During the handover, the vehicle may be without a key. Its unsigned frames are therefore neither
+                # reported nor counted as refused.
                 return signing.may_be_unsigned(frame)
             refusal = signing.check(frame, self._unix_time())
         except Exception:
-            logger.exception("allow_unsigned of %r raised; the frame was refused", signing)
+            logger.exception("the check of a frame by %r raised; the frame was refused", signing)
             return False
         if refusal is not None and refusal not in self._reported:
             self._reported.add(refusal)
@@ -117,7 +118,7 @@ class SignatureGate:
         """Log a refusal and publish it as an event. Called for the first refusal of each reason."""
         source = frame.system_id, frame.component_id
         logger.warning(
-            "a frame of %d/%d was refused: %s (%r); further refused frames are counted, but not logged",
+            "a frame of %d/%d was refused: %s (%r); further frames refused for this reason are counted, but not logged",
             *source,
             refusal.value,
             signing.key,
@@ -135,7 +136,8 @@ class SignatureGate:
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
         """Return how signatures may block communication, for error texts; "" if there is no sign of it.
 
-        With a key, these are the refusals of all senders. Without a key, it is that these senders sign their frames.
+        With a key, the text lists the frames refused so far, from all senders. Without a key, it says that a sender of
+        ``heartbeats`` signs its frames.
         """
         signing = self._encoder.signing
         if signing is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -47,8 +48,11 @@ class BackgroundTasks:
             task.cancel()
 
     async def aclose(self) -> None:
-        """Cancel all tasks and wait for their end, even if the caller is being cancelled."""
-        self.cancel()
+        """Cancel all tasks and wait for their end, even if the caller is being cancelled.
+
+        Must not be called by one of these tasks, because it would wait for its own end.
+        """
+        self.cancel()  # It also prevents new tasks.
         cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
         with anyio.CancelScope(shield=True):
             while self._tasks:
@@ -157,11 +161,15 @@ class Deadlines:
         timer slightly early.
         """
         self._timer = None
-        for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
-            if self._deadlines.pop(alarm, None) is not None:  # None if another alarm of this list has cancelled it
-                alarm()
-        if self._deadlines:
-            self._schedule(min(self._deadlines.values()))
+        try:
+            for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
+                # Another alarm of this list may have cancelled this one, or set it to a later time.
+                if self._deadlines.get(alarm, math.inf) <= timer_at:
+                    del self._deadlines[alarm]
+                    alarm()
+        finally:  # If an alarm raises, the loop logs the exception, and the others are called by the next timer.
+            if self._deadlines:
+                self._schedule(min(self._deadlines.values()))
 
     def _schedule(self, at: float) -> None:
         """Set the timer to ``at``, unless it fires earlier anyway."""

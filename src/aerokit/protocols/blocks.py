@@ -60,7 +60,8 @@ class AdaptiveWindow:
     def on_answer(self, seconds: float | None) -> None:
         """Record an answer.
 
-        ``seconds`` is the time since its request; None if the answer may be to one of several transmissions.
+        ``seconds`` is the time since its request; None if it says nothing about the link, because the answer may be to
+        one of several transmissions, or the server was busy.
         """
         self._loss -= LOSS_WEIGHT * self._loss  # The average moves towards 0 with an answer, towards 1 with a loss.
         if seconds is None:
@@ -95,8 +96,8 @@ class _BlockRequest:
 class BlockRequests:
     """Requests for blocks, keyed by offset. An adaptive window limits the number of requests in flight.
 
-    The first ``burst_size`` requests are sent at once, further ones ``spacing_s`` seconds apart. A request is repeated
-    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
+    The first ``burst_size`` requests are sent without delay, further ones ``spacing_s`` seconds apart. A request is
+    repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, burst_size: int = BURST_SIZE, spacing_s: float = SPACING_S) -> None:
@@ -175,8 +176,8 @@ class BlockRequests:
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
         """Return the offsets to request now, and count them as sent. Overdue blocks come first.
 
-        ``limit`` reduces the number of requests in flight. Up to ``burst_size`` requests are sent at once; beyond that,
-        one request every ``spacing_s`` seconds.
+        ``limit`` reduces the number of requests in flight. While fewer than ``burst_size`` requests are in flight, the
+        next one is sent without delay; beyond that, one every ``spacing_s`` seconds.
         """
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)
@@ -248,7 +249,7 @@ class Reassembly:
         self.position = start
         """Everything before this offset was written."""
         self.tail: int = start
-        """End of the received block with the largest offset."""
+        """End of the received block with the largest offset, or of the file once its size is known."""
         self.end: int | None = None
         """Size of the file; None while unknown."""
         self.gaps: dict[int, None] = {}
@@ -258,8 +259,8 @@ class Reassembly:
         self._bytes_ahead = 0
 
     @property
-    def done(self) -> int:
-        """Bytes received, including those before ``start``."""
+    def received_bytes(self) -> int:
+        """Number of bytes received, including those before ``start``."""
         return self.position + self._bytes_ahead
 
     @property

@@ -124,7 +124,7 @@ def command_long(
 
     Raises:
         InvalidArgument: there are more than seven parameters, a parameter cannot be converted to a 32-bit float or is
-            infinite, or the target is 0.
+            infinite, or ``target_system`` is 0.
     """
     _check_target(target_system, command)
     if len(params) > 7:
@@ -147,10 +147,11 @@ def command_int(
     """Build a COMMAND_INT.
 
     ``params`` are param1 to param4. ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or distances in 1e-4 m
-    in local frames. ``z`` is the altitude in metres in ``frame`` (MAV_FRAME).
+    in local frames. ``z`` is in metres: the altitude in global frames, the z coordinate in local frames, which is
+    positive down in NED frames. ``frame`` is a MAV_FRAME.
 
     Raises:
-        InvalidArgument: there are more than four parameters, a value exceeds its type, or the target is 0.
+        InvalidArgument: there are more than four parameters, a value exceeds its type, or ``target_system`` is 0.
     """
     _check_target(target_system, command)
     if len(params) > 4:
@@ -181,8 +182,8 @@ class CommandExchange(Exchange[CommandAck]):
         message: the command.
         own_system: our system id.
         own_component: our component id.
-        attempts: maximum number of transmissions; None: 4, or 1 for an order in `UNREPEATABLE_COMMANDS`.
-        attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for an order in `UNREPEATABLE_COMMANDS`.
+        attempts: maximum number of transmissions; None: 4, or 1 for a command in `UNREPEATABLE_COMMANDS`.
+        attempt_timeout: seconds for each attempt; None: 1 s, or 4 s for a command in `UNREPEATABLE_COMMANDS`.
         progress_timeout: seconds without any answer after an IN_PROGRESS, until the command fails.
         on_progress: called with each progress report.
         earlier_answers: number of acknowledgements to ignore, because they belong to an earlier, abandoned command with
@@ -223,10 +224,10 @@ class CommandExchange(Exchange[CommandAck]):
         super().__init__()
         is_unrepeatable = False
         if attempts is None:
-            attempts = MAX_ATTEMPTS if order_status is None else allowed_attempts(message.command, _params_of(message))
+            attempts = allowed_attempts(message.command, _params_of(message))
             is_unrepeatable = attempts == 1
         if attempt_timeout is None:
-            # An order that must not be repeated waits as long as all attempts of another command together.
+            # A command that must not be repeated waits as long as all attempts of another command together.
             attempt_timeout = ATTEMPT_TIMEOUT_S * (MAX_ATTEMPTS if is_unrepeatable else 1)
         if attempt_timeout > 0:  # Other values are refused below, with the value that the caller gave.
             attempt_timeout = max(attempt_timeout, min_timeout_s)
@@ -242,7 +243,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._earlier_answers, self._acks_per_sending = earlier_answers, acks_per_sending
         self._order_status = order_status
         self._is_sent = is_sent
-        self._sent_count = 0
+        self._sent_count = 0  # number of transmissions, including a first one by the caller
         self._answer_count = 0
         self._in_progress = False
 
@@ -306,14 +307,15 @@ class CommandExchange(Exchange[CommandAck]):
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
             return
+        # The time is checked first: if the event loop was blocked, a recent HEARTBEAT must not cause a late repetition.
+        give_up_at = self._started_at + self._attempts * self._attempt_timeout
+        if now >= give_up_at:
+            self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_repeated()))
+            return
         # A HEARTBEAT after this time shows that the link to the vehicle works, so the order may be repeated.
         min_heartbeat_at = max(self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout, now - MAX_HEARTBEAT_AGE_S)
         if self._sent_count < self._attempts and order_status.heartbeat_at >= min_heartbeat_at:
             self._send(now)
-            return
-        give_up_at = self._started_at + self._attempts * self._attempt_timeout
-        if now >= give_up_at:
-            self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_repeated()))
         else:
             self.deadline = min(now + POLL_INTERVAL_S, give_up_at)
 
@@ -345,7 +347,8 @@ class CommandExchange(Exchange[CommandAck]):
         return CommandLong(**fields)
 
     def _is_ours(self, ack: CommandAck) -> bool:
-        # In MAVLink 1, and from old firmware, an acknowledgement has no target fields, which then count as 0 (all).
+        # The caller passes only messages of the target system. In MAVLink 1, and from old firmware, an acknowledgement
+        # has no target fields, which then count as 0 (all).
         own_system, own_component = self._own_ids
         component = self._message.target_component
         frame = ack.received_frame

@@ -183,7 +183,8 @@ class MessageStream:
     def due_at(self) -> float:
         """Deadline for the next message.
 
-        If it passes, the stream has ended or, before the first message, has not started.
+        If it passes, the stream has ended or, before the first message, has not started. Until a second message, the
+        interval is unknown, and only the round trip determines the deadline.
         """
         # The first failures do not lengthen the wait, because radios lose single requests.
         silence_s = self._round_trip.timeout_s(max(1, self.failures - 1))
@@ -197,7 +198,10 @@ class MessageStream:
         self._has_started = False
 
     def on_message(self, now: float, messages: int) -> None:
-        """Record a message. ``messages`` counts it and the lost messages right before it, so 1 means no loss."""
+        """Record a message. ``messages`` counts it and the lost messages right before it, so 1 means no loss.
+
+        Without a count above 0, the message is a repeated or delayed one, which does not measure the interval.
+        """
         elapsed_s = now - self._last_at
         if self._has_started and messages > 0:
             self._interval.add_sample(elapsed_s / messages)
@@ -326,7 +330,11 @@ class StaleAnswerFilter:
         self._early_requests: dict[str, set[float]] = {}  # by name: send times of requests answered too early
 
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
-        """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``."""
+        """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``.
+
+        ``attempts`` is the number of transmissions of the request. The caller needs further evidence for answers that
+        are accepted: an answer to another station may be accepted once the vehicle counts as faster.
+        """
         elapsed_s = now - sent_at
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):
             return False

@@ -236,7 +236,7 @@ class FtpClient:
         self.source_system: int = source_system
         self.source_component: int = source_component
         self._sequence = first_sequence
-        self._session = first_sequence  # session numbers should differ between programs, too
+        self._session = first_sequence  # `next_session` limits it to 8 bits; should differ between programs, too
 
     def next_sequence(self, replies: int = 1) -> int:
         """Return the sequence number of a new request. The next ``replies`` numbers are reserved for its replies."""
@@ -322,7 +322,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
     ) -> None:
         super().__init__(client, path, **options)
         self.attempts = 0
-        """Number of times the request was sent."""
+        """Number of times the request was sent, including a first transmission by the caller."""
         self._request = FtpMessage(
             client.next_sequence(), opcode, session=session, size=len(data), offset=offset, data=data
         )
@@ -408,7 +408,9 @@ class FtpRequest(FtpExchange[FtpMessage]):
         """Return True if this NAK only means that the operation was executed before."""
         opcode = self._request.opcode
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            return True  # If the session does not exist, it is already closed.
+            # The session does not exist, so it is already closed. ArduPilot and PX4 refuse a close for no other reason,
+            # but after a FILEEXISTS, PX4 answers with another error (see `NO_SESSION_ERRORS`).
+            return True
         if self.attempts == 1:
             return False
         # An earlier transmission may have been executed although its answer was lost. The file is then already removed,

@@ -127,8 +127,9 @@ class FtpDownload(FtpExchange[int]):
         self._bursts_without_new_block = 0  # number of bursts requested since the last block that was new
         self._highest_blocks: dict[int, int] = {}  # by sequence number of a burst: the highest received block number
         self._supports_bursts = True
-        self._burst_at = 0.0  # time of the latest request for a burst, or of the last block after it
-        # Burst of the last block that was received, and time and number of the block with the highest number of it.
+        self._burst_active_at = 0.0  # time of the last block of a burst or, before any, of the request for the burst
+        # The burst to which the last received block belongs. Of this burst, the highest block number so far, and the
+        # time when that block arrived.
         self._last_burst: _Burst | None = None
         self._last_block_at = 0.0
         self._last_block_number = -1
@@ -168,6 +169,7 @@ class FtpDownload(FtpExchange[int]):
                 if burst.contains(reply):
                     self._on_block(burst, reply, now)
                     return
+            # A NAK belongs to a burst if its offset is possible as the end of the file, whatever its error is.
             elif (end := burst.file_end(reply)) is not None:
                 self._end_burst(burst, end, reply)
                 return
@@ -177,7 +179,7 @@ class FtpDownload(FtpExchange[int]):
             return
         is_latest = burst is self._bursts[-1]
         self._record_block(burst, burst.blocks_before(reply), now)
-        self._burst_at = now
+        self._burst_active_at = now
         self._failed_bursts = 0
         self._requests.set_busy(now + BUSY_BLOCKS * (self._interval.smoothed_s or 0.0))
         if is_latest and reply.burst_complete:
@@ -221,7 +223,7 @@ class FtpDownload(FtpExchange[int]):
             return
         # Before the first block, the errors in NO_BURST mean that the server does not support bursts. After it, they
         # mean that the transfer has failed.
-        has_no_block = self._reassembly.done == self._reassembly.start
+        has_no_block = self._reassembly.received_bytes == self._reassembly.start
         if has_no_block and reply.error_code in NO_BURST:
             self._supports_bursts = False
         else:
@@ -230,9 +232,10 @@ class FtpDownload(FtpExchange[int]):
     def _receive_read(self, sent: _SentRequest, reply: FtpMessage, now: float) -> None:
         offset = sent.offset
         self._requests.on_answer(offset, now, sent_at=sent.at)
-        if reply.is_ack and reply.data:
+        if reply.is_ack and reply.data and not self._is_past_size(offset):
             self._add(offset, reply.data, now)
-        # An ACK without data also means that the offset is not before the end of the file.
+        # An ACK without data also means that the offset is not before the end of the file. Data after the known size
+        # means that the file has grown, so it is dropped.
         elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
             self._end_at(offset)
         else:
@@ -263,7 +266,7 @@ class FtpDownload(FtpExchange[int]):
         if is_new:
             self._bursts_without_new_block = 0
             self._requests.discard(offset)
-            self._report_progress(now, self._reassembly.done, self._total)
+            self._report_progress(now, self._reassembly.received_bytes, self._total)
 
     # -------------------------------------------------------------------------------- requests
 
@@ -273,7 +276,7 @@ class FtpDownload(FtpExchange[int]):
         if self._size is not None and reassembly.position >= self._size:
             self._finish(reassembly.position)
             return
-        if reassembly.is_complete:  # The size is unknown, or was larger.
+        if reassembly.is_complete:  # The size is unknown, or the file has become shorter than the reported size.
             self._finish_at_end()
             return
         self._request_gaps()
@@ -317,11 +320,12 @@ class FtpDownload(FtpExchange[int]):
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. A later request with one of them would look like a
         # repetition of this request, and the server would only repeat its last reply. The request, the full blocks, a
-        # shorter block and the NAK have one number each.
+        # shorter block and the NAK have one number each. At most half of all numbers are reserved, because the numbers
+        # of a longer burst wrap around in any case. If the size is unknown, it is ArduPilot's number of blocks.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True
-        self._burst_at = now
+        self._burst_active_at = now
         self._bursts_without_new_block += 1
         self._send(
             FtpMessage(sequence, MavFtpOpcode.BURSTREADFILE, session=self._session, size=DATA_SIZE, offset=offset)
@@ -339,7 +343,7 @@ class FtpDownload(FtpExchange[int]):
             has_started = self._last_burst is self._bursts[-1]
             max_lost = MAX_LOST_BLOCKS if has_started else MAX_LOST_FIRST_BLOCKS
             silence_s += max(max_lost * self._interval.smoothed_s, self._interval.timeout_s())
-        return self._burst_at + silence_s
+        return self._burst_active_at + silence_s
 
     def _set_deadline(self) -> None:
         deadline = self._idle_deadline
@@ -367,7 +371,7 @@ class FtpDownload(FtpExchange[int]):
 
     def _timeout_error(self) -> FileTimeout:
         missing = self._reassembly.missing(self._size)  # Not empty, because the download is not complete.
-        received = self._reassembly.done
+        received = self._reassembly.received_bytes
         first_offset, _ = missing[0]
         return FileTimeout(
             f"read {self._path}: no data received for {self._idle_timeout_s:g} s; {received} bytes received,"

@@ -42,8 +42,8 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# Ranges grow until one takes this many round trips, so that the pause between two ranges is negligible.
-MIN_RANGE_ROUND_TRIPS = 60
+# Ranges grow until one takes this many time-outs of the round trip, so that the pause between two ranges is negligible.
+MIN_RANGE_TIMEOUTS = 60
 
 MAX_EARLY_ENDS = 3
 
@@ -76,12 +76,13 @@ class LogDownload(Transfer[int]):
         self._stream = MessageStream(self.round_trip)
         self._is_streaming = False
         self._range_end = into.position
-        self._latest_offset = self._range_end  # largest offset received in the current range
+        self._latest_offset = self._range_end  # largest offset received in the range, or the block before the range
         self._max_range_blocks = FIRST_RANGE
         self._requested_blocks = 0  # number of requested blocks of the current range
         self._received_blocks = 0
         self._early_ends = 0  # number of short blocks before the end of the log
-        self._has_checked_gaps = True  # False while the last range may have long gaps
+        # False while the last range, or an earlier download into the same `Reassembly`, may have left long gaps.
+        self._has_checked_gaps = not into.gaps
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -107,7 +108,7 @@ class LogDownload(Transfer[int]):
             self._fail(
                 FileTimeout(
                     f"log {self._id}: no data received for {self._idle_timeout_s:g} s;"
-                    f" {self._reassembly.done} of {self._size} bytes received",
+                    f" {self._reassembly.received_bytes} of {self._size} bytes received",
                     missing=missing,
                 )
             )
@@ -131,12 +132,18 @@ class LogDownload(Transfer[int]):
             self._is_streaming = offset + LOG_BLOCK < self._range_end
         # If the log has grown since it was listed, PX4 sends a full block at the listed end. The rest is cut off.
         length = min(message.count, self._size - offset)
-        if self._reassembly.add(offset, bytes(message.data[:length])):
-            self._report_progress(now, self._reassembly.done, self._size)
+        try:
+            is_new = self._reassembly.add(offset, bytes(message.data[:length]))
+        except Exception as error:  # Writing failed, e.g. because the disk is full.
+            self._fail(error)
+            self._send_end()
+            return
+        if is_new:
+            self._report_progress(now, self._reassembly.received_bytes, self._size)
         self._requests.on_answer(offset, now)
 
     def _on_short_block(self, end: int) -> None:
-        """Process the end of a block that is short although the log is longer: fail only after some of them."""
+        """Drop a block that ends before the end of the log. Fail after `MAX_EARLY_ENDS` such blocks."""
         # The vehicle could not read its own log. This may be temporary, so the data is requested again a few times.
         self._is_streaming = False
         self._early_ends += 1
@@ -175,7 +182,7 @@ class LogDownload(Transfer[int]):
     def _first_long_gap(self) -> tuple[int, int] | None:
         """Return start and end of the first gap of at least `LONG_GAP` blocks; None if all gaps are shorter."""
         min_length = LONG_GAP * LOG_BLOCK
-        start, end = 0, 0  # the gap that is being measured
+        start, end = 0, 0  # the gap that is being measured: consecutive offsets in `gaps`, which has one for each block
         for offset in self._reassembly.gaps:
             is_new_gap = offset != end
             if is_new_gap:
@@ -199,14 +206,14 @@ class LogDownload(Transfer[int]):
 
     def _adapt_range(self) -> None:
         # Radios lose up to a third of the messages. If more than half are lost, a queue overflows, so ranges must be
-        # shorter.
+        # shorter. A range that was ended by a time-out is not judged, because the request or the link may have failed.
         if self._stream.failures or not self._requested_blocks:
             return
         if self._received_blocks < self._requested_blocks / 2:
             self._max_range_blocks = max(self._max_range_blocks // 2, MIN_RANGE)
         elif self._requested_blocks >= self._max_range_blocks and self._stream.interval_s:
             # Ranges grow until the pause between two ranges is negligible.
-            useful_blocks = MIN_RANGE_ROUND_TRIPS * self.round_trip.timeout_s() / self._stream.interval_s
+            useful_blocks = MIN_RANGE_TIMEOUTS * self.round_trip.timeout_s() / self._stream.interval_s
             self._max_range_blocks = min(2 * self._max_range_blocks, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
 
     def _request(self, offset: int, count: int) -> None:
@@ -289,14 +296,14 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
         **options: Unpack[TransferOptions],
     ) -> None:
         super().__init__(target_system, target_component, **options)
-        self._first_id = first_id
-        self._from_id = first_id if from_id is None else from_id
+        self._first_id = first_id  # the lowest id that exists
+        self._from_id = first_id if from_id is None else from_id  # the first requested id
         self._to_id = to_id
         self._max_unanswered = max_unanswered
         self._entries: dict[int, LogEntry] = {}
         self._missing: dict[int, None] | None = None  # ids of the missing entries; None before the first entry
         self._stream = MessageStream(self.round_trip)
-        self._last_id = 0  # the id of the last entry or, after a request, the first requested id
+        self._previous_id = 0  # the id of the previously received entry or, after a request, the first requested id
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -307,8 +314,8 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
             return
         if self._missing is None:
             self._expect(message)
-        self._stream.on_message(now, message.id - self._last_id)
-        self._last_id = message.id
+        self._stream.on_message(now, message.id - self._previous_id)
+        self._previous_id = message.id
         assert self._missing is not None
         if message.id in self._missing:
             del self._missing[message.id]
@@ -348,7 +355,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
 
     def _request(self, now: float, first: int, last: int) -> None:
         self._outbox.append(LogRequestList(self.target_system, self.target_component, first, last))
-        self._last_id = first
+        self._previous_id = first
         self._stream.on_request(now)
         self._set_deadline()
 

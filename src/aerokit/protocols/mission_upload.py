@@ -130,7 +130,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             # After a long silence, ERROR means that the vehicle's transfer has expired. The upload then starts again.
             has_expired = self._is_requesting and silence_s >= TRANSFER_EXPIRY_S
             if message.type == MavMissionResult.ERROR and has_expired:
-                self._restart(now)
+                self._restart(message.type, now)
             else:
                 self._on_ack(message, now)
         elif isinstance(message, (MissionRequestInt, MissionRequest)) and self._first <= message.seq < self._end:
@@ -214,19 +214,23 @@ class MissionUpload(MissionExchange[UploadResult]):
                 if self._outbox:  # If nothing was sent, the present deadline stays.
                     self._wait(now)
         elif result == MavMissionResult.OPERATION_CANCELLED:
-            self._restart(now)
-        elif result == MavMissionResult.ERROR and not self._is_partial_refusal:
+            self._restart(result, now)
+        elif result == MavMissionResult.ERROR and not self._is_refusal_of_partial_upload:
             self._on_error(now)
         else:
             self._fail_as_refused(result)
 
     @property
-    def _is_partial_refusal(self) -> bool:
+    def _is_refusal_of_partial_upload(self) -> bool:
         """True if an ERROR refuses MISSION_WRITE_PARTIAL_LIST."""
         return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
-        """Process an ERROR that may be temporary: repeat an item first, and end the upload after a second ERROR."""
+        """Process an ERROR that may be temporary.
+
+        Before the first request, wait and announce the items again. Then repeat an item, unless it is in flight. At a
+        second ERROR fail, or end without a confirmation if all items were sent.
+        """
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
         # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
         # therefore repeated. A second ERROR that arrives within a round trip may answer what was sent before the
@@ -239,7 +243,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             seq = self._end - 1 if are_all_sent else self._confirmed_end
             self._send(seq, now, unless_in_flight=True)
             self._wait(now)
-        elif now - self._error_at >= IN_FLIGHT_ROUND_TRIPS * (self.round_trip.smoothed_s or 0.0):
+        elif now - self._error_at >= self._in_flight_s:
             if self._sent_end == self._end:
                 # All items were sent, so the upload may be complete. The caller must read the plan back.
                 self._succeed(now, is_confirmed=False, opaque_id=0)
@@ -256,13 +260,14 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._progress_at = now  # The vehicle answers, so the transfer must not time out as idle.
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
-    def _restart(self, now: float) -> None:
-        """Begin again, because the vehicle's transfer has expired or was cancelled."""
+    def _restart(self, result: int, now: float) -> None:
+        """Begin again, because ``result`` shows that the vehicle's transfer has expired or was cancelled."""
         if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
             return
-        # A partial upload does not begin again, because some of the old items may already have been replaced.
+        # A partial upload does not begin again. The differences were computed from the vehicle's plan, which another
+        # station may have changed since.
         if self.is_partial or self._restarts >= MAX_RESTARTS:
-            self._fail_as_refused(MavMissionResult.OPERATION_CANCELLED)
+            self._fail_as_refused(result)
             return
         self._restarts += 1
         self._reset()
@@ -308,13 +313,13 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
-        """Call `_send` for all unconfirmed items, except those in flight, and for ``ahead`` items after them.
+        """Repeat the items that were sent but not confirmed, except those in flight, and send ``ahead`` more.
 
-        The vehicle's requests for these items may have been lost.
+        The vehicle's requests for the repeated items may have been lost.
         """
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # Not only the last item is repeated. PX4 takes any repeated item for the mission's last item, and confirms
-            # the upload. This confirmation does not prove that PX4 has all items.
+            # Not only the last item may be repeated. PX4 takes any repeated item for the mission's last item, and
+            # confirms the upload. This confirmation does not prove that PX4 has all items.
             self._was_tail_repeated = True
         # One more than the window, because the vehicle may already have the first unconfirmed item.
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)
@@ -343,7 +348,12 @@ class MissionUpload(MissionExchange[UploadResult]):
         # The vehicle would answer a duplicate by another request, and each request for an item that was already
         # requested makes us send a whole window again. An item in flight is therefore not repeated.
         sent_at = self._sent_at.get(seq)
+        return sent_at is not None and now - sent_at < self._in_flight_s
+
+    @property
+    def _in_flight_s(self) -> float:
+        """Seconds after a transmission in which its answer cannot have arrived yet."""
         round_trip_s = self.round_trip.smoothed_s
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()
-        return sent_at is not None and now - sent_at < IN_FLIGHT_ROUND_TRIPS * round_trip_s
+        return IN_FLIGHT_ROUND_TRIPS * round_trip_s

@@ -150,7 +150,11 @@ class MissionClear(MissionExchange[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process the MISSION_ACK. A result that can only belong to an expired upload is ignored."""
+        """Process the MISSION_ACK. A result that can only belong to an expired upload is ignored.
+
+        A late ACCEPTED of an earlier upload counts, because it looks the same. The caller therefore reads the number
+        of items afterwards.
+        """
         if not isinstance(message, MissionAck) or not self._is_ours(message):
             return
         if message.type == MavMissionResult.ACCEPTED:
@@ -230,15 +234,15 @@ class SetCurrentItem(Transfer[None]):
 
     def expire(self, now: float) -> None:
         status = self._order_status
-        end = "" if status is None else status.end
+        end_reason = "" if status is None else status.end
         min_heartbeat_at = max(self._sent_at, now - MAX_HEARTBEAT_AGE_S)
-        if end or self._is_idle(now):
+        if end_reason or self._is_idle(now):
             reported = "nothing" if self._reported is None else f"item {self._reported}"
             self._fail(
                 OperationTimeout(
                     f"MISSION_SET_CURRENT {self._seq} was not confirmed in {now - self._started_at:.1f} s"
                     f" ({self._attempts} attempts); MISSION_CURRENT reported {reported} (numbers as in the messages)"
-                    + (f"; not sent again: {end}" if end else "")
+                    + (f"; not sent again: {end_reason}" if end_reason else "")
                 )
             )
         elif status is not None and status.heartbeat_at < min_heartbeat_at:
@@ -272,8 +276,9 @@ def mission_checksum(items: Iterable[MissionItem]) -> int:
     """Compute the checksum with which PX4 identifies a plan.
 
     The checksum is a CRC-32 with initial value 0 and without final inversion, over frame, command, autocontinue and the
-    seven numbers of each item. PX4 (since 1.15) reports it as ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as
-    ``mission_id``, ``fence_id`` and ``rally_points_id`` in MISSION_CURRENT
+    seven numbers of each item, with x and y as the integers of MISSION_ITEM_INT. PX4 (since 1.15) reports it as
+    ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as ``mission_id``, ``fence_id`` and ``rally_points_id`` in
+    MISSION_CURRENT
     (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
     """
     # zlib.crc32 inverts its start value and its result, so both are inverted once more.

@@ -111,7 +111,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         """Process a value of the stream, an answer to a request, or a value outside the list (index 65535)."""
         index = message.param_index
         if index == UNKNOWN_INDEX or message.param_id == HASH_NAME:
-            self._on_uncounted_value(message, now)
+            self._on_value_without_index(message, now)
             return
         is_streamed = self._is_streaming and index >= self._next_index
         self._record_count(message.param_count, is_streamed=is_streamed)
@@ -128,9 +128,9 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._parameters[parameter.name] = parameter
         self._store(index, parameter, message.param_count, now)
 
-    def _on_uncounted_value(self, message: ParamValue, now: float) -> None:
-        # The value has no index, so it is not a part of the list. Either another client has set the parameter, or the
-        # value is PX4's hash of all parameters, after which the list starts.
+    def _on_value_without_index(self, message: ParamValue, now: float) -> None:
+        # The value is not a part of the list. Either a client has set the parameter, or the value is PX4's hash of all
+        # parameters, after which the list starts.
         self._record_count(message.param_count, is_streamed=False)
         if message.param_id == HASH_NAME:
             self._last_at = now
@@ -140,8 +140,10 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._parameters[reported.name] = merge_update(self._parameters[reported.name], reported, self._bytewise)
 
     def _on_refusal(self, message: ParamError) -> None:
-        # The error means that the list has become shorter. Only the index in the message is used, because PX4 does not
-        # fill in the name.
+        # The error means that the list has become shorter. PX4 also sends it if it has no room for the value, but
+        # hardly ever `MAX_REFUSALS` times for one index. If later parameters were received, they no longer fit the
+        # count, so `_drop_stale` requests values again, and their messages correct the count. Only the index in the
+        # message is used, because PX4 does not fill in the name.
         index = message.param_index
         if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._received:
             return
@@ -204,7 +206,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _quiet_s(self) -> float:
         """Return the seconds without a message after which the stream has stopped.
 
-        Answers to requests also count as messages, because they delay the stream.
+        Except near the end, answers to requests also count as messages, because they delay the stream.
         """
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed_count < MIN_STREAMED:  # A single value may be the answer to our request by index.
@@ -243,12 +245,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._finish(ParameterTable(self._in_order(parameters, names)))
 
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
-        """Number the parameters of the list, each name once with its latest value. Names without an index come last."""
-        ordered = dict.fromkeys(parameter.name for parameter in parameters)
+        """Return the parameters by index, each name once with its latest value. Names without an index come last."""
+        indices: dict[str, int | None] = {}
+        for index, parameter in enumerate(parameters):
+            indices.setdefault(parameter.name, index)
         if self._refreshes == 0:  # After a change of the list, names without an index may no longer exist.
-            ordered.update(dict.fromkeys(name for name in self._parameters if name not in names))
-        table = []
-        for index, name in enumerate(ordered):
-            latest = self._parameters[name]
-            table.append(Parameter(name, latest.value, latest.type, index=index))
-        return table
+            indices.update(dict.fromkeys(name for name in self._parameters if name not in names))
+        latest = self._parameters
+        return [Parameter(name, latest[name].value, latest[name].type, index=index) for name, index in indices.items()]

@@ -143,6 +143,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
 
     def _on_value(self, message: ParamValue, now: float) -> None:
         """Process the answer to a probe, or the value of a requested name. A message may be both."""
+        # An answer to another station also counts. `_loss_probability` rejects a name only after so many probes that
+        # such a coincidence has no effect.
         is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
         if is_probe_answer:
             self._count_probe()
@@ -218,12 +220,13 @@ class ParameterWrites(ParameterRequests):
             **options,
         )
         self._before = dict(before)
-        self._recent = set(recent)
+        self._recently_written = set(recent)
         self._to_set = set(self._requested)  # names whose next request is a PARAM_SET
         self._unexpected: dict[str, UnexpectedAnswers[Parameter]] = {}
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
+        """Return PARAM_SET if the name is in `_to_set`, and remove it there; otherwise a request to read."""
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
         if name not in self._to_set:
             return [read]
@@ -232,7 +235,8 @@ class ParameterWrites(ParameterRequests):
         write = set_message(
             self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
         )
-        if self._unexpected.get(name):
+        answers = self._unexpected.get(name)
+        if answers is not None and len(answers) > 0:
             # The vehicle has answered an earlier write with another value, so it may ignore this write and send no
             # answer. The read makes the vehicle send the value in any case.
             return [write, read]
@@ -247,9 +251,10 @@ class ParameterWrites(ParameterRequests):
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         answers = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
-        if is_as_requested and name in self._recent:
-            # The message may be the late answer to the earlier write, so the value is read once more.
-            self._recent.remove(name)
+        if is_as_requested and name in self._recently_written:
+            # The message may be the late answer to a write of this name by an earlier call, so the value is read once
+            # more.
+            self._recently_written.remove(name)
             answers.add(reported)
             self._window.on_answer(name, now)
             self._window.request(name)

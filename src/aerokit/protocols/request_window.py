@@ -62,7 +62,7 @@ class RequestWindow(Generic[KeyT]):
         self._silences = 0  # number of silences of the whole link since the last answer
         self._next_silence_at = -math.inf  # earliest time at which a further silence is counted
         self._waiting: dict[KeyT, None] = {}
-        # Requests whose answer is awaited and not yet overdue, in the order in which they were sent.
+        # Requests that were sent, and neither answered nor queued again, in the order in which they were sent.
         self._in_flight: dict[KeyT, _Request] = {}
         # All unanswered requests that were sent at least once, including overdue ones that wait to be sent again.
         self._requests: dict[KeyT, _Request] = {}
@@ -108,7 +108,7 @@ class RequestWindow(Generic[KeyT]):
         self._requests.pop(key, None)
 
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
-        """Record an answer. Return the requests that count as lost.
+        """Record an answer. Queue the requests again that count as lost, and return them.
 
         The lost requests were sent at least ``overtaken`` transmissions before the answered request.
         """

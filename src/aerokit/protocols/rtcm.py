@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from aerokit.mavlink.messages import GpsRtcmData
 
 __all__ = ["MAX_MESSAGE_SIZE", "RtcmReader", "crc24q", "fragments", "message_number", "rtcm_messages"]
@@ -65,10 +63,14 @@ def rtcm_messages(data: bytes) -> list[bytes]:
         remaining = len(data) - begin
         subject = f"rtcm (byte {begin} of {len(data)})"
         if 0 < remaining <= HEADER_SIZE and data[begin] == PREAMBLE:
-            raise InvalidArgument(f"{subject} is not allowed: the message is incomplete: it ends in its header")
+            raise InvalidArgument(
+                f"{subject} is not allowed: the message is incomplete: it ends in or after its header"
+            )
         size = _frame_size(data, begin) if remaining > HEADER_SIZE else None
         if size is None:
-            raise InvalidArgument(f"{subject} is not allowed: no RTCM 3 message begins there (all begin with 0xD3)")
+            raise InvalidArgument(
+                f"{subject} is not allowed: no RTCM 3 message begins there (all begin with 0xD3 and six zero bits)"
+            )
         frame = data[begin : begin + size]
         if len(frame) < size:
             raise InvalidArgument(
@@ -97,8 +99,9 @@ class RtcmReader:
         self._buffer = b""
         self.skipped_bytes: int = 0
 
-    def feed(self, data: bytes) -> Iterator[bytes]:
-        """Process bytes, and yield each complete message. An incomplete message (up to 1028 bytes) is kept."""
+    def feed(self, data: bytes) -> list[bytes]:
+        """Process bytes, and return the complete messages. An incomplete message (up to 1028 bytes) is kept."""
+        messages: list[bytes] = []
         buffer = self._buffer + data
         begin = 0
         while True:
@@ -117,9 +120,10 @@ class RtcmReader:
                 begin += 1
                 self.skipped_bytes += 1
                 continue
-            yield buffer[begin : begin + size]
+            messages.append(buffer[begin : begin + size])
             begin += size
         self._buffer = buffer[begin:]
+        return messages
 
 
 def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:

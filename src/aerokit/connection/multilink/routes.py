@@ -311,7 +311,7 @@ class MultiLinkRoutes:
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
-        """Return peers that together reach every system, each only once if possible.
+        """Return peers that together reach every system with a link in use, each only once if possible.
 
         Links over which no system is known are added as well.
         """
@@ -348,6 +348,8 @@ class MultiLinkRoutes:
             return
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
+            # The link cannot tell for which system the data is. Data for other systems is lost, too, which their
+            # commands and transfers treat like any other loss: nothing arrives late.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             name = self._link.names[used.link]

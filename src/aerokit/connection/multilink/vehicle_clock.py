@@ -33,7 +33,7 @@ class VehicleClock:
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
         """True if the last sample was as expected from the speed; False after a pause or reboot."""
-        # Clock rate before the last pause or reboot, and our time then.
+        # Clock rate before the last pause or reboot, and our time of the first sample after it.
         self._previous_speed: tuple[float, float] | None = None
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
@@ -97,9 +97,9 @@ class VehicleClock:
             return self._measured_speed
         if self._previous_speed is None:
             return None
-        speed, measured_at = self._previous_speed
+        speed, interrupted_at = self._previous_speed
         last_at, _ = self._samples[-1]
-        return speed if last_at - measured_at <= SPEED_MAX_AGE_S else None
+        return speed if last_at - interrupted_at <= SPEED_MAX_AGE_S else None
 
     @property
     def _measured_speed(self) -> float | None:
