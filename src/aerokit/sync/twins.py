@@ -611,6 +611,8 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
+        Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
+
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
         set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
@@ -678,9 +680,11 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     and sends nothing more. After a stop, ``fly`` and leaving the block raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).
-        OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
-        InvalidArgument: ``height_m`` was given, but the target has no altitude. The vehicle holds.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.
+        OperationTimeout: no position of the target was known within ``valid_for_s``.
+        InvalidArgument: ``height_m`` was given, but the target has no altitude.
+
+    After these errors, the vehicle is ordered to hold if it was still executing an earlier order of the program.
     """
 
     @property

@@ -73,7 +73,7 @@ def test_fly_sim_starts_at_planned_home(capsys: pytest.CaptureFixture[str]) -> N
     ("kind", "text"),
     [
         ("copter", "mission finished: in AUTO, disarmed"),
-        exhaustive(pytest.param("px4", "mission finished: holding in LOITER, disarmed")),
+        exhaustive(pytest.param("px4", "mission finished: in LOITER, disarmed")),
     ],
 )
 def test_example_plan_is_flown_to_its_end(kind: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:

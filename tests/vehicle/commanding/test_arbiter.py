@@ -170,7 +170,8 @@ def test_previous_orders_mode_while_active_is_no_takeover() -> None:
 def test_unreported_ordered_mode_in_doubt_is_no_takeover(in_doubt: bool, end: str) -> None:
     stage = Stage()
     stage.arbiter.order(GUIDED)
-    stage.arbiter.mode_is_in_doubt = in_doubt
+    if in_doubt:
+        stage.open.enter_context(stage.arbiter.changing_mode())
     order = stage.arbiter.order(BRAKE)
     stage.report(GUIDED)
     assert order.end == end
@@ -181,7 +182,8 @@ def test_abandoned_mode_within_three_seconds_is_no_takeover(after_s: float, end:
     stage = Stage()
     stage.arbiter.order(GUIDED)
     stage.arbiter.doubt_mode()
-    stage.arbiter.mode_is_in_doubt = False
+    with stage.arbiter.changing_mode():
+        pass
     stage.now += after_s
     order = stage.arbiter.order(BRAKE)
     stage.report(GUIDED)
@@ -239,6 +241,47 @@ def test_refused_mode_keeps_previous_doubt() -> None:
     with pytest.raises(CommandRejected), arbiter.changing_mode():
         raise CommandRejected("no", command=176, result=4)
     assert arbiter.mode_is_in_doubt
+
+
+def test_mode_stays_in_doubt_until_newer_change_is_answered() -> None:
+    """A newer order supersedes a change in progress, and its command is still unanswered."""
+    arbiter = Stage().arbiter
+    older, newer = arbiter.changing_mode(), arbiter.changing_mode()
+    older.__enter__()
+    newer.__enter__()
+    older.__exit__(None, None, None)
+    assert arbiter.mode_is_in_doubt
+    newer.__exit__(None, None, None)
+    assert not arbiter.mode_is_in_doubt
+
+
+def test_refused_mode_leaves_no_doubt_about_answered_change() -> None:
+    arbiter = Stage().arbiter
+    older = arbiter.changing_mode()
+    older.__enter__()
+    with pytest.raises(CommandRejected), arbiter.changing_mode():
+        older.__exit__(None, None, None)
+        raise CommandRejected("no", command=176, result=4)
+    assert not arbiter.mode_is_in_doubt
+
+
+def test_answered_mode_keeps_doubt_about_later_change() -> None:
+    """A hold was sent without waiting while the change was in progress."""
+    arbiter = Stage().arbiter
+    with arbiter.changing_mode():
+        arbiter.doubt_mode()
+    assert arbiter.mode_is_in_doubt
+
+
+def test_vehicle_is_not_flown_after_takeover_that_follows_refusal() -> None:
+    stage = Stage(armed=False)
+    with stage.arbiter.auxiliary_order() as arming, stage.arbiter.sending(arming, armed=True):
+        stage.report(LOITER)
+    refused = stage.arbiter.order(GUIDED)
+    refused.was_refused = True
+    assert stage.arbiter.is_flown_by_program
+    stage.report(RTL)
+    assert not stage.arbiter.is_flown_by_program
 
 
 def test_state_is_known_for_two_and_a_half_seconds() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import anyio
 import pytest
-from flight_harness import Flight, in_the_air, open_flight, open_px4
+from flight_harness import Flight, in_the_air, now, open_flight, open_px4
 
 from aerokit import connect, missions
 from aerokit.errors import (
@@ -188,6 +188,15 @@ async def test_wait_ready_names_unarmable_mode_after_the_list() -> None:
         await anyio.sleep(2.0)
         with pytest.raises(OperationTimeout, match=r"still missing:(\n  - .*)+\nArduCopter cannot arm in LAND, only"):
             await flight.vehicle.wait_ready(timeout=1.0)
+
+
+async def test_wait_ready_returns_if_vehicle_becomes_ready_at_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        ready_at = now() + 1.0
+        health = flight.vehicle._context.health
+        monkeypatch.setattr(health, "missing_for_flight", lambda: ["a position"] if now() < ready_at else [])
+        await flight.vehicle.wait_ready(timeout=1.0)
 
 
 async def test_missing_for_flight_names_lost_link() -> None:

@@ -32,6 +32,20 @@ async def test_block_left_after_cancelled_flight_warns_that_vehicle_holds(
     assert record.message.startswith("the async with block of vehicle 1 was left: holding in BRAKE, still armed, ")
 
 
+async def test_block_left_holds_although_callback_raises(caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    with anyio.move_on_after(30) as scope:
+        async with in_the_air() as flight:
+            flight.vehicle._context.on_finish.append(fail)
+            scope.deadline = anyio.current_time() + 2
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(flight.vehicle.go_to, flight.vehicle.position.value.offset(north_m=500))
+    assert flight.wire.mode_orders() == [CopterMode.BRAKE]
+    assert "a callback at the end of the async with block of this vehicle failed" in caplog.text
+
+
 async def test_block_left_by_exception_in_flight_warns(caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(ZeroDivisionError):
         async with in_the_air():

@@ -185,6 +185,47 @@ async def test_take_off_climb_is_effect(grounded: Flight, monkeypatch: pytest.Mo
     assert len(grounded.wire.commands(MavCmd.NAV_TAKEOFF)) == 4
 
 
+@pytest.mark.parametrize("outdated_m", [-20.0, None])
+async def test_altitude_higher_than_outdated_one_is_no_climb(grounded: Flight, outdated_m: float | None) -> None:
+    vehicle = grounded.vehicle
+    here = vehicle.position.value
+    grounded.copter.faults.silent = True
+    await anyio.sleep(1.0)
+    vehicle.position.set(here.replace(altitude_relative_m=outdated_m), Source(1, 1, "GLOBAL_POSITION_INT"))
+    await anyio.sleep(3.0)
+    is_rising = vehicle._climb_detector()
+    assert not is_rising()
+    grounded.copter.faults.silent = False
+    await vehicle.position.wait_until(lambda place: place.altitude_relative_m not in (None, outdated_m))
+    assert not is_rising()
+    vehicle.position.set(here.replace(altitude_relative_m=5.0), Source(1, 1, "GLOBAL_POSITION_INT"))
+    assert is_rising()
+
+
+async def test_low_take_off_does_not_end_on_ground(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    await grounded.vehicle.take_off(0.5)
+    height_m = grounded.vehicle.position.value.altitude_relative_m
+    assert height_m is not None
+    assert height_m >= 0.25
+
+
+async def test_refused_take_off_on_ground_is_not_its_own_cause(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    await grounded.vehicle.arm()
+    grounded.copter.faults.refuse(MavCmd.NAV_TAKEOFF, MavResult.FAILED)
+    with pytest.raises(CommandRejected) as caught:
+        await grounded.vehicle.take_off(10.0)
+    assert caught.value.__cause__ is None
+
+
+async def test_landing_time_out_without_altitude_says_so(flying: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flying.vehicle.telemetry, "position", StateCell[Position]("position", now, "nothing"))
+    with pytest.raises(OperationTimeout, match="the vehicle's altitude is unknown"):
+        await flying.vehicle.land(timeout=2.0)
+
+
 async def test_take_off_stale_landed_state_is_ignored(grounded: Flight) -> None:
     """Neither the landing nor a later landed state was received."""
     vehicle = grounded.vehicle
@@ -594,6 +635,15 @@ async def test_vehicle_that_tumbles_after_impact_has_fallen(moves_m_s: float, fl
     for sink in sinks:
         flying.vehicle.velocity.set(Velocity(0.0, 0.0, sink), Source(1, 1, "the test"))
         assert not ground.confirms(sink == 0.0)
+        await anyio.sleep(0.1)
+
+
+async def test_sinking_vehicle_with_outdated_height_is_not_on_ground(flying: Flight) -> None:
+    flying.copter.faults.silent = True
+    ground = GroundCheck(flying.vehicle._context.session)
+    for _ in range(100):
+        flying.vehicle.velocity.set(Velocity(0.0, 0.0, 2.5), Source(1, 1, "the test"))
+        assert not ground.confirms(True)
         await anyio.sleep(0.1)
 
 

@@ -19,6 +19,7 @@ from aerokit import (
     VelocitySetpoint,
     connect,
 )
+from aerokit.connection.cells import StateCell
 from aerokit.errors import OperationRejected, OperationTimeout, SetpointStreamStopped
 from aerokit.mavlink.enums import MavResult, SubMode
 from aerokit.mavlink.messages import SetPositionTargetLocalNed
@@ -33,6 +34,7 @@ from aerokit.sim import (
     SimulatedVehicle,
     simulated_link,
 )
+from aerokit.vehicle.state.movement import Home
 
 pytestmark = pytest.mark.anyio
 
@@ -189,6 +191,14 @@ async def test_rover_return_to_launch_ends_at_home() -> None:
         await vehicle.go_to(vehicle.position.value.offset(north_m=30), timeout=60)
         with pytest.raises(OperationTimeout, match=r"return_to_launch: .*; the vehicle is \d+\.\d m from home"):
             await vehicle.return_to_launch(timeout=2)
+
+
+async def test_rover_returns_although_home_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with guided(SimulatedRover(boot_time_s=1.0)) as vehicle:
+        monkeypatch.setattr(vehicle.telemetry, "home", StateCell[Home]("home", anyio.current_time, "nothing"))
+        with pytest.raises(OperationTimeout, match="the distance from home is unknown"):
+            await vehicle.return_to_launch(timeout=2)
+        assert vehicle.mode_name == "RTL"
 
 
 async def test_rover_mission_with_return_ends_at_home() -> None:

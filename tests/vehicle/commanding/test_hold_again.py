@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 
 import anyio
 import pytest
@@ -10,6 +11,7 @@ from flight_harness import Flight, in_the_air, now, open_px4
 
 from aerokit import messages as m
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
+from aerokit.vehicle.commanding.cleanup import BackgroundTask
 
 pytestmark = pytest.mark.anyio
 
@@ -75,6 +77,7 @@ async def test_hold_ignored_is_repeated_three_times(
         await anyio.sleep(60.0)
         reported = [message for message in caplog.messages if "is not confirmed yet" in message]
         assert len(reported) == 3
+        assert caplog.messages[-1].endswith("was not confirmed; aerokit does not send it again")
         flight.wire.clear()
         await anyio.sleep(60.0)
         assert not flight.wire.mode_orders()
@@ -104,3 +107,33 @@ async def test_pending_hold_is_dropped_after_takeover() -> None:
         assert flight.wire.mode_orders() == []
         assert flight.copter.mode.name == "LOITER"
         assert not flight.vehicle.is_hold_pending
+
+
+async def test_background_task_that_raises_is_done(caplog: pytest.LogCaptureFixture) -> None:
+    async with in_the_air() as flight:
+        task = BackgroundTask(flight.vehicle._context.session, "test", warning_clause="before the end")
+
+        async def fail() -> None:
+            raise ZeroDivisionError
+
+        task.start(fail)
+        started = now()
+        await task.finish(5.0)
+        assert not task.is_open
+        assert now() == started
+    assert "before the end" not in caplog.text
+
+
+async def test_new_background_task_cancels_previous() -> None:
+    async with in_the_air() as flight:
+        task, ended = BackgroundTask(flight.vehicle._context.session, "test", warning_clause=""), list[str]()
+
+        async def work(name: str) -> None:
+            await anyio.sleep(1.0)
+            ended.append(name)
+
+        task.start(partial(work, "first"))
+        await anyio.sleep(0.5)
+        task.start(partial(work, "second"))
+        await anyio.sleep(5.0)
+        assert ended == ["second"]

@@ -8,7 +8,7 @@ import anyio
 import pytest
 from flight_harness import Flight, open_flight, open_px4, suspend_computer
 
-from aerokit.errors import AerokitError, CommandTimeout, OperationRejected
+from aerokit.errors import AerokitError, CommandTimeout, OperationRejected, OperationTimeout
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.mavlink.messages import CommandAck
@@ -243,3 +243,67 @@ async def test_late_arming_is_undone_only_with_timely_ack(
     await anyio.sleep(8.0)
     assert ordered(grounded) == ([1, 0] if is_undone else [1])
     assert grounded.copter.is_armed is not is_undone
+
+
+async def test_pilot_arming_after_accepted_order_without_effect_stays_armed(
+    grounded: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pilot arms right after the call has ended, before another HEARTBEAT reports disarmed."""
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    await grounded.vehicle.set_mode("GUIDED")
+    with monkeypatch.context() as patch:
+        patch.setattr(grounded.copter.arming, "arm", lambda **_: True)
+        with pytest.raises(OperationTimeout):
+            await grounded.vehicle.arm(timeout=5.0)
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(ARM_WATCH_S)
+    assert ordered(grounded) == [1]
+    assert grounded.copter.is_armed
+
+
+async def late_arming(flight: Flight) -> None:
+    """Abandon an arm command, and arm the vehicle by it five seconds later without an acknowledgement."""
+    flight.copter.parameters["DISARM_DELAY"] = 0.0
+    await flight.vehicle.set_mode("GUIDED")
+    flight.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.0):
+        await flight.vehicle.arm()
+    await anyio.sleep(5.0)
+    flight.copter.faults.commands.clear()
+
+
+async def test_vehicle_disarmed_and_armed_by_pilot_before_ack_stays_armed(grounded: Flight) -> None:
+    await late_arming(grounded)
+    assert grounded.copter.arming.arm()
+    await grounded.vehicle.armed.wait_until(bool)
+    grounded.copter.arming.disarm()
+    await grounded.vehicle.armed.wait_until(lambda armed: not armed)
+    grounded.wire.deliver(FrameEncoder(1, 1).encode(CommandAck(ARM, 0, 0, 0, 255, 190)))
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(ARM_WATCH_S)
+    assert ordered(grounded) == [1]
+    assert grounded.copter.is_armed
+
+
+async def test_raw_arm_command_while_ack_is_awaited_stays_armed(grounded: Flight) -> None:
+    await late_arming(grounded)
+    assert grounded.copter.arming.arm()
+    await grounded.vehicle.armed.wait_until(bool)
+    await grounded.vehicle.command(ARM, 1.0)
+    await anyio.sleep(ARM_WATCH_S)
+    assert ordered(grounded) == [1, 1]
+    assert grounded.copter.is_armed
+
+
+async def test_cancelled_arm_leaves_vehicle_to_newer_arm(grounded: Flight) -> None:
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    await grounded.vehicle.set_mode("GUIDED")
+    async with anyio.create_task_group() as tasks:
+        older = asyncio.create_task(grounded.vehicle.arm())
+        await anyio.sleep(0.01)
+        tasks.start_soon(grounded.vehicle.arm)
+        await anyio.sleep(0.01)
+        older.cancel()
+    await anyio.sleep(ARM_WATCH_S)
+    assert ordered(grounded) == [1, 1]
+    assert grounded.copter.is_armed

@@ -8,6 +8,7 @@ import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import anyio
@@ -16,7 +17,7 @@ from flight_harness import Wire, in_the_air, now, open_flight
 
 import aerokit
 from aerokit import messages as m
-from aerokit.connection.cells import Source
+from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
@@ -35,6 +36,8 @@ from aerokit.sim import (
     SimulatedVehicle,
     simulated_link,
 )
+from aerokit.vehicle.commanding.follow import FollowedTarget
+from aerokit.vehicle.state.movement import Velocity
 
 pytestmark = pytest.mark.anyio
 
@@ -368,6 +371,56 @@ async def test_follow_function_that_raises_stops_it() -> None:
         with pytest.raises(SetpointStreamStopped, match="StopIteration"):
             async with flight.vehicle.follow(lambda: next(places)) as following:
                 await following.fly(5)
+
+
+async def test_follow_from_course_without_bearing_keeps_place_at_first() -> None:
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        target = here.offset(east_m=-20)
+        async with flight.vehicle.follow(lambda: target, distance_m=20, from_course=True) as following:
+            await following.fly(1)
+        sent = flight.wire.last(m.SetPositionTargetGlobalInt)
+        assert aerokit.Position(sent.lat_int / 1e7, sent.lon_int / 1e7).distance_to(here) < 0.5
+
+
+async def test_follow_positions_that_raise_cancellation_stop_it() -> None:
+    async def positions(place: aerokit.Position) -> AsyncIterator[aerokit.Position]:
+        yield place
+        await anyio.sleep(1.0)
+        raise asyncio.CancelledError
+
+    async with in_the_air() as flight:
+        place = flight.vehicle.position.value
+        with pytest.raises(SetpointStreamStopped, match="the reading of the target was cancelled"):
+            async with flight.vehicle.follow(positions(place), valid_for_s=5.0) as following:
+                await following.fly(10)
+
+
+async def test_follow_position_out_of_range_stops_it() -> None:
+    async with in_the_air() as flight:
+        here = flight.vehicle.position.value
+        places = iter([here])
+        high = here.replace(altitude_amsl_m=1e6)
+        with pytest.raises(SetpointStreamStopped, match="cannot follow the position of the target: altitude"):
+            async with flight.vehicle.follow(lambda: next(places, high), height_m=5) as following:
+                await following.fly(5)
+
+
+def test_followed_velocity_that_is_no_longer_received_is_ignored() -> None:
+    clock = [0.0]
+    position = StateCell[aerokit.Position]("position", lambda: clock[0], "GLOBAL_POSITION_INT")
+    velocity = StateCell[Velocity]("velocity", lambda: clock[0], "GLOBAL_POSITION_INT")
+    leader = SimpleNamespace(telemetry=SimpleNamespace(position=position, velocity=velocity))
+    target, source = FollowedTarget(leader, lambda: clock[0]), Source(1, 1, "GLOBAL_POSITION_INT")
+    velocity.set(Velocity(5.0, 0.0, 0.0), source)
+    velocities = []
+    for now_s in (1.0, 3.0):
+        clock[0] = now_s
+        position.set(aerokit.Position(47.0, 8.0), source)
+        state = target.read()
+        assert state is not None
+        velocities.append(state.velocity)
+    assert velocities == [(5.0, 0.0, 0.0), (0.0, 0.0, 0.0)]
 
 
 async def test_transition_returns_in_its_state() -> None:

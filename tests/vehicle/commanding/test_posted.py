@@ -187,7 +187,7 @@ def test_arming_and_posted_arming_supersede_each_other() -> None:
         assert end_of(posted) == NEWER
         stage.post("arm", armed=False)
         assert sending.end == NEWER
-    assert stage.arbiter.arming_orders == 3
+    assert stage.arbiter.arm_commands_sent == 3
 
 
 def test_reboot_ends_all_orders() -> None:

@@ -54,20 +54,18 @@ class CommandArbiter:
         self.slept_since: Callable[[float], float] = lambda _: 0.0  # see `Connection._slept_since`
         self.newest: Order | None = None
         """The last steering order given by an action or a raw command."""
-        self.arming_orders: int = 0
+        self.arm_commands_sent: int = 0
         """Number of arm and disarm commands sent."""
-        self.mode_is_in_doubt: bool = False
-        """True while the result of a mode change is unknown, so that the reported mode may still change."""
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         # Until this time, any reported mode may be the effect of a raw command.
         self._any_mode_until = -math.inf
         self._arming_accepted_at = -math.inf
-        # Time of the last HEARTBEAT that reported disarmed.
-        self._disarmed_at = -math.inf
+        self.last_disarmed_report_at: float = -math.inf
+        """Time of the last HEARTBEAT that reported disarmed."""
         # Time of the last change from disarmed to armed, and the order that records that this program caused it; None
         # if another party armed the vehicle.
-        self._armed_at = -math.inf
+        self._last_arming_at = -math.inf
         self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
@@ -75,6 +73,11 @@ class CommandArbiter:
         self._posted: list[Order] = []
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
+        # Open `changing_mode` blocks; and the numbers of the last mode change with an unknown result, and of the last
+        # one that was confirmed.
+        self._open_mode_changes = 0
+        self._doubted_change = 0
+        self._confirmed_change = 0
         # The newest order about each topic, even if it was withdrawn or has ended.
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()
@@ -119,7 +122,9 @@ class CommandArbiter:
 
     # ------------------------------------------------------------------------------- steering
 
-    def order(self, *modes: Mode, subjects: Iterable[Subject] = ("mode", "motion"), ends_flight: bool = False) -> Order:
+    def order(
+        self, *modes: Mode, subjects: Collection[Subject] = ("mode", "motion"), ends_flight: bool = False
+    ) -> Order:
         """Create a steering order. ``modes`` are the modes that the vehicle may enter because of it.
 
         The new order supersedes the previous steering order, and the posted orders about these subjects (orders that
@@ -140,7 +145,7 @@ class CommandArbiter:
         self._orders = [order]  # The order has ended all other actions, so they need no more reports of the vehicle.
         return order
 
-    def raw_order(self, subjects: Iterable[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
+    def raw_order(self, subjects: Collection[Subject] = ("mode", "motion"), *, modes: Collection[Mode] = ()) -> Order:
         """Register a raw command of the program as a steering order.
 
         Without ``modes``, any mode that is reported soon afterwards may be the command's effect.
@@ -164,7 +169,7 @@ class CommandArbiter:
         self._ordered_since_disarmed.clear()
         # Infinity makes `current` ignore all orders from before the reboot until the vehicle arms again.
         self._arming_order = None
-        self._armed_at = math.inf
+        self._last_arming_at = math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
 
@@ -247,8 +252,9 @@ class CommandArbiter:
             is_done=is_done,
             slept_s=partial(self.slept_since, self._now()),
         )
-        if order.armed is None:  # A posted order to arm has already ended earlier orders to arm.
+        if order.armed is None and armed is not None:  # A posted order to arm has already ended earlier orders to arm.
             self._supersede_arming(armed)
+            order.arm_command = self.arm_commands_sent
         self._sent.append(sent)
         try:
             yield sent
@@ -271,7 +277,7 @@ class CommandArbiter:
         """End earlier orders to arm or disarm if a newer command does either; ``armed`` is None if it does neither."""
         if armed is None:
             return
-        self.arming_orders += 1
+        self.arm_commands_sent += 1
         self.supersede(("arm",))
         for sent in self._sent:
             sent.on_newer_command(armed)
@@ -286,16 +292,17 @@ class CommandArbiter:
         neither a takeover nor a failsafe has followed.
         """
         order = self.current
-        if order is not None and order.was_refused:  # After a refusal, the vehicle continues its previous task.
-            return order.was_flown_before
-        return order is not None and not order.takeover_reason and not order.failsafe
+        if order is None or order.takeover_reason or order.failsafe:
+            return False
+        # After a refusal, the vehicle continues its previous task.
+        return order.was_flown_before if order.was_refused else True
 
     @property
     def current(self) -> Order | None:
         """The program's present order to the armed vehicle: the newest steering order, or the order that armed it."""
         newest = self.newest
         # A steering order that was given before the vehicle armed belongs to an earlier flight.
-        return newest if newest is not None and newest.given_at >= self._armed_at else self._arming_order
+        return newest if newest is not None and newest.given_at >= self._last_arming_at else self._arming_order
 
     def clear_failsafe(self) -> None:
         """Ignore a failsafe that has ended, or that was already active when the program gave its new order."""
@@ -307,16 +314,14 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program.
 
-        This is so if the program armed the vehicle, and it was not disarmed since; or if the program steers the
-        vehicle, and there was no takeover.
+        This is so if the program has given an order since the vehicle was last disarmed, and no takeover has ended
+        this order. A takeover does not undo an arm command.
         """
         order, topics = self.newest, self._ordered_since_disarmed
-        # After an order without modes, such as a raw command, a mode change does not prove a takeover. `newest` is the
-        # newest order of an action or a raw command; `is_newest` is false once a posted order has followed it.
-        was_taken_over = order is not None and order.modes and order.takeover_reason and order.is_newest
-        if was_taken_over:  # Of the program's orders, only the one that armed the vehicle still has an effect.
-            return "arm" in topics
-        return bool(topics)
+        # After an order without modes, such as a raw command, a mode change does not prove a takeover. If a posted
+        # order has followed, `order` is not the newest one, and its end says nothing.
+        was_taken_over = order is not None and bool(order.modes) and bool(order.takeover_reason) and order.is_newest
+        return "arm" in topics if was_taken_over else bool(topics)
 
     @property
     def is_state_recent(self) -> bool:
@@ -324,28 +329,39 @@ class CommandArbiter:
         self.slept_since(self._now())  # If the computer has just slept, this call adds the sleep to all ages.
         return self._telemetry.armed.age <= MODE_MAX_AGE_S
 
+    @property
+    def mode_is_in_doubt(self) -> bool:
+        """True while the result of a mode change is unknown, so that the reported mode may still change."""
+        return self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
+
     @contextmanager
     def changing_mode(self) -> Iterator[None]:
         """Distrust the reported mode until the vehicle has answered a command that changes the mode.
 
-        After a cancellation or a time-out, the mode stays in doubt. After a refusal, the mode is in doubt only if an
-        earlier order may still change it.
+        After a cancellation or a time-out, the mode stays in doubt until a newer change is confirmed. After a refusal,
+        the mode is in doubt only if an earlier order may still change it. A newer order may open its block before the
+        block of the order that it replaces has ended.
         """
-        was_in_doubt = self.mode_is_in_doubt
-        self.mode_is_in_doubt = True
+        change = next(self._order_numbers)
+        self._open_mode_changes += 1
         try:
             yield
         except CommandRejected:
-            self.mode_is_in_doubt = was_in_doubt
             raise
         except BaseException:
-            self.doubt_mode()
+            self._doubt_change(change)
             raise
-        self.mode_is_in_doubt = False
+        else:
+            self._confirmed_change = max(self._confirmed_change, change)
+        finally:
+            self._open_mode_changes -= 1
 
     def doubt_mode(self) -> None:
         """Distrust the reported mode, because a command that changes it was sent without waiting for the result."""
-        self.mode_is_in_doubt = True
+        self._doubt_change(next(self._order_numbers))
+
+    def _doubt_change(self, change: int) -> None:
+        self._doubted_change = max(self._doubted_change, change)
         self.mode_settles_at = self._now() + MODE_GRACE_S
 
     # ------------------------------------------------------------------------------- internals
@@ -421,17 +437,19 @@ class CommandArbiter:
         if armed and not armed_before:
             self._on_arming()
         if not armed:
-            self._disarmed_at = self._telemetry.armed.updated_at
+            self.last_disarmed_report_at = self._telemetry.armed.updated_at
         receivers: tuple[Order | SentCommand, ...] = (*self._active_orders(), *self._sent)
         for receiver in receivers:
             receiver.on_armed(armed, self._telemetry.armed.updated_at)
 
     def _on_arming(self) -> None:
         """Record whether the program or another party has armed the vehicle."""
-        self._armed_at = self._telemetry.armed.updated_at
+        self._last_arming_at = self._telemetry.armed.updated_at
         is_order_open = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
-        was_caused_by_order = was_accepted and was_armed_by_order(self._disarmed_at, self._arming_accepted_at)
+        was_caused_by_order = was_accepted and was_armed_by_order(
+            self.last_disarmed_report_at, self._arming_accepted_at
+        )
         was_armed_by_program = is_order_open or was_caused_by_order
         newest = self.newest
         modes = () if newest is None or newest.takeover_reason else newest.modes

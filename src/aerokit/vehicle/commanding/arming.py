@@ -103,8 +103,9 @@ class ArmingActions(VehicleBase):
         # The time-out has expired.
         recent_texts = self._health.arming_texts(self.connection.now() - PREARM_REPORT_INTERVAL_S)
         missing_now = self._health.missing_for_flight()
-        # The vehicle may have become ready just after the last check. Nothing is missing then.
-        reasons = self._session.deduplicate_reasons(*recent_texts, *missing_now) or ("nothing",)
+        if not missing_now:  # The vehicle has become ready just after the last check.
+            return
+        reasons = self._session.deduplicate_reasons(*recent_texts, *missing_now)
         missing = "".join(f"\n  - {reason}" for reason in reasons)
         # The mode does not count as missing, because `arm` changes it.
         mode_text = "".join(f"\n{text}" for text in self._health.unarmable_mode())
@@ -183,8 +184,16 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
-            may_be_forbidden = may_change_mode and not has_computer_slept and self._is_in_mode_armable_by_option()
-            other_mode = self.autopilot.mode_to_arm_in() if may_be_forbidden else None
+            may_retry_in_other_mode = (
+                may_change_mode
+                and not has_computer_slept
+                # A set-point stream needs the mode that it has set, and the mode of an armed vehicle belongs to
+                # whoever has armed it.
+                and self._flight_cleanup.stop_stream is None
+                and self.telemetry.is_confirmed_disarmed
+                and self._is_in_mode_armable_by_option()
+            )
+            other_mode = self.autopilot.mode_to_arm_in() if may_retry_in_other_mode else None
             if other_mode is None:
                 raise
             await self._change_to_arming_mode(other_mode)
@@ -293,18 +302,17 @@ class ArmingActions(VehicleBase):
     def _is_in_mode_armable_by_option(self) -> bool:
         """Return True if a parameter of the vehicle decides whether its present mode allows arming."""
         mode = self.telemetry.mode.latest
-        is_optional = mode is not None and mode.name in self.autopilot.armable_by_option
-        return is_optional and self.telemetry.is_confirmed_disarmed and self._flight_cleanup.stop_stream is None
+        return mode is not None and mode.name in self.autopilot.armable_by_option
 
     async def _change_to_arming_mode(self, mode: Mode) -> None:
         """Change the mode for arming; raise if a newer order or a silence then forbids the arm command."""
         order = self._arbiter.order(mode)
-        arming_orders_before = self._arbiter.arming_orders
+        arm_commands_before = self._arbiter.arm_commands_sent
         await self._sender.ensure_mode(mode, order)
         await self._wait_until_armable()
         self._sender.raise_if_ended(order)
         self._sender.raise_if_slept(order)
-        if self._arbiter.arming_orders != arming_orders_before:
+        if self._arbiter.arm_commands_sent != arm_commands_before:
             raise OperationRejected("arm(): another arm or disarm command was given; the arm command was not sent")
         if not self._arbiter.is_state_recent:
             link = self._session.describe_link()
@@ -338,7 +346,8 @@ class ArmingActions(VehicleBase):
         if not force:
             self._session.check_disarmed("reboot")
         reboots_before = self._session.watch.reboots
-        # A reboot is recognised by a shorter time since boot, so the present time since boot must be known.
+        # A reboot is recognised by a shorter time since boot, so the present time since boot is requested. Without an
+        # answer, the time since boot that was received last counts.
         self._session.link_watch.request_time()
         unanswered: CommandTimeout | None = None
         with self._session.watch.expecting_reboot():

@@ -50,15 +50,18 @@ class BackgroundTask:
 
     def start(self, work: Callable[[], Awaitable[None]]) -> None:
         """Run ``work`` in the background, as long as the connection is open."""
+        self.cancel()  # Two tasks might give the same order twice.
         scope, done = Cancellation(), asyncio.Event()
         self._scope, self._done = scope, done
 
         async def run() -> None:
-            with scope:
-                await work()
-            if self._scope is scope:  # No newer task has replaced this one.
-                self._scope = None
-            done.set()
+            try:
+                with scope:
+                    await work()
+            finally:
+                if self._scope is scope:  # No newer task has replaced this one.
+                    self._scope = None
+                done.set()
 
         self._session.background.start(run, self._name)
 
@@ -162,8 +165,8 @@ class FlightCleanup:
         disarmed, or the order has ended, for example because a pilot took over.
 
         Otherwise return True. If the last HEARTBEAT is recent, one command is sent at once. If not, it is sent after
-        the next HEARTBEAT, unless a failsafe or a pilot has taken over by then. A background task waits for the
-        confirmation while the connection is open.
+        the next HEARTBEAT, unless the order has ended or the vehicle is disarmed by then. While the connection is open,
+        a background task waits for the confirmation, and sends the hold again if there is none.
         """
         if not order.may_move:
             return False
@@ -193,7 +196,7 @@ class FlightCleanup:
         """Wait for the confirmation of a hold. If it was not sent yet, send it after the next HEARTBEAT.
 
         Without a confirmation, the hold is sent again after the next HEARTBEAT, unless the order has ended by then, for
-        example because a pilot took over.
+        example because a pilot took over. There are at most `MAX_HOLD_ATTEMPTS` attempts.
         """
         for _ in range(MAX_HOLD_ATTEMPTS):
             try:
@@ -215,6 +218,7 @@ class FlightCleanup:
                 if not order.end:
                     logger.warning("the vehicle does not hold after an abandoned flight: %s", error)
                 return
+        logger.error("the hold after an abandoned flight was not confirmed; aerokit does not send it again")
 
     @property
     def is_hold_pending(self) -> bool:
@@ -255,8 +259,8 @@ class FlightCleanup:
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Create the order to change to ``mode``, which the caller sends after the `with` block.
 
-        The caller prepares a stream in the block, and may wait there. If the block raises, the vehicle is ordered to
-        hold.
+        The caller prepares a stream in the block, and may wait there. After any error, also after one of those below,
+        the vehicle is ordered to hold if an earlier order of the program may still move it; see `hold_in_background`.
 
         Raises:
             BusyError: another stream is open.
@@ -269,7 +273,9 @@ class FlightCleanup:
             yield order
             self._sender.raise_if_ended(order)
             if not self._arbiter.is_state_recent:
-                raise HeartbeatTimeout(f"the vehicle is silent: {self._session.describe_link()}; nothing was sent")
+                raise HeartbeatTimeout(
+                    f"the vehicle is silent: {self._session.describe_link()}; the mode was not changed"
+                )
         except BaseException:
             self.hold_in_background(order)
             raise
@@ -314,28 +320,22 @@ class ArmCleanup:
 
     def watch(self, order: Order, was_armed: bool) -> None:
         """Start watching whether the vehicle arms after all, because the abandoned arm command may still arrive."""
+        if not self._is_newest_arm_command(order):
+            return
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
-        self._task.start(partial(self._watch_arming, order, was_armed, self._arbiter.arming_orders))
+        self._task.start(partial(self._watch_arming, order, was_armed))
 
-    async def _watch_arming(self, order: Order, was_armed: bool, arming_orders_before: int) -> None:
+    def _is_newest_arm_command(self, order: Order) -> bool:
+        """Return True if the order's command was sent, and the program has sent no arm or disarm command since."""
+        return order.arm_command == self._arbiter.arm_commands_sent
+
+    async def _watch_arming(self, order: Order, was_armed: bool) -> None:
         """Disarm the vehicle if the abandoned order arms it within `ARM_WATCH_S`."""
-        armed = self._session.telemetry.armed
-        last_disarmed_at = order.given_at
-
-        def on_armed(_: bool | None, is_armed: bool) -> None:
-            nonlocal last_disarmed_at
-            if not is_armed:
-                last_disarmed_at = armed.updated_at
-
-        detach = armed.observe(on_armed, every_arrival=True)
         has_armed = False
-        try:
-            with anyio.move_on_after(ARM_WATCH_S):
-                has_armed = await self._wait_until_armed(was_armed)
-        finally:
-            detach()
+        with anyio.move_on_after(ARM_WATCH_S):
+            has_armed = await self._wait_until_armed(was_armed)
         if has_armed:
-            await self._undo_late_arming(order, arming_orders_before, last_disarmed_at)
+            await self._undo_late_arming(order)
 
     async def _wait_until_armed(self, was_armed: bool) -> bool:
         """Return True once the vehicle arms; False if the link ends first.
@@ -352,11 +352,12 @@ class ArmCleanup:
             return False
         return True
 
-    async def _undo_late_arming(self, order: Order, arming_orders_before: int, disarmed_at: float) -> None:
+    async def _undo_late_arming(self, order: Order) -> None:
         """Disarm the vehicle, which has armed after its arm order was abandoned, unless another party armed it."""
-        if self._arbiter.arming_orders != arming_orders_before:  # The program has sent a newer arm or disarm command.
+        was_armed_by_order = await self._was_armed_by(order)
+        if not self._is_newest_arm_command(order) or self._session.telemetry.is_confirmed_disarmed:
             return
-        if not await self._was_armed_by(order, disarmed_at):
+        if not was_armed_by_order:
             logger.warning(
                 "the vehicle armed after an arm command was abandoned: it stays armed, because another party may have"
                 " armed it"
@@ -370,22 +371,24 @@ class ArmCleanup:
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 
-    async def _was_armed_by(self, order: Order, disarmed_at: float) -> bool:
-        """Return True if this order, and not a pilot, has armed the vehicle.
+    async def _was_armed_by(self, order: Order) -> bool:
+        """Return True if this order, and not a pilot, has armed the vehicle. Called when HEARTBEAT has reported armed.
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
         acknowledgement, the order armed it if the next HEARTBEAT reports armed and there was no takeover.
         """
+        armed_at = self._session.telemetry.armed.updated_at
+        disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
         if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
             return False
-        # This method is called when a HEARTBEAT has reported armed.
-        armed_after_s = self._session.telemetry.armed.updated_at - order.given_at
         was_taken_over = bool(order.end)
-        if not was_taken_over and armed_after_s <= ARM_HEARTBEAT_DELAY_S:
+        if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)
-        return self._is_accepted(disarmed_at)
+        # A vehicle that was disarmed meanwhile and is armed again was armed by another party.
+        has_stayed_armed = self._arbiter.last_disarmed_report_at < armed_at
+        return has_stayed_armed and self._is_accepted(disarmed_at)
 
     def _is_accepted(self, disarmed_at: float) -> bool:
         accepted_at = self._session.commands.accepted_at(MavCmd.COMPONENT_ARM_DISARM)

@@ -72,9 +72,9 @@ class Eight(ClosedPath):
 class PathFlight:
     """Moves a set-point straight to the start of a path, stops it there, and then moves it along the path to its end.
 
-    ``start`` is the vehicle's position relative to the centre of the path (north, east, down). ``centre`` is the
-    position of the centre in the local frame. ``heading`` returns the heading in degrees for a place relative to the
-    centre and a velocity; None leaves it to the autopilot.
+    ``start_from_centre`` is the vehicle's position at the start, relative to the centre of the path (north, east,
+    down). ``centre`` is the position of the centre in the local frame. ``heading`` returns the heading in degrees for a
+    place relative to the centre and a velocity; None leaves it to the autopilot.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PathFlight:
         path: ClosedPath,
         rounds: float,
         speed_m_s: float,
-        start: tuple[float, float, float],
+        start_from_centre: tuple[float, float, float],
         centre: tuple[float, float, float],
         heading: Callable[[Vector, Vector], float | None],
     ) -> None:
@@ -90,11 +90,11 @@ class PathFlight:
         self._speed_m_s = speed_m_s
         self._centre = centre
         self._heading = heading
-        self._start = start
+        self._start_from_centre = start_from_centre
         # Phase of the set-point, and phase at the end of the path.
         self._phase = path.first_phase
         self._last_phase = path.first_phase + 2 * math.pi * rounds
-        # Distance of the set-point from `_start`, until it is on the path.
+        # Distance of the set-point from the start, until it is on the path.
         self._flown_m = 0.0
         self._present_speed_m_s = 0.0
         self.is_on_path: bool = False
@@ -112,7 +112,7 @@ class PathFlight:
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
         """Move the set-point along the straight line to the first point of the path."""
         (path_north, path_east), _, _ = self._path.at(self._path.first_phase)
-        start_north, start_east, start_down = self._start
+        start_north, start_east, start_down = self._start_from_centre
         to_path = (path_north - start_north, path_east - start_east, -start_down)  # The path is at down = 0.
         length_m = math.hypot(*to_path)
         self._change_speed(seconds, length_m - self._flown_m)
@@ -123,7 +123,8 @@ class PathFlight:
             self._present_speed_m_s = 0.0
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
-            coordinate + fraction * component for coordinate, component in zip(self._start, to_path, strict=True)
+            coordinate + fraction * component
+            for coordinate, component in zip(self._start_from_centre, to_path, strict=True)
         )
         speed = self._present_speed_m_s
         north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)
@@ -204,7 +205,7 @@ class LobeCounter:
         self._lobe = 0  # The last lobe that the vehicle was in is 1 or -1; 0 means that it was in none yet.
         self.rounds: float = 0.0
         self.is_on_path: bool = False
-        """True while the vehicle is in one of the lobes."""
+        """True while the vehicle is in one of the lobes, far enough from the crossing to tell them apart."""
 
     def add(self, north_m: float, east_m: float) -> None:
         """Count half a figure for the first lobe, and each time the vehicle reaches the other lobe.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 from aerokit.vehicle.commanding.arbiter import CommandArbiter
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from aerokit.events import LinkReport
     from aerokit.vehicle.session.session import VehicleSession
     from aerokit.vehicle.state.telemetry import Telemetry
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 
 class VehicleContext:
@@ -45,7 +48,10 @@ class VehicleContext:
         Returns True if a flight was abandoned.
         """
         for callback in tuple(self.on_finish):
-            callback()
+            try:
+                callback()
+            except Exception:  # The vehicle must hold even if a device fails.
+                logger.exception("a callback at the end of the async with block of this vehicle failed")
         self.flight_cleanup.end_flights()
         was_flight_abandoned = self.flight_cleanup.is_hold_pending
         await self.flight_cleanup.finish()
@@ -57,10 +63,10 @@ class VehicleContext:
         autopilot, telemetry = self.session.autopilot, self.session.telemetry
         hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
         mode = telemetry.mode.latest
-        if mode is not None and mode == hold_mode:
-            where = "holding in"
-        elif telemetry.is_armed and is_reported_on_ground(telemetry):
+        if telemetry.is_armed and is_reported_on_ground(telemetry):
             where = "on the ground in"  # A copter in LAND stays armed for some seconds after the touchdown.
+        elif mode is not None and mode == hold_mode and not telemetry.is_confirmed_disarmed:
+            where = "holding in"
         else:
             where = "in"
         if telemetry.is_armed:

@@ -106,15 +106,21 @@ class FlightActions(VehicleBase):
             self._flight_cleanup.hold_in_background(order)
             raise
         except CommandRejected as error:
-            raise self._with_landed_state(error) from error
+            explained = self._with_landed_state(error)
+            if explained is None:
+                raise
+            raise explained from error
 
-    def _with_landed_state(self, error: CommandRejected) -> CommandRejected:
-        """Add the landed state to the error of a refused take-off, because the vehicle's refusal does not name it."""
+    def _with_landed_state(self, error: CommandRejected) -> CommandRejected | None:
+        """Add the landed state to the error of a refused take-off, because the vehicle's refusal does not name it.
+
+        Return None if the vehicle is not known to be in the air.
+        """
         state = IN_THE_AIR.get(self.telemetry.landed_state.latest)
         altitude_m = self._position.altitude_relative()
         is_high = altitude_m > MIN_FLYING_HEIGHT_M
         if state is None and not is_high:
-            return error
+            return None
         is_altitude_known = altitude_m > -math.inf
         height = f", {altitude_m:.1f} m above home" if is_altitude_known else ""
         reason = (
@@ -148,15 +154,20 @@ class FlightActions(VehicleBase):
 
         Earlier messages may describe the previous flight.
         """
-        here, landed = self.telemetry.position.latest, self.telemetry.landed_state
-        # No altitude is greater than NaN, so only the landed state can show a climb while the position is unknown.
-        start_m = math.nan if here is None else self._position.altitude_relative()
+        started, landed = self.connection.now(), self.telemetry.landed_state
+        # Without a recent altitude, the climb is measured from the first one that is received.
+        is_start_known = self._position.is_known_since(started - POSITION_MAX_AGE_S)
+        start_m = self._position.altitude_relative() if is_start_known else -math.inf
         state_before = landed.latest
 
         def is_rising() -> bool:
+            nonlocal start_m
+            if start_m == -math.inf and self._position.is_known_since(started):
+                start_m = self._position.altitude_relative()
             has_taken_off = landed.latest in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF)
             is_reported = has_taken_off and landed.latest != state_before
-            return is_reported or self._position.altitude_relative() > start_m + CLIMB_DETECTED_M
+            has_climbed = start_m > -math.inf and self._position.altitude_relative() > start_m + CLIMB_DETECTED_M
+            return is_reported or has_climbed
 
         return is_rising
 
@@ -164,8 +175,8 @@ class FlightActions(VehicleBase):
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
         """Wait for the altitude. Fail in any mode but that of the take-off and the mode that follows it."""
-        # A vehicle that hovers at the altitude may be slightly below it.
-        min_altitude_m = altitude_m - max(0.5, 0.05 * altitude_m)
+        # A vehicle that hovers at the altitude may be slightly below it, but not on the ground.
+        min_altitude_m = altitude_m - min(max(0.5, 0.05 * altitude_m), 0.5 * altitude_m)
         started = self.connection.now()
 
         def is_up() -> bool:
@@ -178,11 +189,16 @@ class FlightActions(VehicleBase):
                 f"take_off({altitude_m:g} m)",
                 is_done=is_up,
                 failure_reason=self._sender.mode_failure(order, *order.modes),
-                describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
+                describe=self._describe_altitude,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
                 stall_reason=StallDetector(self._session),
             )
+
+    def _describe_altitude(self) -> str:
+        altitude_m = self._position.altitude_relative()
+        is_known = altitude_m > -math.inf
+        return f"the vehicle is at {altitude_m:.1f} m" if is_known else "the vehicle's altitude is unknown"
 
     async def land(self, *, timeout: float | None = 300.0, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Land at the present position. Returns when the vehicle is on the ground.
@@ -234,7 +250,8 @@ class FlightActions(VehicleBase):
     ) -> None:
         """Wait until messages received after the order report the vehicle on the ground.
 
-        Older messages may be outdated. A submarine counts as landed when it leaves its surfacing mode near the surface.
+        Older messages may be outdated. A submarine counts as landed when it leaves its surfacing mode, unless it is
+        known to be deep.
         """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
@@ -244,7 +261,9 @@ class FlightActions(VehicleBase):
         def is_down() -> bool:
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
-            has_surfaced = has_left_surfacing_mode() and not is_deep()  # A submarine "lands" by going to the surface.
+            # A submarine "lands" by going to the surface. Most submarines have no global position, so an unknown depth
+            # is sufficient.
+            has_surfaced = has_left_surfacing_mode() and not is_deep()
             return ground.confirms(is_disarmed or is_landed or has_surfaced)
 
         def has_left_surfacing_mode() -> bool:
@@ -267,21 +286,29 @@ class FlightActions(VehicleBase):
                 operation,
                 is_done=is_down,
                 failure_reason=failure_reason,
-                describe=lambda: f"the vehicle is at {self._position.altitude_relative():.1f} m",
+                describe=self._describe_altitude,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
 
     async def _await_home(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
         """Wait until the vehicle is above home, for an autopilot that does not land after a return."""
-        home = self.telemetry.home.value
-        place = Position(home.latitude_deg, home.longitude_deg)
+        home = self.telemetry.home
         arrival_radius_m = self.autopilot.arrival_radius_m
         started = self.connection.now()
 
+        def distance_m() -> float:
+            """Return the distance from home; infinite while home or the position is unknown."""
+            if home.latest is None:
+                return math.inf
+            return self._position.distance_to(Position(home.latest.latitude_deg, home.latest.longitude_deg))
+
         def is_back() -> bool:
-            is_near = self._position.is_known_since(started) and self._position.distance_to(place) <= arrival_radius_m
-            return is_near and not order.end
+            return self._position.is_known_since(started) and distance_m() <= arrival_radius_m and not order.end
+
+        def describe() -> str:
+            is_known = math.isfinite(distance_m())
+            return f"the vehicle is {distance_m():.1f} m from home" if is_known else "the distance from home is unknown"
 
         with self._session.streaming("position"):
             await await_progress(
@@ -289,7 +316,7 @@ class FlightActions(VehicleBase):
                 "return_to_launch",
                 is_done=is_back,
                 failure_reason=self._sender.mode_failure(order, *order.modes),
-                describe=lambda: f"the vehicle is {self._position.distance_to(place):.1f} m from home",
+                describe=describe,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
             )
@@ -360,9 +387,10 @@ class ModeActions(VehicleBase):
             return ""
         if not order.has_lost_mode:  # Without a mode change, only a failsafe is a takeover.
             return order.failsafe
-        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR
-        if may_have_landed and self.telemetry.armed.updated_at < order.mode_lost_at:
+        may_have_landed = self.telemetry.landed_state.latest != MavLandedState.IN_AIR  # also if it is unknown
+        awaits_heartbeat = self.telemetry.armed.updated_at < order.mode_lost_at
+        if may_have_landed and awaits_heartbeat:
             # PX4 leaves LAND when it disarms. CURRENT_MODE may report the new mode before HEARTBEAT reports that the
-            # vehicle is disarmed.
+            # vehicle is disarmed, so the next HEARTBEAT decides.
             return ""
         return order.takeover_reason

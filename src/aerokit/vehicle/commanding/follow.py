@@ -99,7 +99,8 @@ class FollowedTarget:
         # `position.updated_at` is on the clock of the target's connection, which may differ from ours, so the time is
         # computed from the age of the position.
         received_at = self._now() - position.age
-        speeds = ZERO if velocity is None else (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
+        is_velocity_recent = velocity is not None and telemetry.velocity.age <= POSITION_MAX_AGE_S
+        speeds = (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s) if is_velocity_recent else ZERO
         # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
         place = position.latest.replace(altitude_relative_m=None)
         self.latest = TargetState(place, speeds, reported_at=received_at, first_reported_at=received_at)
@@ -153,9 +154,11 @@ class FollowStream(SteeringStream[TargetState]):
     and sends nothing more. After a stop, ``fly`` and leaving the block raise :class:`SetpointStreamStopped`.
 
     Entering raises:
-        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown (the vehicle holds).
-        OperationTimeout: no position of the target was known within ``valid_for_s``. The vehicle holds.
-        InvalidArgument: ``height_m`` was given, but the target has no altitude. The vehicle holds.
+        OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.
+        OperationTimeout: no position of the target was known within ``valid_for_s``.
+        InvalidArgument: ``height_m`` was given, but the target has no altitude.
+
+    After these errors, the vehicle is ordered to hold if it was still executing an earlier order of the program.
     """
 
     _NAME, _VALUE = "following", "position of the target"
@@ -173,7 +176,10 @@ class FollowStream(SteeringStream[TargetState]):
         if getattr(target, "telemetry", None) is context.session.telemetry:
             raise InvalidArgument("target is not allowed: a vehicle cannot follow itself")
         if not (autopilot.setpoints.global_position and autopilot.setpoints.velocity):
-            raise NotSupported(f"follow: {autopilot.firmware} does not support position set-points; nothing was sent")
+            raise NotSupported(
+                f"follow: {autopilot.firmware} does not support global position set-points with a velocity;"
+                " nothing was sent"
+            )
         unknown = TargetState(Position(0.0, 0.0), ZERO, -math.inf, -math.inf)  # replaced when the stream is entered
         super().__init__(context, self._encode_place, unknown, RATE_HZ, valid_for_s, MAX_LAG_S)
         self._target = target
@@ -225,7 +231,7 @@ class FollowStream(SteeringStream[TargetState]):
         try:
             with self._context.flight_cleanup.preparing_stream(mode) as self._prepared_order:
                 self._value = await self._first_state()
-                self._choose_place(self._value.position)
+                self._choose_place(self._value)
                 self._replace_value(self._value)  # Raises for an invalid place before the mode changes.
             return await super().__aenter__()
         except BaseException:
@@ -255,12 +261,18 @@ class FollowStream(SteeringStream[TargetState]):
                     self._end_reason = "the positions of the target ended"
                 except Exception as error:
                     self._end_reason = f"the positions of the target raised {error!r}"
+                except asyncio.CancelledError:
+                    # The iterator raises CancelledError if it awaits a cancelled task.
+                    if self._reading is scope:
+                        self._end_reason = "the reading of the target was cancelled"
+                    raise
 
         self._session.background.start(read, "aerokit follow")
 
     def _stop_reading(self) -> None:
         if self._reading is not None:
-            self._reading.cancel()
+            scope, self._reading = self._reading, None
+            scope.cancel()
 
     async def _first_state(self) -> TargetState:
         """Wait for a position of the target that is not too old."""
@@ -271,21 +283,26 @@ class FollowStream(SteeringStream[TargetState]):
                 return state
             if self._now() > until or self._end_reason:
                 reason = self._end_reason or f"no position of the target was known within {self._valid_for_s:g} s"
-                raise OperationTimeout(f"follow: {reason}; a hold was ordered")
+                raise OperationTimeout(f"follow: {reason}; the stream was not started")
             await anyio.sleep(POLL_INTERVAL_S)
 
-    def _choose_place(self, target: Position) -> None:
+    def _choose_place(self, state: TargetState) -> None:
         """Use the present bearing from the target and the present altitude where the caller gave none."""
-        here = self._session.telemetry.position.fresh(POSITION_MAX_AGE_S)
-        self._bearing_deg = target.bearing_to(here) if self._place.bearing_deg is None else self._place.bearing_deg
+        here, target = self._session.telemetry.position.fresh(POSITION_MAX_AGE_S), state.position
+        # Until the target moves, its course is unknown: assume that it moves away from the vehicle.
         self._course_deg = here.bearing_to(target)
+        present_deg = target.bearing_to(here) - self._reference_deg(state)
+        self._bearing_deg = present_deg if self._place.bearing_deg is None else self._place.bearing_deg
         if self._place.height_m is None:
             if here.altitude_amsl_m is None:
-                raise OperationRejected("follow: the vehicle's altitude above sea level is unknown; a hold was ordered")
+                raise OperationRejected(
+                    "follow: the vehicle's altitude above sea level is unknown; the stream was not started"
+                )
             self._own_altitude_m = here.altitude_amsl_m
         elif target.altitude_amsl_m is None and target.altitude_relative_m is None:
             raise InvalidArgument(
-                f"height_m = {self._place.height_m:g} is not allowed: the target has no altitude; a hold was ordered"
+                f"height_m = {self._place.height_m:g} is not allowed: the target has no altitude;"
+                " the stream was not started"
             )
 
     # ------------------------------------------------------------------------------ the stream
@@ -295,14 +312,19 @@ class FollowStream(SteeringStream[TargetState]):
 
     def _tick(self, due: float) -> None:
         """Read the target, and send the set-point for its position."""
+        state = None
         try:
             state = self._tracker.read()
-            if state is not None:
-                self._replace_value(state)
-                self._set_at = state.reported_at  # The age of a value is the age of the target's position.
         except (Exception, asyncio.CancelledError) as error:
             # The program's function raises CancelledError if it reads the result of a cancelled task.
             self._end_reason = f"the position of the target raised {error!r}"
+        if state is not None:
+            try:
+                self._replace_value(state)
+            except Exception as error:
+                self._end_reason = f"the vehicle cannot follow the position of the target: {error}"
+            else:
+                self._set_at = state.reported_at  # The age of a value is the age of the target's position.
         super()._tick(due)
 
     def _stop_reason(self, lag: float) -> str | None:
@@ -312,14 +334,18 @@ class FollowStream(SteeringStream[TargetState]):
             return f"the target is {self.distance_m:.0f} m away (max_distance_m = {self._max_distance_m:g})"
         return super()._stop_reason(lag)
 
+    def _reference_deg(self, state: TargetState) -> float:
+        """Return the direction from which the bearing is measured: the target's course, or 0 for north."""
+        north_m_s, east_m_s, _ = state.velocity
+        if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
+            self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
+        return self._course_deg if self._place.from_course else 0.0
+
     def _encode_place(self, state: TargetState) -> Message:
         """Return the set-point for this moment, assuming that the target keeps its velocity between two positions."""
         moved_for_s = max(0.0, min(self._now() - state.first_reported_at, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
-        if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
-            self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
-        reference_deg = self._course_deg if self._place.from_course else 0.0  # 0 is north.
-        bearing = math.radians(reference_deg + self._bearing_deg)
+        bearing = math.radians(self._reference_deg(state) + self._bearing_deg)
         distance_m = self._place.distance_m
         goal = state.position.offset(
             north_m=distance_m * math.cos(bearing) + north_m_s * moved_for_s,

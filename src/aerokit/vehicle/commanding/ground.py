@@ -91,7 +91,7 @@ class ImpactDetector:
         interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
         self._updated_at = cell.updated_at
-        height_m = self._current_height()
+        height_m = self.current_height()
         sinks_fast = velocity.down_m_s >= IMPACT_M_S
         has_just_sunk_fast = cell.updated_at - self._sank_fast_at <= max_stop_s
         has_stopped_suddenly = has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S
@@ -122,7 +122,8 @@ class ImpactDetector:
             return ""
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
 
-    def _current_height(self) -> float | None:
+    def current_height(self) -> float | None:
+        """Return the height above home in metres; None if no recent position reports it."""
         is_recent = self._telemetry.position.age <= POSITION_MAX_AGE_S
         return height_above_home(self._telemetry) if is_recent else None
 
@@ -169,7 +170,7 @@ class GroundCheck:
         if self._reported_at is None:
             self._reported_at = now
             self._settled_since = math.inf
-            self._reported_height_m = height_above_home(self._session.telemetry)
+            self._reported_height_m = self._impact.current_height()
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
@@ -185,16 +186,19 @@ class GroundCheck:
         return self._impact.describe() or None
 
     def _has_settled(self, now: float, updated_at: float) -> bool:
-        """Return True if the vehicle moves as on the ground; ``updated_at`` is the time of the last velocity."""
+        """Return True if the vehicle moves no faster than on the ground.
+
+        ``updated_at`` is the time of the last velocity.
+        """
         reported_at = now if self._reported_at is None else self._reported_at
         if now - updated_at > VELOCITY_MAX_AGE_S:
             # Without a recent velocity, the report that the vehicle is on the ground is sufficient.
             return True
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
-            height_m = height_above_home(self._session.telemetry)
             # The reported velocity may be wrong. If the height has not changed for STANDING_S, the vehicle stands on
-            # the ground although it reports a velocity.
+            # the ground although it reports a velocity. An old height would not change in a fall.
+            height_m = self._impact.current_height()
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, STANDING_M)
             return is_still and now - reported_at >= STANDING_S

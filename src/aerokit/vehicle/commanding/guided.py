@@ -145,6 +145,8 @@ class Guided:
     ) -> SetpointStream[AttitudeRateSetpoint]:
         """Stream body rates with thrust (SET_ATTITUDE_TARGET without an attitude).
 
+        Without ``initial``, the stream begins with rates of 0 and ``thrust`` 0.5; see :class:`AttitudeSetpoint`.
+
         ArduCopter and PX4 execute them. The autopilot does not level the vehicle, which keeps turning until the next
         set-point, or until aerokit orders a hold because there was no new set-point for ``valid_for_s``.
         """
@@ -235,7 +237,7 @@ class SetpointStream(SteeringStream[SetpointT]):
         self._repeats_left = INITIAL_REPEATS
         self._sent_at = -math.inf
         self._stall = StallDetector(context.session)
-        if isinstance(initial, BRAKED_BY_AUTOPILOT):
+        if isinstance(initial, BRAKED_BY_AUTOPILOT):  # Other set-points may stop the vehicle suddenly in the air.
             self._impact = ImpactDetector(context.session.telemetry)
 
     def set(self, setpoint: SetpointT) -> None:

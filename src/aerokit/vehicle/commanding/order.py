@@ -181,6 +181,8 @@ class Order:
 
         CURRENT_MODE may report the mode before the HEARTBEAT that reports the mode and, after a landing, disarming.
         """
+        self.arm_command: int | None = None
+        """Number of the order's arm or disarm command among those of the program; None until it was sent."""
         self.was_sent: bool = False
         """True once a command of the order was sent. The next command is a further step."""
         self.only_stops: bool = False
