@@ -48,7 +48,9 @@ async def test_duplicate_address_is_refused_before_opening(one: str, again: str)
 @pytest.mark.parametrize("has_link_object", [True, False])
 async def test_peers_that_filter_no_sender_are_refused(has_link_object: bool) -> None:
     near, _ = memory_link_pair()
-    addresses = ["udpin:127.0.0.1:0", near] if has_link_object else ["udpout:127.0.0.1:1", "tcp:127.0.0.1:1"]
+    addresses: list[str | Link] = ["udpout:127.0.0.1:1", "tcp:127.0.0.1:1"]
+    if has_link_object:
+        addresses = ["udpin:127.0.0.1:0", near]
     with pytest.raises(InvalidArgument, match="peers = … is not allowed"):
         async with open_connection(addresses, peers="127.0.0.1"):
             pass
