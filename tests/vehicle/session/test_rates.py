@@ -115,6 +115,19 @@ async def test_rates_out_of_range(grounded: Flight, hz: float) -> None:
     assert not asked(grounded, m.Attitude)
 
 
+async def test_message_rate_out_of_range_keeps_earlier_rate(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    with pytest.raises(InvalidArgument, match="rate_hz"):
+        vehicle.message(m.RawImu, rate_hz=0.0)
+    assert m.RawImu not in vehicle._session.subscriber._cells
+    vehicle.message(m.RawImu, rate_hz=20.0)
+    with pytest.raises(InvalidArgument, match="rate_hz"):
+        vehicle.message(m.RawImu, rate_hz=2000.0)
+    vehicle.message(m.RawImu, rate_hz=5.0)
+    await anyio.sleep(1.0)
+    assert interval(grounded, m.RawImu) == pytest.approx(0.2)
+
+
 async def test_rate_request_lost_is_sent_again() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.ignore(SET_INTERVAL, times=7)
