@@ -177,6 +177,9 @@ def _actions() -> Table:
         ("PostedOrder.wait_confirmed", "CommandRejected"): later(
             lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)
         ),
+        ("Vehicle.set_heading", "ValueUnknownError"): P(
+            _method("set_heading", 30, relative=True), airborne, _clear_state("heading_deg")
+        ),
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
             _method("set_heading", 179, relative=True, rate_deg_s=1), stops_sending, 3.0
         ),

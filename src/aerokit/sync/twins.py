@@ -2634,7 +2634,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.start, item, timeout=timeout)
 
     def pause(self) -> None:
-        """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
+        """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
 
         Raises OperationRejected if the vehicle is not flying its mission. Otherwise raises as :meth:`Vehicle.hold`.
         """
@@ -2671,7 +2671,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        The mission must be the last order to the vehicle, and must be complete or at its last item.
+        The mission must be the last order to the vehicle, must not be paused, and must be complete or at its last item.
         """
         return self.aio.explains_mode
 
@@ -4876,8 +4876,9 @@ class Vehicle(VehicleTwin):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left.
-            relative: True to turn by an angle from the present heading.
+                left. PX4 always turns the shorter way to the new heading, and ArduPilot does so unless the angle is 170
+                to 350 degrees to either side.
+            relative: True to turn by an angle from the present heading. A full turn ends at once.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
@@ -4885,6 +4886,7 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
+            ValueUnknownError: ``relative`` is True, but the heading is unknown or older than 2 s. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
@@ -4901,10 +4903,11 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait for the next HOME_POSITION, which has the new place.
+        """Move the home position, and wait for the next HOME_POSITION after the acknowledgement.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
-        firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
+        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
+        metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.

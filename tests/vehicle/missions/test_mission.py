@@ -21,13 +21,14 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MissionState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MissionState
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch, waypoint
 from aerokit.sim import SimulatedPx4
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.px4 import modes as px4_modes
+from aerokit.vehicle.state.condition import MissionProgress
 
 pytestmark = pytest.mark.anyio
 
@@ -187,6 +188,30 @@ async def test_wait_finished_continues_through_pause() -> None:
         await mission.wait_finished(timeout=60)
 
 
+async def test_pilot_mode_change_after_refused_pause_ends_wait_finished() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        flight.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED)
+        with pytest.raises(CommandRejected):
+            await mission.pause()
+        flight.pilot_takes_over(CopterMode.LOITER)
+        with pytest.raises(OperationRejected, match="the mode changed to LOITER"):
+            await mission.wait_finished(timeout=30)
+
+
+async def test_pause_at_last_item_is_not_end_of_mission() -> None:
+    async with armed(open_flight, landing()) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.current.wait_until(lambda item: item == mission.count.value - 1, timeout=100)
+        await mission.pause()
+        assert mission._tracker.is_at_last_item
+        assert not mission.explains_mode
+
+
 async def test_wait_finished_reports_fall_of_armed_vehicle() -> None:
     async with armed(open_flight) as flight:
         assert isinstance(flight, Flight)
@@ -309,6 +334,13 @@ async def test_count_and_current_without_mission() -> None:
     async with open_px4() as other:
         await other.vehicle.mission.count.wait_until(lambda count: count == 0, timeout=5)
         assert other.vehicle.mission.current.value is None
+
+
+async def test_current_without_mission_is_none_if_total_is_zero() -> None:
+    async with open_px4() as flight:
+        tracker = flight.vehicle.mission._tracker
+        tracker._on_current(None, MissionProgress(0, 0, MissionState.NO_MISSION))
+        assert (tracker.count.value, tracker.current.value) == (0, None)
 
 
 # ---------------------------------------------------------------------------------- takeovers

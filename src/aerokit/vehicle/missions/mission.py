@@ -292,7 +292,7 @@ class MissionControl(VehiclePlan["Mission"]):
             raise
 
     async def pause(self) -> None:
-        """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
+        """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
 
         Raises OperationRejected if the vehicle is not flying its mission. Otherwise raises as :meth:`Vehicle.hold`.
         """
@@ -303,9 +303,16 @@ class MissionControl(VehiclePlan["Mission"]):
                 f"mission.pause: the vehicle is not flying its mission but is in {session.telemetry.mode_name};"
                 " nothing was sent"
             )
-        self._order = vehicle_context.arbiter.order(mode)
+        order = vehicle_context.arbiter.order(mode)
+        self._order = order
         self._is_paused = True
-        await vehicle_context.flight_cleanup.stop_in(mode, self._order)
+        try:
+            await vehicle_context.flight_cleanup.stop_in(mode, order)
+        except (CommandRejected, OperationRejected):
+            # The vehicle does not hold. After a time-out or a cancellation, it may still do so.
+            if self._order is order:
+                self._is_paused = False
+            raise
 
     async def resume(self, *, timeout: float = 10.0) -> None:
         """Continue the mission from the current item, even if a pilot or another order has interrupted the mission.
@@ -367,10 +374,10 @@ class MissionControl(VehiclePlan["Mission"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        The mission must be the last order to the vehicle, and must be complete or at its last item.
+        The mission must be the last order to the vehicle, must not be paused, and must be complete or at its last item.
         """
         session = self._vehicle_context.session
-        if self._order is None or self._vehicle_context.arbiter.newest is not self._order:
+        if self._order is None or self._vehicle_context.arbiter.newest is not self._order or self._is_paused:
             return False
         final_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)

@@ -131,7 +131,7 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if COMMAND_INT is not supported.
+        """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if the vehicle answers "unsupported".
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees; ``z`` is in metres above mean sea level.
         """
@@ -274,7 +274,7 @@ class CommandSender:
             run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """Deliver an ack to the call that waits for it, or remove it from the recorded acks of earlier commands."""
+        """Deliver an ack to the call that waits for it, or remove one from the acks still expected for earlier ones."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)
