@@ -2509,8 +2509,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
                 vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
                 if the vehicle supports that.
-            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
-                read back.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
+                as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
@@ -2606,6 +2606,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
         without a position (a DO command) is executed; ``current`` then shows the item after it.
 
+        Args:
+            item: number of the item.
+            timeout: seconds to wait for MISSION_CURRENT; without effect if the vehicle supports the command.
+
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
@@ -2651,7 +2655,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """Wait until the mission has been flown to its end, including a landing at its end.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
-        command is sent when it fails.
+        command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
+        a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
+        completion shows whether the vehicle lands.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -2703,8 +2709,8 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
                 vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
                 if the vehicle supports that.
-            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
-                read back.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
+                as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
@@ -2812,8 +2818,8 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
                 vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
                 if the vehicle supports that.
-            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
-                read back.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
+                as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.

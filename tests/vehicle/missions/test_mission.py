@@ -21,14 +21,13 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MissionState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavMissionType, MavResult, MissionState
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch, waypoint
 from aerokit.sim import SimulatedPx4
 from aerokit.sim.ardupilot.mission_run import MissionRun
 from aerokit.sim.px4 import modes as px4_modes
-from aerokit.vehicle.state.condition import MissionProgress
 
 pytestmark = pytest.mark.anyio
 
@@ -82,6 +81,17 @@ async def test_mission_of_earlier_program_is_flown_to_landing(uploads_again: boo
         await flight.vehicle.mission.start()
         await flight.vehicle.mission.wait_finished(timeout=600)
         assert px4.is_landed
+
+
+async def test_mission_replaced_by_another_station_is_flown_to_landing() -> None:
+    """The number of items shows that the items of the last upload are no longer the vehicle's."""
+    async with armed(open_px4, return_to_launch()) as flight:
+        mission = flight.vehicle.mission
+        cache = mission._context.caches[MavMissionType.MISSION]
+        cache.set(short_mission(flight).to_items(), now())
+        await mission.start()
+        await mission.wait_finished(timeout=600)
+        assert flight.vehicle.landed_state.value == MavLandedState.ON_GROUND
 
 
 async def test_unknown_mission_that_ends_in_air_is_finished_there() -> None:
@@ -334,13 +344,6 @@ async def test_count_and_current_without_mission() -> None:
     async with open_px4() as other:
         await other.vehicle.mission.count.wait_until(lambda count: count == 0, timeout=5)
         assert other.vehicle.mission.current.value is None
-
-
-async def test_current_without_mission_is_none_if_total_is_zero() -> None:
-    async with open_px4() as flight:
-        tracker = flight.vehicle.mission._tracker
-        tracker._on_current(None, MissionProgress(0, 0, MissionState.NO_MISSION))
-        assert (tracker.count.value, tracker.current.value) == (0, None)
 
 
 # ---------------------------------------------------------------------------------- takeovers

@@ -209,12 +209,12 @@ class MissionTracker:
         current = None if reported.current is None else reported.current - self._offset
         if current is not None and current < 0:  # The current item is ArduPilot's item 0, which is home.
             current = None
-        if reported.state == MissionState.NO_MISSION:
+        # A vehicle without a mission reports no total, so `total` is never 0; see `mission_progress`.
+        if reported.total is None and reported.state == MissionState.NO_MISSION:
             current = None
-        if reported.total is not None:
-            self.count.set(reported.total, self._source)
-        elif reported.state == MissionState.NO_MISSION:
             self.count.set(0, self._source)
+        elif reported.total is not None:
+            self.count.set(reported.total, self._source)
         self.progress.set(MissionProgress(current, self.count.latest, reported.state), self._source)
         self.current.set(current, self._source)
         if current is not None and current == self.last_item:

@@ -207,7 +207,10 @@ class CommandSender:
                 raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
-            if was_just_sent:  # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command.
+            if was_just_sent:
+                # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command. If they have
+                # arrived while this call waited for the lock, the command is repeated, which is harmless: only commands
+                # that stop or release something are sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
