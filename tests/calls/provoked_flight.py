@@ -209,6 +209,9 @@ def _actions() -> Table:
     for name in ("land", "return_to_launch", "hold"):
         rows[f"Vehicle.{name}", "NotSupported"] = P(_method(name), airborne, no_modes, alone=True)
     rows["Vehicle.go_to", "CommandTimeout"] = P(_go, airborne, ignored(Cmd.DO_REPOSITION))
+    rows["Vehicle.set_heading", "CommandTimeout"] = P(
+        _method("set_heading", 180, relative=True), airborne, ignored(Cmd.CONDITION_YAW)
+    )
     rows["Vehicle.set_heading", "OperationTimeout"] = P(
         _method("set_heading", 90, relative=True, timeout=0.2), airborne
     )

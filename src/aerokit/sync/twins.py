@@ -4894,6 +4894,7 @@ class Vehicle(VehicleTwin):
             InvalidArgument: an argument is out of range. Nothing was sent.
             ValueUnknownError: ``relative`` is True, but the heading is unknown or older than 2 s. Nothing was sent.
             CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement. A turn of 170 to 350 degrees is sent once, and may happen.
             OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.

@@ -15,6 +15,7 @@ from aerokit._internal import geo
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import (
     CommandRejected,
+    CommandTimeout,
     HeartbeatTimeout,
     InvalidArgument,
     OperationRejected,
@@ -723,6 +724,14 @@ async def test_set_heading_relative_sends_direction_of_large_turn(
     await flying.vehicle.set_heading(angle_deg, relative=True)
     (turn,) = flying.wire.commands(MavCmd.CONDITION_YAW)
     assert turn.param3 == direction
+
+
+async def test_set_heading_relative_large_turn_is_not_repeated(flying: Flight) -> None:
+    """A repetition near the goal might begin another circle."""
+    flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
+    with pytest.raises(CommandTimeout):
+        await flying.vehicle.set_heading(180.0, relative=True)
+    assert len(flying.wire.commands(MavCmd.CONDITION_YAW)) == 1
 
 
 async def test_set_heading_relative_needs_recent_heading(flying: Flight) -> None:

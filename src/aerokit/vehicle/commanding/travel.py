@@ -61,6 +61,9 @@ ARRIVED_FOR_S = 0.5
 # the shorter way might be the wrong one.
 MIN_DIRECTED_TURN_DEG, MAX_DIRECTED_TURN_DEG = 170, 350
 
+# Seconds to wait for the acknowledgement of a turn with a direction, which is sent only once.
+DIRECTED_TURN_ACK_TIMEOUT_S = 4.0
+
 
 @checks_arguments
 class TravelActions(VehicleBase):
@@ -272,6 +275,7 @@ class TravelActions(VehicleBase):
             InvalidArgument: an argument is out of range. Nothing was sent.
             ValueUnknownError: ``relative`` is True, but the heading is unknown or older than 2 s. Nothing was sent.
             CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement. A turn of 170 to 350 degrees is sent once, and may happen.
             OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
@@ -295,8 +299,10 @@ class TravelActions(VehicleBase):
             direction = 0  # the shorter way
             if relative and MIN_DIRECTED_TURN_DEG <= abs(heading_deg) <= MAX_DIRECTED_TURN_DEG:
                 direction = 1 if heading_deg > 0 else -1
-            absolute = 0
-            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal_deg, rate_deg_s, direction, absolute)
+            # With a direction, a repetition near the goal might begin another circle.
+            options = {"attempts": 1, "attempt_timeout": DIRECTED_TURN_ACK_TIMEOUT_S} if direction else {}
+            turn = (goal_deg, rate_deg_s, direction, 0)  # 0: an absolute heading
+            await self._sender.send_long(order, MavCmd.CONDITION_YAW, *turn, **options)
         await self._await_heading(goal_deg, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
