@@ -277,8 +277,9 @@ class ImageCaptured(Event):
 class LinkReport(Event):
     """Link quality of the last second, published every second.
 
-    ``loss_percent`` is derived from missing sequence numbers (None before the first frame), ``round_trip_s`` from
-    TIMESYNC (None before the first answer). ``frames_per_s`` and ``bytes_per_s`` count what was received.
+    ``loss_percent`` is derived from missing sequence numbers (None before the first frame). ``round_trip_s`` is the
+    last measurement by TIMESYNC (None before the first answer). ``frames_per_s`` and ``bytes_per_s`` count received
+    data.
     """
 
     loss_percent: float | None

@@ -177,6 +177,9 @@ def _actions() -> Table:
         ("PostedOrder.wait_confirmed", "CommandRejected"): later(
             lambda s: _post(s, ["arm"], armed=True), _deny_arming, 0.5, grounded, before=accepted(arm)
         ),
+        ("Vehicle.set_heading", "ValueUnknownError"): P(
+            _method("set_heading", 30, relative=True), airborne, _clear_state("heading_deg")
+        ),
         ("Vehicle.set_heading", "HeartbeatTimeout"): later(
             _method("set_heading", 179, relative=True, rate_deg_s=1), stops_sending, 3.0
         ),
@@ -206,6 +209,9 @@ def _actions() -> Table:
     for name in ("land", "return_to_launch", "hold"):
         rows[f"Vehicle.{name}", "NotSupported"] = P(_method(name), airborne, no_modes, alone=True)
     rows["Vehicle.go_to", "CommandTimeout"] = P(_go, airborne, ignored(Cmd.DO_REPOSITION))
+    rows["Vehicle.set_heading", "CommandTimeout"] = P(
+        _method("set_heading", 180, relative=True), airborne, ignored(Cmd.CONDITION_YAW)
+    )
     rows["Vehicle.set_heading", "OperationTimeout"] = P(
         _method("set_heading", 90, relative=True, timeout=0.2), airborne
     )

@@ -241,7 +241,7 @@ def test_target_location_falls_back_to_old_command(stage: Stage, result: int) ->
         since = stage.fc.mark()
         commands(stage, lambda kind=kind: stage.vehicle.gimbal.target_location(kind(*PLACE)))
         sent = stage.fc.commands(since=since)[-1]
-        assert (sent.name, *params(sent)) == ("COMMAND_LONG", ROI, (0, 0, 0, 0, -35.1235, 149.7654, altitude))
+        assert (sent.name, *params(sent)) == ("COMMAND_LONG", ROI, (3, 0, 0, 0, -35.1235, 149.7654, altitude))
 
 
 def test_target_location_px4_uses_amsl_altitude() -> None:

@@ -2516,8 +2516,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
                 vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
                 if the vehicle supports that.
-            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
-                read back.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
+                as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
@@ -2613,6 +2613,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
         without a position (a DO command) is executed; ``current`` then shows the item after it.
 
+        Args:
+            item: number of the item.
+            timeout: seconds to wait for MISSION_CURRENT; without effect if the vehicle supports the command.
+
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
@@ -2641,7 +2645,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.start, item, timeout=timeout)
 
     def pause(self) -> None:
-        """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
+        """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
 
         Raises OperationRejected if the vehicle is not flying its mission. Otherwise raises as :meth:`Vehicle.hold`.
         """
@@ -2658,7 +2662,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         """Wait until the mission has been flown to its end, including a landing at its end.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
-        command is sent when it fails.
+        command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
+        a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
+        completion shows whether the vehicle lands.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -2678,7 +2684,7 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        The mission must be the last order to the vehicle, and must be complete or at its last item.
+        The mission must be the last order to the vehicle, must not be paused, and must be complete or at its last item.
         """
         return self.aio.explains_mode
 
@@ -2710,8 +2716,8 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
             only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
                 vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
                 if the vehicle supports that.
-            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
-                read back.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
+                as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
@@ -2819,8 +2825,8 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
             only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
                 vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
                 if the vehicle supports that.
-            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
-                read back.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
+                as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.
@@ -4883,8 +4889,9 @@ class Vehicle(VehicleTwin):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left.
-            relative: True to turn by an angle from the present heading.
+                left. PX4 always turns the shorter way to the new heading, and ArduPilot does so unless the angle is 170
+                to 350 degrees to either side.
+            relative: True to turn by an angle from the present heading. A full turn ends at once.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
@@ -4892,7 +4899,9 @@ class Vehicle(VehicleTwin):
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
+            ValueUnknownError: ``relative`` is True, but the heading is unknown or older than 2 s. Nothing was sent.
             CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement. A turn of 170 to 350 degrees is sent once, and may happen.
             OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
@@ -4908,10 +4917,11 @@ class Vehicle(VehicleTwin):
         )
 
     def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait for the next HOME_POSITION, which has the new place.
+        """Move the home position, and wait for the next HOME_POSITION after the acknowledgement.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
-        firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
+        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
+        metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.

@@ -15,10 +15,12 @@ from aerokit._internal import geo
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import (
     CommandRejected,
+    CommandTimeout,
     HeartbeatTimeout,
     InvalidArgument,
     OperationRejected,
     OperationTimeout,
+    StaleValueError,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavResult
 from aerokit.sim import SimulatedCopter
@@ -757,9 +759,39 @@ async def test_set_heading_absolute_and_relative(flying: Flight) -> None:
     absolute, left, right = (command for command in flying.wire.commands(MavCmd.CONDITION_YAW))
     assert (absolute.param1, absolute.param3, absolute.param4) == (90.0, 0.0, 0.0)
     assert left.param1 == pytest.approx(60.0, abs=1.5)
-    assert (left.param3, left.param4) == (-1.0, 0.0)
+    assert (left.param3, left.param4) == (0.0, 0.0)
     assert right.param1 == pytest.approx(100.0, abs=3.0)  # absolute: a repetition does not turn the vehicle further
-    assert (right.param2, right.param3, right.param4) == (20.0, 1.0, 0.0)
+    assert (right.param2, right.param3, right.param4) == (20.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "direction"), [(0, 0), (90, 0), (-90, 0), (180, 1), (-180, -1), (270, 1), (-270, -1), (-360, 0)]
+)
+async def test_set_heading_relative_sends_direction_of_large_turn(
+    flying: Flight, angle_deg: float, direction: float
+) -> None:
+    """ArduPilot turns almost a full circle if its target heading is already slightly beyond the heading."""
+    await flying.vehicle.set_heading(angle_deg, relative=True)
+    (turn,) = flying.wire.commands(MavCmd.CONDITION_YAW)
+    assert turn.param3 == direction
+
+
+async def test_set_heading_relative_large_turn_is_not_repeated(flying: Flight) -> None:
+    """A repetition near the goal might begin another circle."""
+    flying.copter.faults.lose_ack(MavCmd.CONDITION_YAW)
+    with pytest.raises(CommandTimeout):
+        await flying.vehicle.set_heading(180.0, relative=True)
+    assert len(flying.wire.commands(MavCmd.CONDITION_YAW)) == 1
+
+
+async def test_set_heading_relative_needs_recent_heading(flying: Flight) -> None:
+    for message_type in (m.GlobalPositionInt, m.VfrHud, m.Attitude):
+        flying.copter.faults.lose(message_type, times=10_000)
+    await anyio.sleep(3.0)
+    with pytest.raises(StaleValueError):
+        await flying.vehicle.set_heading(30.0, relative=True)
+    assert not flying.wire.mode_orders()
+    assert not flying.wire.commands(MavCmd.CONDITION_YAW)
 
 
 async def test_set_heading_not_reached_times_out(flying: Flight) -> None:
@@ -796,6 +828,16 @@ async def test_set_home_at_position_and_elsewhere(flying: Flight) -> None:
     place = Position(before.latitude_deg, before.longitude_deg, altitude_amsl_m=before.altitude_amsl_m)
     await flying.vehicle.set_home(place)
     assert flying.vehicle.home.value.position.distance_to(place) < 0.1
+
+
+@pytest.mark.parametrize("name", ["refuse", "ignore"])
+async def test_set_home_without_requested_message_succeeds(flying: Flight, name: str) -> None:
+    """ArduPilot sends HOME_POSITION without a request, too."""
+    getattr(flying.copter.faults, name)(MavCmd.REQUEST_MESSAGE)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(flying.vehicle.set_home)
+        await anyio.sleep(6.0)
+        flying.copter.send_built(m.HomePosition.ID)
 
 
 async def test_look_at_refused(flying: Flight) -> None:

@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +27,7 @@ from aerokit.errors import (
     OperationRejected,
     SetpointStreamStopped,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavVtolState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavVtolState
 from aerokit.sim import (
     SimulatedCopter,
     SimulatedPlane,
@@ -457,6 +458,30 @@ async def test_autotune_reports_its_progress() -> None:
         seen: list[int] = []
         await vehicle.autotune(on_progress=seen.append)
         assert seen == [0, 20, 40, 60, 80, 95]
+
+
+async def test_autotune_ignores_unknown_progress() -> None:
+    """COMMAND_ACK.progress 255 means that the vehicle does not report its progress."""
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    async with hovering(simulated) as (vehicle, _):
+        simulated.faults.ignore(MavCmd.DO_AUTOTUNE_ENABLE, times=1)
+        ack = m.CommandAck(MavCmd.DO_AUTOTUNE_ENABLE, MavResult.IN_PROGRESS, 255, 0, 0, 0)
+        asyncio.get_running_loop().call_later(0.2, simulated.send, ack)
+        seen: list[int] = []
+        await vehicle.autotune(on_progress=seen.append)
+        assert seen == [0, 20, 40, 60, 80, 95]
+
+
+async def test_autotune_ignores_ack_of_another_component() -> None:
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    async with hovering(simulated) as (vehicle, _):
+        simulated.faults.ignore(MavCmd.DO_AUTOTUNE_ENABLE, times=1)
+        foreign_ack = m.CommandAck(MavCmd.DO_AUTOTUNE_ENABLE, MavResult.DENIED, 0, 0, 0, 0)
+        own_ack = m.CommandAck(MavCmd.DO_AUTOTUNE_ENABLE, MavResult.IN_PROGRESS, 0, 0, 0, 0)
+        loop = asyncio.get_running_loop()
+        loop.call_later(0.2, partial(simulated.send, foreign_ack, sender=(1, 100)))
+        loop.call_later(0.4, simulated.send, own_ack)
+        await vehicle.autotune()
 
 
 async def test_autotune_is_not_asked_again_after_a_lost_answer() -> None:

@@ -23,7 +23,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import MavCmd, MavResult, MavRoi
 from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCopter, SimulatedGimbal, SimulatedPx4, SimulatedVehicle, simulated_link
 from aerokit.sim.commands import CommandHandler
@@ -188,6 +188,7 @@ async def test_old_firmware_gets_legacy_roi_command(flying: Flight, result: int)
     assert len(flying.wire.commands(MavCmd.DO_SET_ROI_LOCATION)) == 1
     above, sea = flying.wire.commands(ROI)
     assert (params(above)[-1], params(sea)[-1]) == (10, 20)
+    assert above.param1 == sea.param1 == MavRoi.LOCATION
     await flying.vehicle.stop_looking()
     assert params(flying.wire.commands(ROI)[-1]) == (0, 0, 0, 0)
 

@@ -21,7 +21,7 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MissionState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavMissionType, MavResult, MissionState
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch, waypoint
@@ -81,6 +81,17 @@ async def test_mission_of_earlier_program_is_flown_to_landing(uploads_again: boo
         await flight.vehicle.mission.start()
         await flight.vehicle.mission.wait_finished(timeout=600)
         assert px4.is_landed
+
+
+async def test_mission_replaced_by_another_station_is_flown_to_landing() -> None:
+    """The number of items shows that the items of the last upload are no longer the vehicle's."""
+    async with armed(open_px4, return_to_launch()) as flight:
+        mission = flight.vehicle.mission
+        cache = mission._context.caches[MavMissionType.MISSION]
+        cache.set(short_mission(flight).to_items(), now())
+        await mission.start()
+        await mission.wait_finished(timeout=600)
+        assert flight.vehicle.landed_state.value == MavLandedState.ON_GROUND
 
 
 async def test_unknown_mission_that_ends_in_air_is_finished_there() -> None:
@@ -185,6 +196,30 @@ async def test_wait_finished_continues_through_pause() -> None:
         await mission.start(1)  # from another task
         assert not mission._tracker.is_complete
         await mission.wait_finished(timeout=60)
+
+
+async def test_pilot_mode_change_after_refused_pause_ends_wait_finished() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        flight.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.DENIED)
+        with pytest.raises(CommandRejected):
+            await mission.pause()
+        flight.pilot_takes_over(CopterMode.LOITER)
+        with pytest.raises(OperationRejected, match="the mode changed to LOITER"):
+            await mission.wait_finished(timeout=30)
+
+
+async def test_pause_at_last_item_is_not_end_of_mission() -> None:
+    async with armed(open_flight, landing()) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.current.wait_until(lambda item: item == mission.count.value - 1, timeout=100)
+        await mission.pause()
+        assert mission._tracker.is_at_last_item
+        assert not mission.explains_mode
 
 
 async def test_wait_finished_reports_fall_of_armed_vehicle() -> None:

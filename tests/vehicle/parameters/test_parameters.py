@@ -210,6 +210,13 @@ async def test_incomplete_list_names_missing_indices() -> None:
         assert not parameters.is_complete
 
 
+async def test_timeout_error_of_program_is_raised_unchanged() -> None:
+    async with open_flight() as flight:
+        for limit in (flight.vehicle._session.transfers.limit(5.0), flight.vehicle._session.transfers.limit(None)):
+            with pytest.raises(TimeoutError, match="the disk does not answer"), limit:
+                raise TimeoutError("the disk does not answer")
+
+
 async def test_download_timeout() -> None:
     async with open_flight(copter(None)) as flight:
         with pytest.raises(OperationTimeout, match=r"not done within 0.1 s"):

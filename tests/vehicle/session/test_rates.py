@@ -115,6 +115,19 @@ async def test_rates_out_of_range(grounded: Flight, hz: float) -> None:
     assert not asked(grounded, m.Attitude)
 
 
+async def test_message_rate_out_of_range_keeps_earlier_rate(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    with pytest.raises(InvalidArgument, match="rate_hz"):
+        vehicle.message(m.RawImu, rate_hz=0.0)
+    assert m.RawImu not in vehicle._session.subscriber._cells
+    vehicle.message(m.RawImu, rate_hz=20.0)
+    with pytest.raises(InvalidArgument, match="rate_hz"):
+        vehicle.message(m.RawImu, rate_hz=2000.0)
+    vehicle.message(m.RawImu, rate_hz=5.0)
+    await anyio.sleep(1.0)
+    assert interval(grounded, m.RawImu) == pytest.approx(0.2)
+
+
 async def test_rate_request_lost_is_sent_again() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     copter.faults.ignore(SET_INTERVAL, times=7)
@@ -161,6 +174,32 @@ async def test_answered_timesync_is_requested_immediately_again() -> None:
             at = [when for when, message in flight.wire.sent if isinstance(message, m.CommandLong)]
             gaps = [later - earlier for earlier, later in itertools.pairwise(at)]
             assert gaps == pytest.approx([3.0, 5.0, 9.0][:times], abs=1.01)
+
+
+async def test_rate_refused_before_reboot_is_requested_again() -> None:
+    async with open_flight(rates={}, latency_s=0.3) as flight:
+        await anyio.sleep(3.0)
+        flight.copter.faults.refuse(SET_INTERVAL, MavResult.DENIED, times=1)
+        with (
+            flight.vehicle.subscribe(StreamUnavailable, capacity=5) as events,
+            flight.vehicle.rate(m.RawImu, 20.0),
+        ):
+            await anyio.sleep(0.4)  # The refusal is under way.
+            flight.vehicle._session.rates.request_again()
+            await anyio.sleep(2.0)
+            assert interval(flight, m.RawImu) == pytest.approx(0.05)
+            assert events.get_nowait() is None
+
+
+async def test_interval_after_failures_is_bounded() -> None:
+    """A vehicle may be silent for a day."""
+    async with open_flight(rates={}) as flight:
+        await anyio.sleep(3.0)
+        flight.copter.faults.ignore(SET_INTERVAL)
+        with flight.vehicle.rate(m.RawImu, 20.0):
+            flight.vehicle._session.rates._streams[m.RawImu.ID].failures = 1100
+            await anyio.sleep(70.0)
+            assert len(asked(flight, m.RawImu)) == 2
 
 
 # ------------------------------------------------------------------------------------- events
@@ -212,6 +251,30 @@ async def test_optional_stream_missing_publishes_nothing() -> None:
         with flight.vehicle.subscribe(StreamSlow, StreamUnavailable, capacity=20) as events:
             await anyio.sleep(60.0)
             assert events.get_nowait() is None
+
+
+async def test_stream_of_ended_subscription_is_optional_again(grounded: Flight) -> None:
+    rates = grounded.vehicle._session.rates
+    with grounded.vehicle.rate(m.Odometry, 10.0):
+        await anyio.sleep(1.0)
+    with grounded.vehicle.subscribe(StreamUnavailable, capacity=5) as events:
+        rates.request(m.Odometry, 20.0, is_optional=True)
+        await anyio.sleep(3.0)
+        assert len(asked(grounded, m.Odometry)) == 2
+        assert events.get_nowait() is None
+
+
+async def test_optional_stream_slow_from_its_start_publishes_event() -> None:
+    async with open_flight(rates={}) as flight:
+        flight.copter.faults.lose(m.RawImu, times=200)
+        flight.vehicle._session.rates.request(m.RawImu, 10.0, is_optional=True)
+        with flight.vehicle.subscribe(StreamSlow, capacity=20) as events:
+            await anyio.sleep(12.0)
+            assert events.get_nowait() is None
+            flight.copter.faults.lose(m.RawImu, times=0)
+            flight.copter.channels[0].streams.set_interval(m.RawImu.ID, 0.5, flight.copter.now)
+            event = await events.get(timeout=20.0)
+            assert event.achieved_hz == pytest.approx(2.0, abs=0.5)
 
 
 async def test_unavailable_message_publishes_event(grounded: Flight) -> None:

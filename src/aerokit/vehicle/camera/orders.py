@@ -12,7 +12,7 @@ from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, Operat
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
-from aerokit.protocols.command import command_long, command_name
+from aerokit.protocols.command import command_name
 from aerokit.vehicle.commanding.order import SUPERSEDED
 
 if TYPE_CHECKING:
@@ -171,8 +171,7 @@ class CameraOrders:
         """Send a command once without waiting, e.g. when a block exits by cancellation."""
         if self._component is None or self._session.is_closed or not self._session.connection.is_open:
             return
-        target = self._component.component_id
-        self._session.connection.send(command_long(self._session.system_id, target, command, params))
+        self._session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
 
     async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
         """At the end of a block, send its stop command at once, and retry it in the background until acknowledged.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -17,12 +17,26 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import MavCmd, MavDoRepositionFlags, MavFrame, MavProtocolCapability, MavResult, SpeedType
+from aerokit.mavlink.enums import (
+    MavCmd,
+    MavDoRepositionFlags,
+    MavFrame,
+    MavProtocolCapability,
+    MavResult,
+    MavRoi,
+    SpeedType,
+)
 from aerokit.mavlink.messages import HomePosition, SetPositionTargetGlobalInt
 from aerokit.position import Home, Position, position_with_altitude, travel_target
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.order import ROI
-from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M, MAX_SILENCE_S, StallDetector, await_progress
+from aerokit.vehicle.commanding.progress import (
+    MAX_DISTANCE_M,
+    MAX_SILENCE_S,
+    POSITION_MAX_AGE_S,
+    StallDetector,
+    await_progress,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,6 +55,14 @@ RESEND_INTERVAL_S = 1.0
 
 # The vehicle has arrived once it has been within the arrival radius for this many seconds.
 ARRIVED_FOR_S = 0.5
+
+# A direction is sent only for turns between these angles. ArduPilot measures the direction from its own target heading,
+# so near 0 and 360 degrees it might turn almost a full circle (ArduCopter/autoyaw.cpp, set_fixed_yaw_rad). In between,
+# the shorter way might be the wrong one.
+MIN_DIRECTED_TURN_DEG, MAX_DIRECTED_TURN_DEG = 170, 350
+
+# Seconds to wait for the acknowledgement of a turn with a direction, which is sent only once.
+DIRECTED_TURN_ACK_TIMEOUT_S = 4.0
 
 
 @checks_arguments
@@ -145,7 +167,7 @@ class TravelActions(VehicleBase):
             if error.result != MavResult.UNSUPPORTED:
                 raise
             await self._sender.ensure_mode(self._sender.mode_for("go_to", "setpoint"), order)
-            self._sender.raise_if_ended(order)
+            self._sender.raise_if_ended(order)  # `await_recent_state` checks this only if it has to wait.
             await self._sender.await_recent_state(order)
             ignored = dict.fromkeys(("vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate"), 0.0)
             message = SetPositionTargetGlobalInt(
@@ -181,8 +203,8 @@ class TravelActions(VehicleBase):
         def resend_if_due() -> None:
             """Resend the target if it is due.
 
-            It is not sent if the state is not recent, the order has ended, or the computer has slept since the last
-            transmission.
+            It is not sent if the state is not recent or the order has ended. If the computer has slept since the last
+            transmission, the target is never sent again, because it would be too late.
             """
             nonlocal sent_at
             now = self.connection.now()
@@ -241,8 +263,9 @@ class TravelActions(VehicleBase):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left.
-            relative: True to turn by an angle from the present heading.
+                left. PX4 always turns the shorter way to the new heading, and ArduPilot does so unless the angle is 170
+                to 350 degrees to either side.
+            relative: True to turn by an angle from the present heading. A full turn ends at once.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
@@ -250,7 +273,9 @@ class TravelActions(VehicleBase):
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
+            ValueUnknownError: ``relative`` is True, but the heading is unknown or older than 2 s. Nothing was sent.
             CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement. A turn of 170 to 350 degrees is sent once, and may happen.
             OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.
@@ -260,7 +285,8 @@ class TravelActions(VehicleBase):
         check_range("tolerance_deg", tolerance_deg, 0, 180, above=True)
         self._check_can_turn(heading_deg)
         mode = self._sender.mode_for("set_heading", self.autopilot.reposition_purpose)
-        goal_deg = (heading_deg + (self.telemetry.heading_deg.value if relative else 0)) % 360
+        present_deg = self.telemetry.heading_deg.fresh(POSITION_MAX_AGE_S) if relative else 0
+        goal_deg = (present_deg + heading_deg) % 360
         order = self._arbiter.order(mode)
         if self._turns_by_reposition:
             yaw = math.remainder(math.radians(goal_deg), 2 * math.pi)
@@ -271,10 +297,12 @@ class TravelActions(VehicleBase):
             await self._sender.ensure_mode(mode, order)
             # An absolute heading is sent instead of an angle, so that a repetition does not turn the vehicle further.
             direction = 0  # the shorter way
-            if relative:
-                direction = 1 if heading_deg >= 0 else -1
-            absolute = 0
-            await self._sender.send_long(order, MavCmd.CONDITION_YAW, goal_deg, rate_deg_s, direction, absolute)
+            if relative and MIN_DIRECTED_TURN_DEG <= abs(heading_deg) <= MAX_DIRECTED_TURN_DEG:
+                direction = 1 if heading_deg > 0 else -1
+            # With a direction, a repetition near the goal might begin another circle.
+            options = {"attempts": 1, "attempt_timeout": DIRECTED_TURN_ACK_TIMEOUT_S} if direction else {}
+            turn = (goal_deg, rate_deg_s, direction, 0)  # 0: an absolute heading
+            await self._sender.send_long(order, MavCmd.CONDITION_YAW, *turn, **options)
         await self._await_heading(goal_deg, tolerance_deg, timeout, max_silence_s, order, mode)
 
     async def _await_heading(
@@ -308,10 +336,11 @@ class TravelActions(VehicleBase):
             )
 
     async def set_home(self, place: Position | Home | None = None, *, timeout: float = 5.0) -> None:
-        """Move the home position, and wait for the next HOME_POSITION, which has the new place.
+        """Move the home position, and wait for the next HOME_POSITION after the acknowledgement.
 
-        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME) as COMMAND_INT. Old
-        firmware without COMMAND_INT gets a COMMAND_LONG, which has a resolution of about a metre.
+        Sends MAV_CMD_DO_SET_HOME (https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_HOME). A place is sent as
+        COMMAND_INT. Firmware that refuses this as unsupported gets a COMMAND_LONG, which has a resolution of about a
+        metre.
 
         Args:
             place: latitude, longitude and an altitude above mean sea level; None: the vehicle's present position.
@@ -339,7 +368,9 @@ class TravelActions(VehicleBase):
                 send = self._session.commands.send_place
                 await self._sender.run_command(order, send, MavCmd.DO_SET_HOME, 0, **position)
         requested_at = self.connection.now()
-        await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
+        # The vehicle has moved its home. Most vehicles then send HOME_POSITION without a request.
+        with suppress(CommandRejected, CommandTimeout):
+            await self._session.commands.send_long(MavCmd.REQUEST_MESSAGE, HomePosition.ID)
         await home.wait_until(lambda _: home.updated_at >= requested_at, timeout=timeout, description="set_home")
 
     def distance_to(self, target: Position | Home) -> float:
@@ -403,8 +434,8 @@ class LookActions(VehicleBase):
             return
         is_relative = place["frame"] == MavFrame.GLOBAL_RELATIVE_ALT_INT
         above_home_m = place["z"] if is_relative else place["z"] - self._position.home_altitude()
-        unused = (0, 0, 0, 0)  # param1 to param4
-        await self._send_roi(MavCmd.DO_SET_ROI, *unused, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
+        params_1_to_4 = (MavRoi.LOCATION, 0, 0, 0)
+        await self._send_roi(MavCmd.DO_SET_ROI, *params_1_to_4, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
         """Send MAV_CMD_DO_SET_ROI_LOCATION; return False if the firmware does not support it as COMMAND_INT."""

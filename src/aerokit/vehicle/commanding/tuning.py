@@ -26,6 +26,8 @@ MAX_ANSWER_AGE_S = 1.5
 
 After a longer pause of the program or its event loop, the tuning may have ended.
 """
+MAX_PERCENT = 100
+"""Maximum of COMMAND_ACK.progress. The value 255 means that the progress is unknown."""
 TUNED_PERCENT = 95
 """Progress in percent at which PX4 has finished, and waits for disarming to save its new gains."""
 
@@ -70,9 +72,10 @@ class TuningActions(VehicleBase):
                     answer = await self._poll(answers)
                     if answer.result not in (MavResult.IN_PROGRESS, MavResult.ACCEPTED):
                         raise rejection(MavCmd.DO_AUTOTUNE_ENABLE, answer.result)
-                    if answer.progress != percent and on_progress is not None:
-                        on_progress(answer.progress)
-                    percent = answer.progress
+                    if answer.progress <= MAX_PERCENT and answer.progress != percent:
+                        percent = answer.progress
+                        if on_progress is not None:
+                            on_progress(percent)
                     is_tuned = percent >= TUNED_PERCENT
                     await anyio.sleep(0 if is_tuned else POLL_INTERVAL_S)
                     self._sender.raise_if_ended(order)
@@ -92,11 +95,17 @@ class TuningActions(VehicleBase):
         until = self.connection.now() + ANSWER_TIMEOUT_S
         while self.connection.now() < until:
             for answer in answers:
-                if answer.command == MavCmd.DO_AUTOTUNE_ENABLE and self._session.commands.is_for_us(answer):
+                if self._is_autotune_answer(answer):
                     return answer
             await anyio.sleep(POLL_INTERVAL_S / 20)
         link = self._session.describe_link()
         raise CommandTimeout(f"autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning; {link}")
+
+    def _is_autotune_answer(self, answer: CommandAck) -> bool:
+        frame = answer.received_frame
+        is_from_autopilot = frame is not None and frame.component_id == self.component_id
+        is_ours = is_from_autopilot and self._session.commands.is_for_us(answer)
+        return is_ours and answer.command == MavCmd.DO_AUTOTUNE_ENABLE
 
     def _age_of(self, answer: CommandAck) -> float:
         """Return the seconds since the answer was received, including the time for which the computer slept."""

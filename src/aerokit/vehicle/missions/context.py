@@ -209,6 +209,7 @@ class MissionTracker:
         current = None if reported.current is None else reported.current - self._offset
         if current is not None and current < 0:  # The current item is ArduPilot's item 0, which is home.
             current = None
+        # A vehicle without a mission reports no total, so `total` is never 0; see `mission_progress`.
         if reported.total is None and reported.state == MissionState.NO_MISSION:
             current = None
             self.count.set(0, self._source)

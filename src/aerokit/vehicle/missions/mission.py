@@ -73,7 +73,7 @@ class MissionEndDetector:
         self._are_items_known = bool(items)
         self._completed_at: float | None = None  # when a mission whose items are unknown was first seen complete
         self._is_last_item_landing_or_return = last_command in LANDING_PURPOSES
-        self._ends_in_air = is_return and not session.autopilot.lands_after_return
+        self._ends_by_return_without_landing = is_return and not session.autopilot.lands_after_return
         self._return_began_at: float | None = None  # when `_has_returned` was first called
         # Modes in which the vehicle may land. If the last item is a landing or a return, only its mode counts.
         self._landing_modes = [
@@ -97,17 +97,11 @@ class MissionEndDetector:
     def _is_end_reported(self) -> bool:
         """Return True if the vehicle reports the end of the mission. A vehicle that has fallen may report it too."""
         if self._tracker.is_complete:
-            if not self._are_items_known and not self._ends_by_landing_or_return:
-                return self._is_on_ground or self._has_stayed_complete()
-            if self._ends_in_air:
-                # ArduPilot reports completion at home, PX4 already when it begins to return.
-                completes_at_home = self._session.autopilot.mission_completes_at_home
-                return completes_at_home or self._has_returned() or self._is_on_ground
-            return not self._ends_by_landing_or_return or self._is_on_ground
+            return self._is_completion_final()
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
-        if self._ends_in_air and self._is_landing:
+        if self._ends_by_return_without_landing and self._is_landing:
             return self._is_on_ground or self._has_returned()
-        # The vehicle flies the mission, perhaps once more.
+        # The mission is not complete. The vehicle may fly it once more, so earlier observations do not count.
         self._return_began_at = None
         self._completed_at = None
         if self._session.telemetry.is_confirmed_disarmed and self._is_landing:
@@ -117,6 +111,16 @@ class MissionEndDetector:
         last = self._tracker.last_item
         # Without a mission state, the last item that was reached shows the end.
         return not reports_state and last is not None and self._tracker.reached == last
+
+    def _is_completion_final(self) -> bool:
+        """Return True if a complete mission needs no further flight: no return, and no landing."""
+        if self._ends_by_return_without_landing:
+            # ArduPilot reports completion at home, PX4 already when it begins to return.
+            completes_at_home = self._session.autopilot.mission_completes_at_home
+            return completes_at_home or self._has_returned() or self._is_on_ground
+        if self._ends_by_landing_or_return:
+            return self._is_on_ground
+        return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
         """Return True if the mission has been complete for ``END_GRACE_S``. Call this only while it is complete.
@@ -247,6 +251,10 @@ class MissionControl(VehiclePlan["Mission"]):
         Sends MAV_CMD_DO_SET_MISSION_CURRENT, or MISSION_SET_CURRENT to PX4, which does not support the command. An item
         without a position (a DO command) is executed; ``current`` then shows the item after it.
 
+        Args:
+            item: number of the item.
+            timeout: seconds to wait for MISSION_CURRENT; without effect if the vehicle supports the command.
+
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
@@ -292,7 +300,7 @@ class MissionControl(VehiclePlan["Mission"]):
             raise
 
     async def pause(self) -> None:
-        """Hold and remember the current item; returns when HEARTBEAT reports the hold mode.
+        """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
 
         Raises OperationRejected if the vehicle is not flying its mission. Otherwise raises as :meth:`Vehicle.hold`.
         """
@@ -303,9 +311,16 @@ class MissionControl(VehiclePlan["Mission"]):
                 f"mission.pause: the vehicle is not flying its mission but is in {session.telemetry.mode_name};"
                 " nothing was sent"
             )
-        self._order = vehicle_context.arbiter.order(mode)
+        order = vehicle_context.arbiter.order(mode)
+        self._order = order
         self._is_paused = True
-        await vehicle_context.flight_cleanup.stop_in(mode, self._order)
+        try:
+            await vehicle_context.flight_cleanup.stop_in(mode, order)
+        except (CommandRejected, OperationRejected):
+            # The vehicle does not hold. After a time-out or a cancellation, it may still do so.
+            if self._order is order:
+                self._is_paused = False
+            raise
 
     async def resume(self, *, timeout: float = 10.0) -> None:
         """Continue the mission from the current item, even if a pilot or another order has interrupted the mission.
@@ -331,7 +346,9 @@ class MissionControl(VehiclePlan["Mission"]):
         """Wait until the mission has been flown to its end, including a landing at its end.
 
         A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
-        command is sent when it fails.
+        command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
+        a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
+        completion shows whether the vehicle lands.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -349,6 +366,8 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
         items_with_home = self._context.caches[MavMissionType.MISSION].items or ()
         items = items_with_home[self._context.offset_of(MavMissionType.MISSION) :]
+        if self._tracker.count.latest not in (None, len(items)):
+            items = ()  # Another ground station has replaced the mission, so its items are unknown.
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
         with session.streaming("mission_current", "landed_state", "position"), end.ground.watching():
             await await_progress(
@@ -367,10 +386,10 @@ class MissionControl(VehiclePlan["Mission"]):
     def explains_mode(self) -> bool:
         """True if the vehicle holds, returns or lands because its mission has ended.
 
-        The mission must be the last order to the vehicle, and must be complete or at its last item.
+        The mission must be the last order to the vehicle, must not be paused, and must be complete or at its last item.
         """
         session = self._vehicle_context.session
-        if self._order is None or self._vehicle_context.arbiter.newest is not self._order:
+        if self._order is None or self._vehicle_context.arbiter.newest is not self._order or self._is_paused:
             return False
         final_modes = [
             session.autopilot.mode_for(purpose, is_vtol=session.telemetry.is_vtol)

@@ -57,8 +57,8 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
                 vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
                 if the vehicle supports that.
-            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. Files are always
-                read back.
+            verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
+                as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
                 is known.
             idle_timeout_s: fail after this many seconds without progress.

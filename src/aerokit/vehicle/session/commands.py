@@ -131,7 +131,7 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if COMMAND_INT is not supported.
+        """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if the vehicle answers "unsupported".
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees; ``z`` is in metres above mean sea level.
         """
@@ -207,7 +207,10 @@ class CommandSender:
                 raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
-            if was_just_sent:  # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command.
+            if was_just_sent:
+                # `send_unconfirmed` has recorded this command's own acks as acks of an earlier command. If they have
+                # arrived while this call waited for the lock, the command is repeated, which is harmless: only commands
+                # that stop or release something are sent this way.
                 del pending_acks[-acks_per_sending:]
             exchange = CommandExchange(
                 message,
@@ -274,7 +277,7 @@ class CommandSender:
             run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """Deliver an ack to the call that waits for it, or remove it from the recorded acks of earlier commands."""
+        """Deliver an ack to the call that waits for it, or remove one from the acks still expected for earlier ones."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)

@@ -42,6 +42,9 @@ The interval doubles with each further request of the stream, up to ``MAX_RETRY_
 
 MAX_RETRY_INTERVAL_S = 60.0
 
+# The interval after requests without an ack is 2 seconds to the power of their number, which is limited to this one.
+MAX_BACKOFF_EXPONENT = 10
+
 # This number in place of a rate in Hz restores the autopilot's own default rate.
 AUTOPILOT_DEFAULT = 0.0
 
@@ -61,7 +64,8 @@ class _Stream:
         self.message_type, self._component_id = message_type, component_id
         # The rates that callers need. Each call of `MessageRates.request` has its own key.
         self.requests: dict[object, float] = {}
-        self.is_optional = True
+        # The keys of the requests that are not optional.
+        self.required: set[object] = set()
         # The rate last requested; None if the needed rate must be requested again.
         self.requested_hz: float | None = None
         self.is_refused = False
@@ -81,6 +85,11 @@ class _Stream:
     def needed_hz(self) -> float:
         """The highest rate needed; 0 (the autopilot's own rate) if no rate is needed."""
         return max(self.requests.values(), default=AUTOPILOT_DEFAULT)
+
+    @property
+    def is_optional(self) -> bool:
+        """True if no present request needs the message."""
+        return not self.required
 
     @property
     def is_due(self) -> bool:
@@ -136,24 +145,26 @@ class MessageRates:
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
 
-        If an optional message is refused or never arrives, for example because its sensor is missing, neither
-        StreamUnavailable nor StreamSlow is published.
+        If a message for which all present requests are optional is refused or never arrives, for example because its
+        sensor is missing, neither StreamUnavailable nor StreamSlow is published.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
         if stream is None:
             stream = self._new_stream(message_type)
             self._streams[message_type.ID] = stream
-        stream.is_optional = stream.is_optional and is_optional
         if stream.is_refused:  # The vehicle may accept another rate than the refused one.
             stream.is_refused = False
             stream.requested_hz = None
         token = object()
         stream.requests[token] = hz
+        if not is_optional:
+            stream.required.add(token)
         self._has_due_streams.set()
 
         def release() -> None:
             if stream.requests.pop(token, None) is not None:
+                stream.required.discard(token)
                 self._has_due_streams.set()
 
         return release
@@ -216,6 +227,7 @@ class MessageRates:
         hz = stream.needed_hz
         interval_us = 0.0 if hz == AUTOPILOT_DEFAULT else 1e6 / hz
         reset_count = self._reset_count
+        refusal: CommandRejected | None = None
         try:
             await self._commands.send_long(
                 MavCmd.SET_MESSAGE_INTERVAL,
@@ -228,16 +240,22 @@ class MessageRates:
             if error.result == MavResult.UNSUPPORTED:
                 self._switch_to_groups()
                 return
-            self._mark_refused(stream, error)
+            refusal = error
         except CommandTimeout:
             # If `request_again` was called meanwhile, it has reset the number of failures, and this failure is not
             # counted.
             if reset_count == self._reset_count:
                 stream.failures += 1
-                stream.next_attempt_at = self._connection.now() + min(2.0**stream.failures, MAX_RETRY_INTERVAL_S)
+                interval_s = min(2.0 ** min(stream.failures, MAX_BACKOFF_EXPONENT), MAX_RETRY_INTERVAL_S)
+                stream.next_attempt_at = self._connection.now() + interval_s
+            return
+        if reset_count != self._reset_count:
+            # `request_again` was called meanwhile. The answer may be from before a reboot, so the stream stays due.
             return
         # The vehicle has accepted or refused the rate. In both cases, nothing more is sent until another rate is
         # needed, or `request_again` or `watch` makes the stream due again.
+        if refusal is not None:
+            self._mark_refused(stream, refusal)
         stream.failures = 0
         stream.mark_requested(self._connection.now(), hz)
 
@@ -325,10 +343,10 @@ class MessageRates:
         window_s = WATCH_WINDOW * WATCH_PERIOD_S
         min_messages = SLOW_FACTOR * stream.requested_hz * window_s - 1
         received_messages = achieved_hz * window_s
-        was_slow = stream.is_slow
-        stream.is_slow = received_messages < min_messages
         if achieved_hz == 0 and stream.is_optional:  # An optional stream need not exist.
             return
+        was_slow = stream.is_slow
+        stream.is_slow = received_messages < min_messages
         if stream.is_slow and not was_slow:
             self._connection.bus.publish(
                 StreamSlow(

@@ -265,7 +265,8 @@ class VehicleSession:
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
         """Collect the acks that refuse a command during a `with` block.
 
-        PX4 acknowledges some commands twice, so that a refusal may follow an acceptance.
+        PX4 acknowledges some commands twice, so that a refusal may follow an acceptance. An acceptance, for example of
+        a repetition, cancels the refusals before it.
         """
         refusals: list[CommandAck] = []
 

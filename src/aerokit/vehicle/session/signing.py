@@ -41,6 +41,7 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
     texts = "; ".join(session.texts_since(started)) or "the vehicle sent no status text"
     if session.autopilot.signing_key_restriction:
         texts += f"; {session.autopilot.signing_key_restriction}"
+    # The repr of a key has its fingerprint, not the secret.
     expected = "without a signature" if signing is None else f"signed with {signing.key!r}"
     raise OperationTimeout(
         f"setup_signing: no frame {expected} arrived within {timeout:g} s; {texts}; {session.describe_link()}"

@@ -104,6 +104,8 @@ class ComponentSubscriber:
 
         All calls for a type return the same cell. A call with ``rate_hz`` replaces the rate of earlier calls.
         """
+        if rate_hz is not None:
+            check_rate(message_type, rate_hz)
         cell = self._cells.get(message_type)
         if cell is None:
             self._connection.check_types((message_type,))

@@ -117,13 +117,10 @@ class Transfers:
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
         """Raise :class:`OperationTimeout` if a `with` block takes more than ``timeout`` seconds. None: no limit."""
-        try:
-            with anyio.fail_after(timeout):
-                yield
-        except OperationTimeout:  # A subclass of TimeoutError, raised by the code in the block.
-            raise
-        except TimeoutError:
-            raise OperationTimeout(f"the operation was not done within {timeout:g} s; {self._describe()}") from None
+        with anyio.move_on_after(timeout) as scope:
+            yield
+        if scope.cancelled_caught:
+            raise OperationTimeout(f"the operation was not done within {timeout:g} s; {self._describe()}")
 
     def command_in_background(self, command: int, *params: float) -> None:
         """Send a command without waiting for its ack. The command is optional, so a failure is ignored."""

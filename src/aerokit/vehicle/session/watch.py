@@ -208,7 +208,7 @@ class VehicleWatch:
         now = self._now()
         milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
         # How far the vehicle's clock is behind its expected time. The result is too small if the earlier message was
-        # delayed.
+        # delayed, and too large if this message was: `EXPECTED_REBOOT_MIN_LAG_MS` allows for that.
         behind_ms = 1000 * (frame.received_at - read_at) - (milliseconds - milliseconds_before)
         if self._expects_reboot and behind_ms > EXPECTED_REBOOT_MIN_LAG_MS:
             self._on_reboot_detected(clock, milliseconds)
@@ -332,7 +332,7 @@ class LinkWatch:
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:
-        """Publish the link's quality since the last report."""
+        """Publish the link's quality since the last report, with the round trip that was measured last."""
         counts, before = self._count(), self._counts_before
         self._counts_before = counts
         seconds = max(counts.at - before.at, 1e-9)
