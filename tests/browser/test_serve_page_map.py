@@ -207,7 +207,7 @@ def tile_server() -> Iterator[tuple[str, list[str]]]:
             self.end_headers()
             self.wfile.write(b"\x89PNG\r\n\x1a\n" + pixel)
 
-        def log_message(self, *arguments: Any) -> None:
+        def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the name in the base class
             pass
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:

@@ -107,7 +107,12 @@ def _old(stage: Stage) -> None:
 
 
 def _clear_state(name: str) -> Callable[[Stage], None]:
-    return lambda stage: getattr(stage.vehicle.telemetry, name).forget()
+    def clear(stage: Stage) -> None:
+        cell = getattr(stage.vehicle.telemetry, name)
+        _ = cell.latest  # Reading the cell decodes what was already received. It would be decoded after `forget`.
+        cell.forget()
+
+    return clear
 
 
 def _actions() -> Table:

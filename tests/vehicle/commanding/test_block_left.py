@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import anyio
 import pytest
@@ -36,13 +37,15 @@ async def test_block_left_holds_although_callback_raises(caplog: pytest.LogCaptu
     def fail() -> None:
         raise ZeroDivisionError
 
+    flights: list[Any] = []
     with anyio.move_on_after(30) as scope:
         async with in_the_air() as flight:
+            flights.append(flight)
             flight.vehicle._context.on_finish.append(fail)
             scope.deadline = anyio.current_time() + 2
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(flight.vehicle.go_to, flight.vehicle.position.value.offset(north_m=500))
-    assert flight.wire.mode_orders() == [CopterMode.BRAKE]
+    assert flights[0].wire.mode_orders() == [CopterMode.BRAKE]
     assert "a callback at the end of the async with block of this vehicle failed" in caplog.text
 
 

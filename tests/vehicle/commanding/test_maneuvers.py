@@ -411,7 +411,7 @@ def test_followed_velocity_that_is_no_longer_received_is_ignored() -> None:
     clock = [0.0]
     position = StateCell[aerokit.Position]("position", lambda: clock[0], "GLOBAL_POSITION_INT")
     velocity = StateCell[Velocity]("velocity", lambda: clock[0], "GLOBAL_POSITION_INT")
-    leader = SimpleNamespace(telemetry=SimpleNamespace(position=position, velocity=velocity))
+    leader: Any = SimpleNamespace(telemetry=SimpleNamespace(position=position, velocity=velocity))
     target, source = FollowedTarget(leader, lambda: clock[0]), Source(1, 1, "GLOBAL_POSITION_INT")
     velocity.set(Velocity(5.0, 0.0, 0.0), source)
     velocities = []

@@ -99,8 +99,9 @@ class FollowedTarget:
         # `position.updated_at` is on the clock of the target's connection, which may differ from ours, so the time is
         # computed from the age of the position.
         received_at = self._now() - position.age
-        is_velocity_recent = velocity is not None and telemetry.velocity.age <= POSITION_MAX_AGE_S
-        speeds = (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s) if is_velocity_recent else ZERO
+        speeds = ZERO
+        if velocity is not None and telemetry.velocity.age <= POSITION_MAX_AGE_S:
+            speeds = (velocity.north_m_s, velocity.east_m_s, velocity.down_m_s)
         # The target's altitude is relative to its own home, which may be higher or lower than the follower's.
         place = position.latest.replace(altitude_relative_m=None)
         self.latest = TargetState(place, speeds, reported_at=received_at, first_reported_at=received_at)
