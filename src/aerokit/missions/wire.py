@@ -56,13 +56,16 @@ def to_wire_float(
     target_system: int,
     target_component: int,
     mission_type: int = 0,
-    current: bool = False,
+    current: int = 0,
+    place: tuple[float, float] | None = None,
 ) -> messages.MissionItem:
     """Convert an item to MISSION_ITEM, for vehicles without MISSION_ITEM_INT. Places are rounded to about a metre.
 
+    ``place`` becomes ``x`` and ``y``; None: the item's own, in degrees where they are a position.
+
     https://mavlink.io/en/messages/common.html#MISSION_ITEM
     """
-    x, y = in_degrees(item)
+    x, y = in_degrees(item) if place is None else place
     return messages.MissionItem(
         target_system=target_system,
         target_component=target_component,

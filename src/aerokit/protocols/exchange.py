@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Generic, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypedDict, TypeVar
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument
@@ -23,6 +23,7 @@ __all__ = [
     "TransferOptions",
     "TransferProgress",
     "format_ranges",
+    "is_addressed_to",
 ]
 
 ResultT = TypeVar("ResultT")
@@ -237,6 +238,11 @@ class TransferProgress(Snapshot):
 
 
 _MAX_RANGES = 10
+
+
+def is_addressed_to(message: Any, system_id: int, component_id: int) -> bool:
+    """Return True if a message with a target is for this component, or for all (0), as in old firmware."""
+    return message.target_system in (0, system_id) and message.target_component in (0, component_id)
 
 
 def format_ranges(numbers: Iterable[int]) -> str:

@@ -13,7 +13,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import FileError, FileTimeout, InvalidArgument
 from aerokit.mavlink.enums import MavFtpErr, MavFtpOpcode
 from aerokit.mavlink.messages import FileTransferProtocol
-from aerokit.protocols.exchange import Transfer, TransferOptions
+from aerokit.protocols.exchange import Transfer, TransferOptions, is_addressed_to
 
 if TYPE_CHECKING:
     from typing_extensions import Self, Unpack
@@ -260,8 +260,7 @@ class FtpClient:
 
     def is_for_us(self, message: FileTransferProtocol) -> bool:
         """Return True if the message is addressed to this client or to all."""
-        is_our_system = message.target_system in (0, self.source_system)
-        return is_our_system and message.target_component in (0, self.source_component)
+        return is_addressed_to(message, self.source_system, self.source_component)
 
 
 class FtpExchange(Transfer[ResultT]):

@@ -39,11 +39,9 @@ def item_message_float(
 ) -> m.MissionItem:
     """Create a MISSION_ITEM; ``place`` becomes ``x`` and ``y``."""
     system, component = to
-    x, y = place
-    return m.MissionItem(
-        target_system=system, target_component=component, seq=seq, frame=item.frame, command=item.command,
-        current=current, autocontinue=int(item.autocontinue), param1=item.param1, param2=item.param2,
-        param3=item.param3, param4=item.param4, x=x, y=y, z=item.z, mission_type=mission_type,
+    return to_wire_float(
+        item, seq, target_system=system, target_component=component, mission_type=mission_type, current=current,
+        place=place,
     )  # fmt: skip
 
 

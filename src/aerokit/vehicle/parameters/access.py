@@ -16,7 +16,7 @@ from aerokit.mavlink.messages import FileTransferProtocol, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import same_value
-from aerokit.protocols.exchange import RoundTrip
+from aerokit.protocols.exchange import RoundTrip, is_addressed_to
 from aerokit.vehicle.parameters.store import ParameterStore
 
 if TYPE_CHECKING:
@@ -141,8 +141,7 @@ class ParameterAccess:
         def on_message(message: FileTransferProtocol) -> None:
             nonlocal has_answer
             # The vehicle also answers other stations.
-            is_our_system = message.target_system in (0, connection.source_system)
-            has_answer |= is_our_system and message.target_component in (0, connection.source_component)
+            has_answer |= is_addressed_to(message, connection.source_system, connection.source_component)
 
         detach = connection.bus.attach(FileTransferProtocol, on_message, system_id=self._transfers.system_id)
         with anyio.CancelScope() as scope:

@@ -12,6 +12,7 @@ from aerokit.errors import CommandRejected, CommandTimeout, ConnectionClosed
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck
 from aerokit.protocols.command import CommandExchange, command_int, command_long, command_name
+from aerokit.protocols.exchange import is_addressed_to
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -157,8 +158,7 @@ class CommandSender:
 
     def is_for_us(self, ack: CommandAck) -> bool:
         """Return True if the ack is addressed to us, or has no target (0), as in MAVLink 1 and old firmware."""
-        is_for_our_system = ack.target_system in (0, self._connection.source_system)
-        return is_for_our_system and ack.target_component in (0, self._connection.source_component)
+        return is_addressed_to(ack, self._connection.source_system, self._connection.source_component)
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
         """Return the last MAV_RESULT received for this command, even if the call that sent it was cancelled."""

@@ -22,7 +22,7 @@
       wish = WISHES[(WISHES.indexOf(wish) + 1) % 3];
       try { localStorage.setItem(KEY, wish); } catch { /* storage is blocked */ }
       apply();
-      dispatchEvent(new Event("resize")); // redraws the canvases
+      dispatchEvent(new Event("resize")); // redraws the attitude
     };
     apply();
   });
