@@ -20,6 +20,7 @@ from aerokit.apps.cli import main
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.logs.convert import convert
 from aerokit.logs.convert.tables import CsvTable
+from aerokit.logs.flights.records import TableColumn
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -155,7 +156,8 @@ def test_folder_has_table_per_message_type(tmp_path: Path, kind: str) -> None:
 
 
 def test_csv_cells_of_rare_values(tmp_path: Path) -> None:
-    table = CsvTable(tmp_path / "values.csv", [])
+    columns = [TableColumn("time_utc", "", "time"), TableColumn("x", "x", "float"), TableColumn("y", "y", "float")]
+    table = CsvTable(tmp_path / "values.csv", columns)
     for values in ((None, 3), ("=1+1", 4), ("a\r\nb", math.nan)):
         table.add(0.0, values)
     for add in (table.add, table.add_numbers):
@@ -164,8 +166,23 @@ def test_csv_cells_of_rare_values(tmp_path: Path) -> None:
     table.close()
     time = "1970-01-01T00:00:00.000000+00:00"
     of_numbers = [f"{time},{row}" for row in ("1,inf", "inf,-inf", "2,", "-0.0,0.1")]
-    rows = ["", f"{time},,3", f"{time},'=1+1,4", f'{time},"a\r\nb",', *of_numbers, *of_numbers, ""]
+    rows = ["time_utc,x,y", f"{time},,3", f"{time},'=1+1,4", f'{time},"a\r\nb",', *of_numbers, *of_numbers, ""]
     assert (tmp_path / "values.csv").read_bytes().decode() == "\n".join(rows)
+
+
+@pytest.mark.parametrize(
+    ("unix_s", "expected"),
+    [
+        (1.7e9 + 0.25, "2023-11-14T22:13:20.250000"),
+        (0.9999996, "1970-01-01T00:00:01.000000"),
+        (-0.25, "1969-12-31T23:59:59.750000"),
+    ],
+)
+def test_csv_time_has_microseconds(tmp_path: Path, unix_s: float, expected: str) -> None:
+    table = CsvTable(tmp_path / "times.csv", [TableColumn("time_utc", "", "time")])
+    table.add(unix_s, ())
+    table.close()
+    assert (tmp_path / "times.csv").read_text().splitlines()[1] == f"{expected}+00:00"
 
 
 def test_integer_parameters_of_px4_are_written_as_numbers(tmp_path: Path) -> None:

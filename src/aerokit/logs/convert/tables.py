@@ -78,10 +78,11 @@ class CsvTable:
     def __init__(self, path: Path, columns: Sequence[TableColumn]) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._lines: list[str] = []
-        line_collector: Any = SimpleNamespace(write=self._lines.append)
+        line_collector: Any = SimpleNamespace(write=self._add_line)
         # The csv module quotes values with "\r" and "\n" only if the line terminator contains both.
         self._writer = csv.writer(line_collector, lineterminator="\r\n")
         self._writer.writerow([_csv_cell(column.name) for column in columns])
+        self._number_format = ",".join(["%s", *["%r"] * (len(columns) - 1)]) + "\n"
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
         """Add a row. The time is written as ISO 8601 in UTC with microseconds."""
@@ -93,11 +94,11 @@ class CsvTable:
 
     def add_numbers(self, unix_s: float, numbers: Sequence[float]) -> None:
         """Add a row of ints and floats. The result is that of :meth:`add`, in half of its time."""
-        total = sum(numbers)
-        if total != total:  # A number is NaN, which becomes an empty cell.
+        line = self._number_format % (_iso_time(unix_s), *numbers)
+        if "nan" in line:  # A number is NaN, which becomes an empty cell.
             self.add(unix_s, numbers)
             return
-        self._lines.append(f"{_iso_time(unix_s)},{','.join(map(repr, numbers))}\r\n")
+        self._lines.append(line)
         if len(self._lines) >= _LINES_PER_FLUSH:
             self._flush()
 
@@ -108,12 +109,11 @@ class CsvTable:
     def discard(self) -> None:
         self._file.close()
 
+    def _add_line(self, line: str) -> None:
+        self._lines.append(line.removesuffix("\r\n") + "\n")
+
     def _flush(self) -> None:
-        text = "".join(self._lines)
-        if text.count("\r\n") == len(self._lines):
-            self._file.write(text.replace("\r\n", "\n"))
-        else:  # A quoted text contains "\r\n", which must stay.
-            self._file.write("".join([line.removesuffix("\r\n") + "\n" for line in self._lines]))
+        self._file.write("".join(self._lines))
         self._lines.clear()
 
 
@@ -165,7 +165,7 @@ Table = CsvTable | ParquetTable
 _AddRow = Callable[[float, Sequence[Any]], None]
 """Adds a row to a table: its time, and the values of its other columns."""
 _MakeRow = Callable[["LogRecord"], Sequence[Any]]
-"""Returns the values of the columns for the fields of a record."""
+"""Returns the values of all columns but the time for a record."""
 
 
 class FlightTableWriter:
@@ -212,7 +212,7 @@ class MessageTablesWriter:
     def write(self, record: LogRecord) -> None:
         """Add a row to the table of a record."""
         add_row, make_row = self._converters.get(record.table) or self._open_table(record)
-        add_row(record.unix_s, (record.system_id, record.component_id, *make_row(record)))
+        add_row(record.unix_s, make_row(record))
         self.written += 1
 
     def _open_table(self, record: LogRecord) -> tuple[_AddRow, _MakeRow]:
@@ -240,11 +240,10 @@ class MessageTablesWriter:
 
 
 def _iso_time(unix_s: float) -> str:
-    fraction, second = math.modf(unix_s)
-    microseconds = round(fraction * 1e6)
-    if not 0 <= microseconds < 1_000_000:  # rare cases: before 1970, or rounded up to a full second
-        return datetime.fromtimestamp(unix_s, timezone.utc).isoformat(timespec="microseconds")
-    return f"{_iso_second(second)}.{microseconds:06}+00:00"
+    microseconds = round(unix_s % 1 * 1e6)
+    if microseconds == 1_000_000:  # rounded up to a full second
+        return f"{_iso_second(unix_s // 1 + 1)}.000000+00:00"
+    return f"{_iso_second(unix_s // 1)}.{microseconds:06}+00:00"
 
 
 @lru_cache(maxsize=1)
@@ -256,14 +255,18 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
     """Return a function that converts records of the same type as ``record`` to table rows."""
     if record.message is None:
         names = [column.field for column in columns]
-        return lambda record: [_cell(record.fields.get(name)) for name in names]
+        return lambda record: [
+            record.system_id,
+            record.component_id,
+            *[_cell(record.fields.get(name)) for name in names],
+        ]
     parts = [column.field.partition(".") for column in columns]
     # NAME is a second name even if there is only one column. For a single name, attrgetter would not return a tuple.
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
     text_positions = [position for position, column in enumerate(columns) if column.kind == "str"]
     if not array_elements and not text_positions:
-        return lambda record: get_fields(record.message)[1:]
+        return lambda record: record[1:3] + get_fields(record.message)[1:]
 
     def make_row(record: LogRecord) -> list[Any]:
         _, *values = get_fields(record.message)
@@ -271,7 +274,7 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
             values[position] = values[position][index]
         for position in text_positions:
             values[position] = _cell(values[position])
-        return values
+        return [*record[1:3], *values]
 
     return make_row
 

@@ -117,9 +117,7 @@ class TlogReader(LogReader):
                         message = self._decode_parameter(message, system_id)
                     if self.needs_states:
                         states = self._states(system_id, component_id, unix_s, message)
-                    yield LogRecord(
-                        unix_s, system_id, component_id, message.NAME, fields=_NO_FIELDS, states=states, message=message
-                    )
+                    yield LogRecord(unix_s, system_id, component_id, message.NAME, _NO_FIELDS, states, message)
             on_bytes(file.tell())
         self._check_and_note(count)
 
