@@ -364,7 +364,7 @@ class OnboardComponent:
     def add_winch(self, winch: WinchDriver) -> None:
         """Serve DO_WINCH by your subclass of :class:`~aerokit.onboard.WinchDriver`, and send WINCH_STATUS at 5 Hz.
 
-        Commands for another instance than 1 or the component id are DENIED.
+        Commands for other instances than 0 (all), 1 and the component id are DENIED.
 
         Raises:
             InvalidArgument: the component already has a winch.
@@ -376,7 +376,7 @@ class OnboardComponent:
     def add_gripper(self, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]) -> None:
         """Serve DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
 
-        Commands for another instance than 1 or the component id are DENIED.
+        Commands for other instances than 0 (all), 1 and the component id are DENIED.
 
         Raises:
             InvalidArgument: the component already has a gripper.
