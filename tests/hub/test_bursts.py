@@ -379,7 +379,7 @@ def test_plans_of_a_burst_equal_plans_of_single_frames(seed: int) -> None:
 def test_plans_follow_a_removed_port_within_a_burst() -> None:
     router: Router[str] = Router(TARGETS, lambda port, number: 0.0)
     nodes = {name: router.add(name) for name in "abc"}
-    router.on_vehicle = lambda port: router.remove(nodes["c"])
+    router.on_autopilot = lambda port: router.remove(nodes["c"])
     encoder = FrameEncoder(1, 1)
     frames = [Frame.parse(encoder.encode(message)) for message in (*telemetry(2), COPTER, *telemetry(2))]
     plans = router.route_all(nodes["a"], frames, 1.0, [])

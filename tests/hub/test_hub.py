@@ -294,6 +294,27 @@ async def test_slow_link_gets_newest_telemetry_and_whole_transfer() -> None:
         assert of(hub, "slow").waiting == 0
 
 
+class BreakingLink(SlowLink):
+    """A link that is lost by a write."""
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        self.receiver.link_lost(LinkLost("broken"))
+
+
+@virtual
+async def test_link_lost_by_a_write_does_not_stop_other_queues() -> None:
+    copter, breaking, slow = Program(1, 1), BreakingLink("breaking:1"), SlowLink()
+    async with copter, Hub([copter.endpoint("a"), Endpoint(breaking, name="b"), Endpoint(slow, name="c")]):
+        breaking.unsent = slow.unsent = 1 << 20
+        copter.send(ATTITUDE)
+        await settle()
+        breaking.unsent = 0
+        await anyio.sleep(1)
+        slow.unsent = 0
+        await anyio.sleep(1)
+        assert slow.names() == ["ATTITUDE"]
+
+
 @virtual
 async def test_late_order_is_dropped_and_reported() -> None:
     async with with_slow_link() as (hub, slow, _, station, events):
@@ -553,6 +574,45 @@ async def test_removed_endpoint_with_retry_open_is_not_opened(monkeypatch: pytes
         assert hub.endpoints == ()
 
 
+class LateLink(SlowLink):
+    """A link that opens when a test allows it."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(address)
+        self.may_open = asyncio.Event()
+
+    async def open(self, receiver: Any) -> None:
+        await self.may_open.wait()
+        await super().open(receiver)
+
+
+@virtual
+async def test_endpoint_removed_while_it_opens_is_closed_again() -> None:
+    link, other = LateLink("late:1"), SlowLink("other:1")
+    async with Hub() as hub:
+        adding = asyncio.create_task(hub.add(Endpoint(link, name="b")))
+        await settle()
+        await hub.remove("b")
+        await hub.add(Endpoint(other, name="b"))
+        link.may_open.set()
+        with pytest.raises(ConnectionClosed, match="b was removed while it was being opened"):
+            await adding
+        assert link.receiver is None
+        assert [endpoint.address for endpoint in hub.endpoints] == ["other:1"]
+
+
+@virtual
+async def test_endpoint_opened_after_the_hub_has_closed_is_closed_again() -> None:
+    link = LateLink("late:1")
+    async with Hub() as hub:
+        adding = asyncio.create_task(hub.add(link))
+        await settle()
+    link.may_open.set()
+    with pytest.raises(ConnectionClosed):
+        await adding
+    assert link.receiver is None
+
+
 class Broadcast(SlowLink):
     """A link with a single peer that has an address, like `UdpBroadcast`."""
 
@@ -698,6 +758,7 @@ async def test_recording_has_every_frame_once(tmp_path: Path) -> None:
         copter.send(COPTER, ATTITUDE)
         station.send(STATION, ORDER, SetupSigning(1, 1, bytes(range(32)), 7))
         onlooker.send(STATION)
+        station.send(ParamRequestList(77, 1))  # There is no such system.
         station.link.write(copter.encoder.encode(COPTER))
         await anyio.sleep(1.5)
         copter.encoder.sequence -= 1
@@ -705,7 +766,7 @@ async def test_recording_has_every_frame_once(tmp_path: Path) -> None:
         await settle()
         assert of(hub, "a").dropped == {"duplicate": 1}
         assert path.stat().st_size > 0, "the file is flushed periodically"
-    assert [raw[7] for _, raw in read_tlog(path)] == [0, 30, 0, 76, 0]
+    assert [raw[7] for _, raw in read_tlog(path)] == [0, 30, 0, 76, 0], "only forwarded frames"
 
 
 @virtual

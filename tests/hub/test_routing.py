@@ -206,7 +206,7 @@ def test_ports_filter_messages(stage: Stage) -> None:
 
 def test_vehicle_is_reported_once_per_port(stage: Stage) -> None:
     events: list[str] = []
-    stage.router.on_vehicle = events.append
+    stage.router.on_autopilot = events.append
     for _ in range(3):
         stage.receive("a", COPTER)
         stage.receive("b", STATION, 255, 190)

@@ -160,13 +160,17 @@ class Stage:
 
 
 @asynccontextmanager
-async def stage(signing: Signing | None = None, vehicle: Program | None = None) -> AsyncIterator[Stage]:
+async def stage(
+    signing: Signing | None = None, vehicle: Program | None = None, ids: tuple[int, int] = (255, 190)
+) -> AsyncIterator[Stage]:
     vehicle, station = vehicle or Program(1, 1), Program(250, 190)
     assert vehicle.near is not None
     async with (
         vehicle,
         station,
-        aerokit.open_connection(vehicle.near, signing=signing) as connection,
+        aerokit.open_connection(
+            vehicle.near, signing=signing, source_system=ids[0], source_component=ids[1]
+        ) as connection,
         shared(connection, [station.endpoint("station")]) as hub,
     ):
         vehicle.send(COPTER)
@@ -206,6 +210,16 @@ def test_vehicle_receives_station_frames_once() -> None:
         assert on.station.frames == []
 
     on_stage(play)
+
+
+def test_vehicle_with_the_system_id_of_the_program_gets_station_frames() -> None:
+    async def play(on: Stage) -> None:
+        on.vehicle.frames.clear()
+        on.station.send(STATION, ORDER, ParamRequestList(1, 0), ParamRequestList(1, 191))
+        await settle()
+        assert on.vehicle.received == ["HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_LIST"]
+
+    on_stage(play, ids=(1, 191))
 
 
 def test_answers_go_to_their_target() -> None:

@@ -13,6 +13,7 @@ from aerokit.errors import BusyError, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState, MavType
 from aerokit.onboard import Identity
+from aerokit.onboard.events import MAX_STORED_EVENTS
 from aerokit.transport import memory_link_pair
 
 pytestmark = pytest.mark.anyio
@@ -60,6 +61,14 @@ async def test_version_and_information_are_served() -> None:
     assert ack.result == MavResult.DENIED
 
 
+@pytest.mark.parametrize(
+    "fields", [{"version": "1.2.3.4.5"}, {"version": "1.2.3.4.rc1"}, {"version": "1.256"}, {"serial_number": 33 * "7"}]
+)
+def test_identity_that_does_not_fit_is_refused(fields: dict[str, str]) -> None:
+    with pytest.raises(InvalidArgument, match="is not allowed"):
+        Identity(**fields)  # type: ignore[arg-type]
+
+
 async def test_message_is_streamed_at_requested_interval() -> None:
     async with payload_and_station() as (payload, station):
 
@@ -93,6 +102,17 @@ async def test_lost_event_is_sent_again_on_request() -> None:
         error = await station.ask(m.RequestEvent(*station.target, 9, 9), m.ResponseEventError)
     assert (event.sequence, event.arguments[0]) == (1, 1)
     assert (error.sequence, error.sequence_oldest_available) == (9, 0)
+
+
+async def test_stored_events_of_a_longer_range_are_sent_again() -> None:
+    async with payload_and_station() as (payload, station):
+        for number in range(100):
+            payload.send_event(191 << 24 | number)
+        await asyncio.sleep(0.1)
+        with station.collecting(m.Event, m.ResponseEventError) as answers:
+            station.connection.send(m.RequestEvent(*station.target, 0, 99))
+            await asyncio.sleep(1.0)
+    assert [answer.sequence for answer in answers] == list(range(100 - MAX_STORED_EVENTS, 100))
 
 
 async def test_ping_and_timesync_are_answered() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import math
+from enum import Enum
+from functools import partial
 from typing import Annotated
 
 import pytest
@@ -297,3 +299,63 @@ async def test_handler_without_annotation_is_refused() -> None:
             @payload.command(MavCmd.USER_1)
             async def drop(_: CommandRequest, height_m) -> None:  # type: ignore[no-untyped-def]
                 pass
+
+
+async def test_handler_may_use_variables_that_are_assigned_later() -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest, count: int) -> None:
+            assert drop is not None  # `drop` has no value yet while it is being registered.
+            calls.append(count)
+
+        calls: list[int] = []
+        await station.command(MavCmd.USER_1, 3)
+    assert calls == [3]
+
+
+async def test_handler_that_is_no_function_is_refused() -> None:
+    def drop(unit: str, _: CommandRequest, height_m: float) -> None:
+        pass
+
+    async with payload_and_station() as (payload, _):
+        with pytest.raises(InvalidArgument, match="must be a function"):
+            payload.command(MavCmd.USER_1)(partial(drop, "m"))
+
+
+async def test_optional_argument_may_have_a_range() -> None:
+    calls: list[float | None] = []
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest, height_m: Height | None) -> None:
+            calls.append(height_m)
+
+        results = [(await station.command(MavCmd.USER_1, height)).result for height in (math.nan, 5.0, 51.0)]
+    assert calls == [None, 5.0]
+    assert results == [MavResult.ACCEPTED, MavResult.ACCEPTED, MavResult.DENIED]
+
+
+class Unit(Enum):
+    METRES = "m"
+
+
+async def test_argument_that_is_an_enum_of_texts_is_refused() -> None:
+    async with payload_and_station() as (payload, _):
+        with pytest.raises(InvalidArgument, match="enum of integers"):
+
+            @payload.command(MavCmd.USER_1)
+            async def drop(_: CommandRequest, unit: Unit) -> None:
+                pass
+
+
+async def test_text_of_denied_command_has_all_digits() -> None:
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest, count: int) -> None:
+            pass
+
+        with station.collecting(m.Statustext) as texts:
+            await station.command(MavCmd.USER_1, 1000000.5)
+    assert texts[0].text.startswith("drop: count = 1000000.5 is not allowed")

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
 from onboard_peers import autopilot_and_client, device_and_client, payload_and_station
 
+from aerokit._internal.files import write_atomically
 from aerokit.errors import AerokitError, FileError, InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavParamError, MavParamExtType, MavType, ParamAck
+from aerokit.mavlink.enums import MavCmd, MavParamError, MavParamExtType, MavType, ParamAck
 from aerokit.missions import Mission, MissionItem, waypoint
+from aerokit.onboard import CommandRequest
 from aerokit.position import Position
 
 pytestmark = pytest.mark.anyio
@@ -106,6 +110,69 @@ async def test_parameters_survive_in_file(tmp_path: Path) -> None:
     async with payload_and_station(parameters_file=path) as (payload, _):
         payload.parameters.add("SPEED", 1.0)
         assert payload.parameters["SPEED"] == 2.5
+
+
+async def test_failed_write_of_parameters_is_repeated_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "payload.json"
+    failures = [OSError(28, "No space left on device")]
+
+    def write(*arguments: Any) -> None:
+        if failures:
+            raise failures.pop()
+        write_atomically(*arguments)
+
+    monkeypatch.setattr("aerokit.onboard.parameters.write_atomically", write)
+    async with payload_and_station(parameters_file=path) as (payload, station):
+        payload.parameters.add("SPEED", 1.0)
+        text = await station.ask(m.ParamSet(*station.target, "SPEED", 2.5, 9), m.Statustext)
+    assert text.text.startswith("parameters could not be saved: No space")
+    assert json.loads(path.read_text()) == {"SPEED": 2.5}
+
+
+async def test_cancelled_program_saves_its_parameters(tmp_path: Path) -> None:
+    path = tmp_path / "payload.json"
+    is_closing = asyncio.Event()
+
+    async def program() -> None:
+        async with payload_and_station(parameters_file=path) as (payload, station):
+            payload.parameters.add("SPEED", 1.0)
+
+            @payload.command(MavCmd.USER_1)
+            async def clean_up(_: CommandRequest) -> None:
+                try:
+                    await asyncio.sleep(60.0)
+                finally:
+                    is_closing.set()
+                    await asyncio.sleep(1.0)
+                    payload.parameters.set("SPEED", 2.5)
+
+            await station.command(MavCmd.USER_1)
+
+    task = asyncio.create_task(program())
+    await is_closing.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert json.loads(path.read_text()) == {"SPEED": 2.5}
+
+
+async def test_on_set_that_is_a_coroutine_function_is_refused() -> None:
+    async def check(value: float) -> None:
+        pass
+
+    async with payload_and_station() as (payload, _):
+        with pytest.raises(InvalidArgument, match="plain function"):
+            payload.parameters.add("SPEED", 1.0, on_set=check)
+        with pytest.raises(InvalidArgument, match="plain function"):
+            payload.missions.on_set_current(check)
+
+
+async def test_text_of_refused_value_has_all_digits() -> None:
+    async with payload_and_station() as (payload, _):
+        with pytest.raises(InvalidArgument, match="ID = 12345678 is not allowed"):
+            payload.parameters.add("ID", 12345678, values={12345679: "left"})
 
 
 async def test_metadata_describes_parameters() -> None:

@@ -11,7 +11,18 @@ from onboard_peers import autopilot_and_client, device_and_client, payload_and_s
 
 from aerokit.errors import AerokitError, BusyError, CommandRejected, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavArmAuthDeniedReason, MavCmd, MavModeFlag, MavResult, MavType, MavWinchStatusFlag
+from aerokit.mavlink.enums import (
+    CameraZoomType,
+    MavArmAuthDeniedReason,
+    MavCmd,
+    MavFrame,
+    MavModeFlag,
+    MavResult,
+    MavState,
+    MavType,
+    MavWinchStatusFlag,
+    WinchActions,
+)
 from aerokit.onboard import (
     AutopilotDriver,
     CameraDriver,
@@ -107,6 +118,25 @@ async def test_video_zoom_tracking_and_storage_call_the_program() -> None:
     assert eye.calls == ["start", "stop", 3]
     assert eye.zoom_percent == 30.0
     assert (storage.total_mib, storage.available_mib) == (1000.0, 990.0)
+
+
+@pytest.mark.parametrize("steps", [math.nan, math.inf])
+async def test_zoom_step_without_number_is_not_executed(steps: float) -> None:
+    eye = Eye()
+    async with payload_and_station(component_id=100, type=MavType.CAMERA) as (component, station):
+        component.add_camera(eye)
+        ack = await station.command(MavCmd.SET_CAMERA_ZOOM, CameraZoomType.STEP, steps)
+    assert (ack.result, eye.zoom_percent) == (MavResult.DENIED, 0.0)
+
+
+async def test_ready_made_part_does_not_replace_handler_of_program() -> None:
+    async with payload_and_station() as (component, _):
+        for command in (MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, MavCmd.IMAGE_START_CAPTURE):
+            component.command(command)(lambda request: None)
+        with pytest.raises(InvalidArgument, match="PITCHYAW already has a handler"):
+            component.add_gimbal(Head())
+        with pytest.raises(InvalidArgument, match="IMAGE_START_CAPTURE already has a handler"):
+            component.add_camera(Eye())
 
 
 async def test_call_without_method_is_not_supported() -> None:
@@ -247,6 +277,47 @@ async def test_autopilot_executes_commands_and_reports_them_in_heartbeat() -> No
     assert raised.value.result == MavResult.UNSUPPORTED
 
 
+@pytest.mark.parametrize(
+    ("frame", "altitude_m", "calls"),
+    [
+        (MavFrame.GLOBAL_RELATIVE_ALT, 12.5, [12.5]),
+        (MavFrame.GLOBAL, math.nan, [None]),
+        (MavFrame.GLOBAL, 488.0, []),
+        (MavFrame.GLOBAL_RELATIVE_ALT, math.inf, []),
+    ],
+)
+async def test_take_off_is_executed_only_with_altitude_above_home(
+    frame: int, altitude_m: float, calls: list[float | None]
+) -> None:
+    model = Model()
+    async with payload_and_station(component_id=1) as (node, station):
+        node.add_autopilot(model)
+        command = m.CommandInt(*station.target, frame, MavCmd.NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 0, 0, altitude_m)
+        ack = await station.ask(command, m.CommandAck)
+    assert model.calls == calls
+    assert ack.result == (MavResult.ACCEPTED if calls else MavResult.DENIED)
+
+
+async def test_base_mode_without_custom_mode_is_denied() -> None:
+    model = Model()
+    async with payload_and_station(component_id=1) as (node, station):
+        node.add_autopilot(model)
+        ack = await station.command(MavCmd.DO_SET_MODE, MavModeFlag.GUIDED_ENABLED, 0)
+    assert (ack.result, model.calls) == (MavResult.DENIED, [])
+
+
+async def test_set_state_keeps_armed_and_mode() -> None:
+    async with payload_and_station(component_id=1) as (node, station):
+        node.add_autopilot(Model())
+        await station.command(MavCmd.COMPONENT_ARM_DISARM, 1, 21196)
+        await station.command(MavCmd.DO_SET_MODE, MavModeFlag.CUSTOM_MODE_ENABLED, 7)
+        with station.connection.subscribe(m.Heartbeat) as beats:
+            node.set_state(MavState.CRITICAL)
+            beat = await beats.get(5.0)
+    assert (beat.system_status, beat.custom_mode) == (MavState.CRITICAL, 7)
+    assert beat.base_mode & MavModeFlag.SAFETY_ARMED
+
+
 @pytest.mark.parametrize(("value", "is_forced"), [(0, False), (2989, False), (21196, True)])
 async def test_only_standard_value_forces_disarming(value: int, is_forced: bool) -> None:
     """2989 is ArduPilot's value for arming: a disarm with it must not stop the motors in flight."""
@@ -276,6 +347,25 @@ async def test_gripper_grabs_and_releases() -> None:
         results = [(await station.command(MavCmd.DO_GRIPPER, 1, action)).result for action in (1, 0, 7)]
     assert moves == ["grab", "release"]
     assert results == [MavResult.ACCEPTED, MavResult.ACCEPTED, MavResult.DENIED]
+
+
+@pytest.mark.parametrize(("instance", "moves"), [(0, 1), (1, 1), (math.nan, 1), (191, 1), (2, 0)])
+async def test_gripper_and_winch_ignore_commands_for_another_instance(instance: float, moves: int) -> None:
+    """A command to all components also arrives at the components with the other grippers."""
+    spool, released = Spool(), []
+
+    async def release() -> None:
+        released.append("release")
+
+    async with payload_and_station() as (component, station):
+        component.add_gripper(release, release)
+        component.add_winch(spool)
+        for command, *params in ((MavCmd.DO_GRIPPER, 0), (MavCmd.DO_WINCH, WinchActions.RELATIVE_LENGTH_CONTROL, 4, 1)):
+            numbers = (*params, *(0.0,) * 6)[:6]
+            await station.ask(m.CommandLong(1, 0, command, 0, instance, *numbers), m.CommandAck)
+            await asyncio.sleep(10.0)
+    assert len(released) == moves
+    assert spool.length_m == 4.0 * moves
 
 
 @pytest.mark.parametrize(

@@ -240,7 +240,7 @@ class Attachment:
             guard=None if self._is_single else self._guard,
             is_read_only=self.endpoint.read_only,
         )
-        self._guard.is_shared = len(self._ports) > 1
+        self._guard.has_several_peers = len(self._ports) > 1
         self._switch.add(port)
         return port
 
@@ -261,7 +261,7 @@ class Attachment:
             self._totals_of_forgotten_peers = self._totals_of_forgotten_peers.plus(framer)
         self._guard.forget(peer)
         port = self._ports.pop(peer, None)
-        self._guard.is_shared = len(self._ports) > 1
+        self._guard.has_several_peers = len(self._ports) > 1
         if port is not None:
             self._switch.remove(port)
 

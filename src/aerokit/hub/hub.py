@@ -63,7 +63,8 @@ class Hub:
 
         Args:
             endpoints: connection strings, unopened links, or `Endpoint` with filters.
-            dialect: known messages; unknown messages are forwarded to all endpoints, unchecked.
+            dialect: known messages. Unknown messages of known senders are forwarded, unchecked, to all endpoints
+                without ``only``.
 
         Raises:
             InvalidArgument: an address or a message name is wrong, or two endpoints have the same name.
@@ -124,7 +125,7 @@ class Hub:
             LinkOpenError: the endpoint could not be opened and has no ``retry_open``.
             InvalidArgument: the address, the name or a message name is wrong; nothing was opened.
             BusyError: the given link is in use.
-            ConnectionClosed: the hub or the given link is closed.
+            ConnectionClosed: the hub or the given link is closed, or the endpoint was removed meanwhile.
         """
         self._raise_unless_open()
         return (await self._add(_as_endpoint(endpoint))).statistics()
@@ -204,30 +205,36 @@ class Hub:
         self._attachments[attachment.name] = attachment
         try:
             await attachment.open()
-        except LinkError as error:
-            if not endpoint.retry_open:
-                del self._attachments[attachment.name]
+        except BaseException as error:  # A cancellation of the call, too.
+            if not (endpoint.retry_open and isinstance(error, LinkError)):
+                if self._has(attachment):
+                    del self._attachments[attachment.name]
                 raise
             self._report(attachment, "lost", f"{error}; it is retried until it can be opened")
             self._background.start(lambda: self._retry_opening(attachment), "aerokit hub opening")
-        except BaseException:  # The call was cancelled, or the given link object cannot be opened.
-            self._attachments.pop(attachment.name, None)
-            raise
+        if not self._has(attachment):
+            attachment.close()
+            await _wait_until_closed([attachment])
+            raise ConnectionClosed(f"{attachment.name} was removed while it was being opened")
         return attachment
+
+    def _has(self, attachment: Attachment) -> bool:
+        """Return False if the endpoint was removed, or if the hub was closed."""
+        return self._attachments.get(attachment.name) is attachment
 
     async def _retry_opening(self, attachment: Attachment) -> None:
         """Try to open an endpoint until it is open or removed, with increasing delays."""
         backoff = Backoff()
-        while self._attachments.get(attachment.name) is attachment:
+        while self._has(attachment):
             await anyio.sleep(backoff.next_delay())
-            if self._attachments.get(attachment.name) is not attachment:  # The endpoint was removed meanwhile.
+            if not self._has(attachment):  # The endpoint was removed meanwhile.
                 return
             try:
                 await attachment.open()
             except LinkError as error:
                 logger.debug("the link still cannot be opened: %s", error)
             else:
-                if self._attachments.get(attachment.name) is not attachment:  # The endpoint was removed meanwhile.
+                if not self._has(attachment):  # The endpoint was removed meanwhile.
                     attachment.close()
                 return
 

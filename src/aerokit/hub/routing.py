@@ -130,7 +130,7 @@ class Router(Generic[PortT]):
         self._duplicate: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="duplicate")
         self._loop: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="loop")
         self._unknown: ForwardingPlan[PortT] = ForwardingPlan(0, -1, (0, 0), reason="unknown")
-        self.on_vehicle: Callable[[PortT], object] | None = None
+        self.on_autopilot: Callable[[PortT], object] | None = None
         """Called when an autopilot is received at a port for the first time."""
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
         """Called with the kind of event, the sender, the port of the frame, and another port of this sender.
@@ -224,6 +224,8 @@ class Router(Generic[PortT]):
             return self._duplicate
         elif self._is_echo(earlier, number, now):
             first_port, port_count, _ = earlier
+            # Too late for a copy: it returns in a slow loop, or it is equal by chance, as the first command of a
+            # restarted program may be. It is forwarded until several frames prove a loop.
             if self._is_loop(node, source, first_port, now):
                 return self._loop
             recent.newer[identity] = first_port, port_count, now
@@ -334,8 +336,8 @@ class Router(Generic[PortT]):
         if sender.is_autopilot and node.number not in sender.reported:
             sender.reported.add(node.number)
             self.forget_plans()
-            if self.on_vehicle is not None:
-                self.on_vehicle(node.port)
+            if self.on_autopilot is not None:
+                self.on_autopilot(node.port)
             if sender.port_number != node.number:  # The autopilot was received at another port before.
                 self._report("duplicate_sender", sender.source, node, sender.port_number)
 

@@ -154,7 +154,7 @@ class IdentityGuard:
     """
 
     def __init__(self, link: Link, report: Callable[[HubEventKind, Peer, str], object]) -> None:
-        self.is_shared = False
+        self.has_several_peers = False
         """True if the endpoint has several peers. With one peer, only heartbeats are checked."""
         self._routes = Routes(link, self._publish)
         self._report = report
@@ -164,7 +164,10 @@ class IdentityGuard:
         self._current_peer: Peer = None  # sender of the frame that is being checked
 
     def admits(self, frame: Frame, framer: Framer, peer: Peer) -> bool:
-        """Return True if this peer may send this frame. Call it for heartbeats; if `is_shared`, for every frame."""
+        """Return True if this peer may send this frame.
+
+        Call it for heartbeats, and for every frame if there are several peers.
+        """
         if self._routes.arrived_on_other_peer(frame, peer):
             self._current_peer = peer
             if not self._routes.claims_route(frame, peer, framer.counters_of(frame), is_signed=False):

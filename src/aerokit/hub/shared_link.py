@@ -31,6 +31,7 @@ class SharedLink(Link):
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+        self._ids = connection.source_system, connection.source_component
         self._targets = TargetFields(connection.bus.dialect)
         self._receiver: Receiver | None = None  # None while the link is not open
         self._detachments: list[Callable[[], None]] = []  # functions that end the observation of the connection
@@ -60,8 +61,8 @@ class SharedLink(Link):
             frame = Frame.parse(raw)
             if not self._is_duplicate_reported:
                 self._check_ids(frame)
-            target_system, _ = self._targets.target_of(frame)
-            if target_system == self._connection.source_system:  # The frame is for this program.
+            # A vehicle may have the same system id as this program, if the program runs on its companion computer.
+            if self._targets.target_of(frame) == self._ids:  # The frame is for this program.
                 continue
             try:
                 gateway = self._current_gateway()
@@ -91,15 +92,14 @@ class SharedLink(Link):
 
     def _check_ids(self, frame: Frame) -> None:
         """Report a frame of another station with our ids. Both stations would process each other's answers."""
-        ours = self._connection.source_system, self._connection.source_component
-        if (frame.system_id, frame.component_id) == ours:
+        if (frame.system_id, frame.component_id) == self._ids:
             self._is_duplicate_reported = True
             logger.warning(
                 "another station on the shared link uses the same ids %d/%d as this program, so both process each"
                 " other's answers; give this program other ids (source_system=, source_component=)",
-                *ours,
+                *self._ids,
             )
-            self._connection.bus.publish(DuplicateSender(self._connection.now(), *ours))
+            self._connection.bus.publish(DuplicateSender(self._connection.now(), *self._ids))
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         """Pass a received frame of the connection to the hub, without its signature."""

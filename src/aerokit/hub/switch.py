@@ -52,7 +52,7 @@ class Switch:
         self._unix_epoch_s = time.time() - self._clock()  # seconds since 1970 at loop time 0
         self._targets = TargetFields(dialect)
         self.router: Router[Port] = Router(self._targets, period)
-        self.router.on_vehicle = _write_single_frames
+        self.router.on_autopilot = _write_single_frames
         self._on_error = on_error
         self._loop_watch = LoopWatch(
             on_blocked=lambda _: None,
@@ -70,7 +70,10 @@ class Switch:
         self._poll_interval_s = MIN_POLL_INTERVAL_S
 
     def unix_time(self) -> float:
-        """Return seconds since 1970: the system time at the start, advanced by the loop's clock."""
+        """Return seconds since 1970: the system time at the start, advanced by the loop's clock. It never jumps.
+
+        `Signing` uses the newest received stamp if this time is older, so a late correction of the clock is not needed.
+        """
         return self._unix_epoch_s + self._clock()
 
     def add(self, port: Port) -> None:
@@ -120,7 +123,7 @@ class Switch:
         """
         # Hot path: local variables are faster than attributes.
         node, guard, peer = port.node, port.guard, port.peer
-        if node is None or port.is_read_only:
+        if node is None or port.is_read_only:  # `node` is None if the port was removed.
             if guard is not None:  # The guard still records the ids that each peer uses.
                 for frame in frames:
                     guard.admits(frame, framer, peer)
@@ -129,7 +132,7 @@ class Switch:
         late = framer.late
         must_check = port.gateway is not None
         if guard is not None and not must_check:
-            must_check = guard.is_shared or _HEARTBEAT_ID in map(_message_id, frames)
+            must_check = guard.has_several_peers or _HEARTBEAT_ID in map(_message_id, frames)
         if must_check:
             received_count = len(frames)
             frames, late = self._admitted(port, framer, frames)
@@ -173,7 +176,7 @@ class Switch:
             if frame is None:
                 continue
             # The guard must see every heartbeat. If there is only one peer, its other frames need no check.
-            must_check = guard is not None and (guard.is_shared or frame.message_id == _HEARTBEAT_ID)
+            must_check = guard is not None and (guard.has_several_peers or frame.message_id == _HEARTBEAT_ID)
             if guard is not None and must_check and not guard.admits(frame, framer, peer):
                 port.counters.dropped["foreign"] += 1
                 continue
@@ -222,7 +225,7 @@ class Switch:
             self._forward_limited(raw, plan, now)
         elif plan.reason:
             port.counters.dropped[plan.reason] += 1
-        if self.recording is not None and plan.reason != "duplicate":
+        if self.recording is not None and not plan.reason:
             self.recording.write(raw, now)
 
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
@@ -263,7 +266,7 @@ class Switch:
             if port.counters.frames_out > frames_out_before:
                 self._poll_interval_s = MIN_POLL_INTERVAL_S
             if not port.has_queued_frames:
-                del self._queueing_ports[port]
+                self._queueing_ports.pop(port, None)  # The port may have been removed because a write failed.
         if self._queueing_ports:
             self._timer = self._loop.call_later(self._poll_interval_s, self._poll)
 

@@ -89,12 +89,12 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
             values: maps each allowed number to its name; other numbers are refused.
             read_only: True if only this program can change it.
             reboot_required: True if a change takes effect only after a reboot; reported in the metadata.
-            on_set: called on the event loop with a value that another program sets, before the value is stored. To
-                refuse the value, this function raises InvalidArgument.
+            on_set: plain function, called on the event loop with a value that another program sets, before the value is
+                stored. To refuse the value, this function raises InvalidArgument.
 
         Raises:
-            InvalidArgument: the name is invalid or in use, the default is not allowed, or the component already has
-                1000 parameters.
+            InvalidArgument: the name is invalid or in use, the default or ``on_set`` is not allowed, or the component
+                already has 1000 parameters.
         """
         self._loop.call(
             self.aio.add,
@@ -132,7 +132,7 @@ class ComponentParameters(TwinOf["AsyncComponentParameters"]):
         return self.aio.__len__()
 
     def aclose(self) -> None:
-        """Wait until the file contains the last change."""
+        """Wait until the file contains the last change. A failed write is tried once more."""
         self._loop.run(self.aio.aclose)
 
     def json(self) -> bytes:
@@ -175,6 +175,9 @@ class ComponentMissions(TwinOf["AsyncComponentMissions"]):
 
         A request to change the current item is refused if the function returns False or raises an exception. Without a
         function, all requests are refused.
+
+        Raises:
+            InvalidArgument: the function is a coroutine function.
         """
         return self._loop.call(self.aio.on_set_current, function)
 
@@ -345,13 +348,13 @@ class OnboardComponent(ComponentTwin):
         """Milliseconds since the component started, for the field ``time_boot_ms`` of messages."""
         return self.aio.time_boot_ms
 
-    def set_state(self, state: int, *, base_mode: int = 0, custom_mode: int = 0) -> None:
+    def set_state(self, state: int, *, base_mode: int | None = None, custom_mode: int | None = None) -> None:
         """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
             state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
-            base_mode: MAV_MODE_FLAG.
-            custom_mode: mode number of this component, 0 to 4294967295.
+            base_mode: MAV_MODE_FLAG; None leaves it unchanged.
+            custom_mode: mode number of this component, 0 to 4294967295; None leaves it unchanged.
 
         Raises:
             InvalidArgument: a value is out of range.
@@ -449,8 +452,8 @@ class OnboardComponent(ComponentTwin):
             camera: an instance of your subclass of :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
-            InvalidArgument: the component already has a camera, or has parameters although the camera has a definition
-                file.
+            InvalidArgument: the component already has a camera, or a handler for one of its commands; or it has
+                parameters although the camera has a definition file.
             FileFormatError: the definition file is damaged.
         """
         self._loop.call(self.aio.add_camera, camera)
@@ -464,12 +467,14 @@ class OnboardComponent(ComponentTwin):
             gimbal: an instance of your subclass of :class:`~aerokit.onboard.GimbalDriver`.
 
         Raises:
-            InvalidArgument: the component already has a gimbal.
+            InvalidArgument: the component already has a gimbal, or a handler for one of its commands.
         """
         self._loop.call(self.aio.add_gimbal, gimbal)
 
     def add_winch(self, winch: WinchDriver) -> None:
         """Serve DO_WINCH by your subclass of :class:`~aerokit.onboard.WinchDriver`, and send WINCH_STATUS at 5 Hz.
+
+        Commands for other instances than 0 (all), 1 and the component id are DENIED.
 
         Raises:
             InvalidArgument: the component already has a winch.
@@ -478,6 +483,8 @@ class OnboardComponent(ComponentTwin):
 
     def add_gripper(self, grab: Callable[[], Awaitable[Any]], release: Callable[[], Awaitable[Any]]) -> None:
         """Serve DO_GRIPPER by two coroutine functions, which return when the gripper has moved.
+
+        Commands for other instances than 0 (all), 1 and the component id are DENIED.
 
         Raises:
             InvalidArgument: the component already has a gripper.
