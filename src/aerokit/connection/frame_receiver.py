@@ -213,7 +213,9 @@ class FrameReceiver:
             if multilink is not None and multilink.is_copy(frame, peer):
                 continue
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
-            if not gate.is_open and not self._is_admitted(frame, is_other_peer):
+            # With several links, the check is also made while the gate is open, because it records what was admitted.
+            must_check = multilink is not None or not gate.is_open
+            if must_check and not self._is_admitted(frame, is_other_peer):
                 continue
             # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that
             # are not in use.
@@ -291,8 +293,7 @@ class FrameReceiver:
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
         """Return True if the signature check admits a frame.
 
-        Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
-        it as a replay.
+        Copies of an admitted frame over other links are not checked, because the check would refuse them as replays.
         """
         # `copies` still refers to this frame, because `is_copy` was just called for it.
         if self._multilink is not None and self._multilink.copies.was_admitted:

@@ -93,11 +93,15 @@ class Copies:
 
     @property
     def was_admitted(self) -> bool:
-        """True if the signature of the first copy of the last checked frame was valid."""
+        """True if the signature of an earlier copy of the last checked frame was valid, or needed no check."""
         return self._current is not None and self._current.is_admitted
 
+    def arrived_over(self, link: int) -> bool:
+        """Return True if the last checked frame, or an equal one, arrived over this link."""
+        return self._current is not None and bool(self._current.link_bits & 1 << link)
+
     def admit(self) -> None:
-        """Record that the signature of the last checked frame is valid. Its copies are then not taken for replays."""
+        """Record that the last checked frame passed the signature check. Its copies are then not taken for replays."""
         if self._current is not None:
             self._current.is_admitted = True
 
@@ -175,17 +179,28 @@ class MergedStreams:
         if not self.copies.is_copy(frame, link):
             return False
         choice = self._choices.get(frame.system_id)
-        # Equal frames prove that both links lead to one vehicle if they contain the time since boot. Frames without
-        # that time, such as heartbeats, may be equal although they come from two vehicles.
-        if choice is not None and boot_time_ms(frame):
-            links_to_vehicle = {link} if choice.used is None else {link, choice.used.link}
-            for link_to_vehicle in links_to_vehicle:
-                if (candidate := choice.candidates.get(link_to_vehicle)) is not None:
-                    candidate.record_copy(frame.received_at)
+        # Equal frames prove that their links lead to one vehicle if they contain the time since boot. Frames without
+        # that time, such as heartbeats, may be equal although they come from two vehicles. Frames that were refused
+        # prove nothing, because any sender can send them over two links.
+        if choice is not None and boot_time_ms(frame) and self.copies.was_admitted:
+            self._record_copy(choice, link, frame.received_at)
         if not self.copies.was_accepted:
             return False
         self._stream(frame).received_at[link] = frame.received_at
         return True
+
+    def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
+        """Record what a copy over this link proves: links that carry the frames of the link in use lead to its vehicle.
+
+        Copies over other links prove only that these lead to one vehicle, which may be another one.
+        """
+        if choice.used is None or not self.copies.arrived_over(choice.used.link):
+            return
+        is_over_used_link = link == choice.used.link
+        for candidate in choice.candidates.values():
+            is_new = is_over_used_link or candidate.link in (link, choice.used.link)
+            if is_new and self.copies.arrived_over(candidate.link):
+                candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
         """Return True if a frame, of which no copy was accepted yet, is to be delivered. Then record it as accepted."""
