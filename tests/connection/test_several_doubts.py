@@ -210,6 +210,43 @@ async def test_copies_prove_only_links_with_frames_of_link_in_use(order: tuple[i
         assert proven == [[]] * (MIN_COPIES - 1) + [[1, 2] if 0 in order else []]
 
 
+async def test_copies_over_link_to_other_hardware_prove_nothing() -> None:
+    radios = Radios(2)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        connection.bus.require_frames(m.Attitude)
+        for far in radios.far:
+            far.write(FrameEncoder(1, 1).encode(AUTOPILOT))
+            await anyio.sleep(0.1)
+        candidates_of(connection)[0].is_other_hardware = True
+        vehicle = FrameEncoder(1, 1)
+        for step in range(MIN_COPIES):
+            data = vehicle.encode(m.Attitude(10_000 + step, *(0.0,) * 6))
+            for far in radios.far:
+                far.write(data)
+            await anyio.sleep(0.1)
+        assert not candidates_of(connection)[1].is_proven
+
+
+@pytest.mark.parametrize("is_first_used", [True, False])
+@pytest.mark.parametrize("is_second_sender", [True, False])
+async def test_copies_of_second_sender_prove_no_link(is_first_used: bool, is_second_sender: bool) -> None:
+    """A second vehicle with the same ids sends over the second link, and to the port of the link in use."""
+    async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0"]) as connection:
+        link = connection.link
+        assert isinstance(link, MultiLink)
+        connection.bus.require_frames(m.Attitude)
+        ours, theirs = FrameEncoder(1, 1), FrameEncoder(1, 1)
+        peers = {0: ("127.0.0.1", 9), 1: ("127.0.0.2", 9)}
+        for index, encoder in ((0, ours), (1, theirs)):
+            link._on_bytes(index, encoder.encode(AUTOPILOT), peers[index])
+        for step in range(MIN_COPIES):
+            data = theirs.encode(m.Attitude(10_000 + step, *(0.0,) * 6))
+            for index in (0, 1) if is_first_used else (1, 0):
+                link._on_bytes(index, data, peers[1 if is_second_sender else index])
+        assert candidates_of(connection)[1].is_proven is not is_second_sender
+
+
 @pytest.mark.parametrize("is_signed", [True, False])
 async def test_forged_copies_prove_no_link(is_signed: bool) -> None:
     radios = Radios(2)

@@ -210,9 +210,9 @@ class FrameReceiver:
         for frame in frames:
             if self._is_closed:  # A sink of an earlier frame has closed the connection.
                 return
-            if multilink is not None and multilink.is_copy(frame, peer):
-                continue
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
+            if multilink is not None and multilink.is_copy(frame, peer, is_other_peer=is_other_peer):
+                continue
             # With several links, the check is also made while the gate is open, because it records what was admitted.
             must_check = multilink is not None or not gate.is_open
             if must_check and not self._is_admitted(frame, is_other_peer):

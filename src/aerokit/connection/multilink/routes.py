@@ -223,20 +223,20 @@ class MultiLinkRoutes:
 
     # -------------------------------------------------------------------- received frames
 
-    def is_copy(self, frame: Frame, peer: Peer) -> bool:
-        """Return True if this frame was already accepted over another link, or is our own.
+    def is_copy(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
+        """Return True if this frame was already accepted over another link, or has our own ids.
 
-        PX4 forwards our heartbeats from one of its ports to its other ports. What a copy proves about its link is
-        recorded.
+        PX4 forwards our heartbeats from one of its ports to its other ports. Another program with our ids is ignored,
+        too. What a copy proves about its link is recorded. ``is_other_peer`` is the result of `arrived_on_other_peer`.
         """
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link_index(peer)
-        if not self._merged.was_accepted(frame, link):
+        if not self._merged.was_accepted(frame, link, may_prove=not is_other_peer):
             return False
         # A copy is not delivered. It still proves that this link works, and which vehicle the link leads to.
         self._probes.record_hardware(frame, link)
-        if frame.message_id == m.Heartbeat.ID and not self.arrived_on_other_peer(frame, peer):
+        if frame.message_id == m.Heartbeat.ID and not is_other_peer:
             counters = self._counters.get((frame.system_id, link), {}).get(frame.component_id)
             self.record_heartbeat(frame, peer, counters)
         return True
