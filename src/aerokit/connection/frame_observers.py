@@ -200,43 +200,45 @@ class FrameObservers:
 
     def __init__(self, on_change: Callable[[], object]) -> None:
         self._on_change = on_change
-        self._sent: tuple[SentFrameObserver, ...] = ()
-        self.received: tuple[FrameObserver, ...] = ()
-        """Callbacks for received frames."""
+        self._send_callbacks: tuple[SentFrameObserver, ...] = ()
+        self.receive_callbacks: tuple[FrameObserver, ...] = ()
+        """Called with each received frame."""
         self.recording: Recording | None = None
 
     @property
     def want_all(self) -> bool:
         """True if the framer must build all received frames, also those without subscribers."""
-        return self.recording is not None or bool(self.received)
+        return self.recording is not None or bool(self.receive_callbacks)
 
     def add(self, callback: FrameObserver) -> Detach:
-        self.received = (*self.received, callback)
+        """Call ``callback`` with each received frame. Returns a function that removes it."""
+        self.receive_callbacks = (*self.receive_callbacks, callback)
         self._on_change()
 
         def detach() -> None:
-            self.received = _without(self.received, callback)
+            self.receive_callbacks = _without(self.receive_callbacks, callback)
             self._on_change()
 
         return once(detach)
 
     def add_sent(self, callback: SentFrameObserver) -> Detach:
-        self._sent = (*self._sent, callback)
+        """Call ``callback`` with each sent frame. Returns a function that removes it."""
+        self._send_callbacks = (*self._send_callbacks, callback)
 
         def detach() -> None:
-            self._sent = _without(self._sent, callback)
+            self._send_callbacks = _without(self._send_callbacks, callback)
 
         return once(detach)
 
     def notify_received(self, frame: Frame, peer: Peer) -> None:
-        for observer in self.received:
+        for observer in self.receive_callbacks:
             try:
                 observer(frame, peer)
             except Exception:
                 logger.exception("frame observer %r raised an exception; the others are still called", observer)
 
     def notify_sent(self, raw: bytes) -> None:
-        for observer in self._sent:
+        for observer in self._send_callbacks:
             try:
                 observer(raw)
             except Exception:

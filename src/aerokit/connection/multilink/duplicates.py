@@ -232,7 +232,8 @@ class MergedStreams:
             is_repeated = stream.is_repeated(frame.payload, link)
             if is_repeated and link != choice.used.link:
                 return False
-        # An answer that another link delivers late must not make older telemetry of this link acceptable.
+        # An answer that another link delivers late must not make older telemetry of this link acceptable. The link in
+        # use always sets the number, because a rebooted vehicle begins again with any number.
         if link == choice.used.link or not stream.has_newer(frame):
             stream.newest_sequence = frame.sequence
         self.copies.accept()
