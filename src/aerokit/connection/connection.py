@@ -162,7 +162,8 @@ class Connection:
         goes to every peer. With several links, a message for a vehicle is not sent at all while the link in use leads
         to another vehicle with the same id, which :class:`DuplicateSender` reports, and no other link works.
 
-        ``to`` chooses the peers of another system than the message's ``target_system``. The message is sent unchanged.
+        ``to`` is the id of the system whose peers get the message; None: the message's ``target_system``. The message
+        itself is not changed.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
