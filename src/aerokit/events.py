@@ -289,7 +289,10 @@ class LinkReport(Event):
 
 
 class LoopBlocked(Event):
-    """The program blocked the event loop for ``seconds``: nothing was received or sent meanwhile."""
+    """The program blocked the event loop: nothing was received or sent meanwhile.
+
+    ``seconds`` is the greatest possible length of the pause, up to 0.12 s more than its real length.
+    """
 
     seconds: float
 
@@ -422,6 +425,6 @@ class LinkStatus(Snapshot):
     used_for: tuple[int, ...]
     """Ids of the systems whose traffic uses this link."""
     loss_percent: float | None
-    """Percentage of frames lost in the last seconds, for the system that loses most; None until known."""
+    """Percentage of about the last dozen frames that were lost, for the system that loses most; None until known."""
     round_trip_s: float | None
     """Round-trip time (TIMESYNC) of the slowest system; None before the first answer."""

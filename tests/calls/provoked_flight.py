@@ -407,6 +407,17 @@ async def _read_twice(stage: Stage) -> None:
             reader.cancel()
 
 
+async def _read_overflowed(stage: Stage) -> None:
+    with stage.vehicle.subscribe(messages.Heartbeat, overflow="error") as subscription:
+        await anyio.sleep(3)
+        await subscription.get()
+        await subscription.get()
+
+
+async def _wait_for_ever(stage: Stage) -> None:
+    await stage.vehicle.mode.wait_until(lambda _: False)
+
+
 def _parts() -> Table:
     guided = {
         "velocity": (),
@@ -437,7 +448,12 @@ def _parts() -> Table:
         ("StateCell.wait_until", "OperationTimeout"): P(
             lambda s: s.vehicle.mode.wait_until(lambda _: False, timeout=1)
         ),
+        ("StateCell.wait_until", "ConnectionClosed"): later(
+            _wait_for_ever, lambda s: s.vehicle.connection.close(), 0.1, alone=True
+        ),
+        ("StateCell.wait_until", "LinkLost"): later(_wait_for_ever, lost, 0.1, alone=True),
         ("Subscription.get", "OperationTimeout"): P(lambda s: _read(s, timeout=1)),
+        ("Subscription.get", "SubscriptionOverflow"): P(_read_overflowed),
         ("Subscription.get", "BusyError"): P(_read_twice),
         ("Subscription.get", "InvalidArgument"): P(_read_closed),
         ("Subscription.get", "ConnectionClosed"): later(_read, lambda s: s.vehicle.connection.close(), 0.1, alone=True),

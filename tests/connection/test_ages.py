@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import random
 import socket
 from typing import Any
@@ -236,6 +237,15 @@ async def test_sink_of_sleep_may_close_the_watch() -> None:
     asleep[0] = 1200.0
     await anyio.sleep(1.0)
     assert pauses == [600.0]
+
+
+async def test_watch_closed_after_catching_up_stays_closed() -> None:
+    watch = LoopWatch(lambda _: None, lambda _: None, on_caught_up=lambda _: watch.close())
+    watch.start()
+    block_loop(1.0)
+    await anyio.sleep(1.0)
+    assert watch.late_after == math.inf, "data that is read now would start the timer again"
+    assert watch._timer is None
 
 
 def test_suspended_time_comes_from_a_system_clock() -> None:

@@ -394,3 +394,29 @@ async def test_failed_connect_leaves_nothing_behind() -> None:
                 pytest.fail("there is no vehicle")
         assert asyncio.all_tasks() == tasks_before
         assert not scheduled_timers()
+
+
+# --------------------------------------------------------------------------------------- vehicles()
+
+
+async def test_known_vehicle_is_yielded_with_time_of_its_heartbeat() -> None:
+    async with far_end() as (near, far, _), open_connection(near) as connection:
+        far.write(FrameEncoder(1, 1).encode(COPTER))
+        await anyio.sleep(0.1)
+        received_at = connection.last_heartbeat_at(1, 1)
+        await anyio.sleep(60)
+        assert (await anext(connection.vehicles())).at == received_at
+
+
+async def test_forgotten_vehicle_is_yielded_once() -> None:
+    """When the table of routes is full, a component without a route is forgotten, and then found again."""
+    async with far_end() as (near, far, _), open_connection(near) as connection:
+        vehicles, found = connection.vehicles(), list[int]()
+        first, second = FrameEncoder(1, 1), FrameEncoder(2, 1)
+        far.write(first.encode(COPTER))
+        await anyio.sleep(0.1)
+        found.append((await anext(vehicles)).system_id)
+        connection.heartbeats.clear()
+        far.write(first.encode(COPTER) + second.encode(COPTER))
+        found.append((await anext(vehicles)).system_id)
+        assert found == [1, 2]

@@ -245,3 +245,11 @@ async def test_unexpected_messages_are_not_decoded(pair: Pair) -> None:
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
+
+
+async def test_failed_attachment_leaves_nothing_attached(pair: Pair) -> None:
+    exchange = Counting()
+    exchange.expects = (Attitude, None)  # type: ignore[assignment]
+    with pytest.raises(AttributeError):
+        await pair.run(exchange)
+    assert Attitude.ID not in pair.connection.bus.wanted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -244,6 +245,31 @@ def test_full_disk_is_reported_once(caplog: pytest.LogCaptureFixture, end: str) 
     recording.close()
     errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     assert errors == ["recording to /dev/full has ended: No space left on device"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_pipe_without_reader_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(LinkOpenError, match="no program reads this pipe yet"):
+        Recording(tmp_path / "pipe", 0.0)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_pipe_with_slow_reader_ends_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, frame = tmp_path / "pipe", FrameEncoder(1, 1).encode(HEARTBEAT)
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    recording = Recording(path, 0.0)
+    recording.write(frame, 1.0)
+    recording.flush()
+    assert os.read(reader, 1000)[8:] == frame
+    for _ in range(100_000):
+        recording.write(frame, 1.0)
+    recording.close()
+    os.close(reader)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"recording to {path} has ended: write could not complete without blocking"
+    ]
 
 
 async def test_open_connection_has_its_own_recording(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import aerokit
 from aerokit import events
 from aerokit import messages as m
 from aerokit.connection.connection import Connection
-from aerokit.connection.multilink.link_choice import MAX_SWITCH_DELAY_S, LinkChoice
+from aerokit.connection.multilink.link_choice import MAX_SWITCH_DELAY_S, MIN_COPIES, Candidate, LinkChoice
 from aerokit.connection.multilink.link_probes import UNATTACHED_RATE_HZ
 from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, LinkLost, LinkOpenError
@@ -182,6 +182,90 @@ async def test_signed_copies_are_accepted_in_any_order() -> None:
             await anyio.sleep(1)
         assert states == list(range(10))
         assert refused.all == []
+
+
+def candidates_of(connection: Connection) -> dict[int, Candidate]:
+    assert connection._multilink is not None
+    return connection._multilink._choices[1].candidates
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0), (1, 2)], ids=str)
+async def test_copies_prove_only_links_with_frames_of_link_in_use(order: tuple[int, ...]) -> None:
+    """The second and the third radio carry equal frames: those of the first, which is in use, or of another vehicle."""
+    radios = Radios(3)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        connection.bus.require_frames(m.Attitude)
+        for far in radios.far:
+            far.write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        await anyio.sleep(0.1)
+        vehicle = FrameEncoder(1, 1)
+        proven: list[list[int]] = []
+        for step in range(MIN_COPIES):
+            data = vehicle.encode(m.Attitude(10_000 + step, *(0.0,) * 6))
+            for index in order:
+                radios.far[index].write(data)
+                await anyio.sleep(0.01)
+            proven.append([link for link in (1, 2) if candidates_of(connection)[link].is_proven])
+        assert proven == [[]] * (MIN_COPIES - 1) + [[1, 2] if 0 in order else []]
+
+
+async def test_copies_over_link_to_other_hardware_prove_nothing() -> None:
+    radios = Radios(2)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        connection.bus.require_frames(m.Attitude)
+        for far in radios.far:
+            far.write(FrameEncoder(1, 1).encode(AUTOPILOT))
+            await anyio.sleep(0.1)
+        candidates_of(connection)[0].is_other_hardware = True
+        vehicle = FrameEncoder(1, 1)
+        for step in range(MIN_COPIES):
+            data = vehicle.encode(m.Attitude(10_000 + step, *(0.0,) * 6))
+            for far in radios.far:
+                far.write(data)
+            await anyio.sleep(0.1)
+        assert not candidates_of(connection)[1].is_proven
+
+
+@pytest.mark.parametrize("is_first_used", [True, False])
+@pytest.mark.parametrize("is_second_sender", [True, False])
+async def test_copies_of_second_sender_prove_no_link(is_first_used: bool, is_second_sender: bool) -> None:
+    """A second vehicle with the same ids sends over the second link, and to the port of the link in use."""
+    async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0"]) as connection:
+        link = connection.link
+        assert isinstance(link, MultiLink)
+        connection.bus.require_frames(m.Attitude)
+        ours, theirs = FrameEncoder(1, 1), FrameEncoder(1, 1)
+        peers = {0: ("127.0.0.1", 9), 1: ("127.0.0.2", 9)}
+        for index, encoder in ((0, ours), (1, theirs)):
+            link._on_bytes(index, encoder.encode(AUTOPILOT), peers[index])
+        for step in range(MIN_COPIES):
+            data = theirs.encode(m.Attitude(10_000 + step, *(0.0,) * 6))
+            for index in (0, 1) if is_first_used else (1, 0):
+                link._on_bytes(index, data, peers[1 if is_second_sender else index])
+        assert candidates_of(connection)[1].is_proven is not is_second_sender
+
+
+@pytest.mark.parametrize("is_signed", [True, False])
+async def test_forged_copies_prove_no_link(is_signed: bool) -> None:
+    radios = Radios(2)
+    await opened(radios)
+    key = SigningKey(bytes(range(32)))
+    async with open_connection(radios.together(), signing=Signing(key)) as connection:
+        connection.bus.require_frames(m.Attitude)
+        vehicle, forger = FrameEncoder(1, 1), FrameEncoder(1, 1)
+        vehicle.signing = Signing(key)
+        for far in radios.far:
+            far.write(vehicle.encode(AUTOPILOT, connection.unix_time()))
+            await anyio.sleep(0.1)
+        for step in range(MIN_COPIES):
+            sender = vehicle if is_signed else forger
+            data = sender.encode(m.Attitude(10_000 + step, *(0.0,) * 6), connection.unix_time())
+            for far in radios.far:
+                far.write(data)
+            await anyio.sleep(0.1)
+        assert candidates_of(connection)[1].is_proven is is_signed
 
 
 async def test_link_in_use_elsewhere_is_left_unchanged() -> None:

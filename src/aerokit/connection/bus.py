@@ -326,7 +326,8 @@ class Subscription(Generic[ItemT]):
     """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
     The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped
-    items. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
+    items. With ``overflow="error"``, a reader that was too slow gets the queued items, then an error. When the
+    connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     def __init__(
@@ -350,8 +351,8 @@ class Subscription(Generic[ItemT]):
         self._detachers: list[Detach] = []  # functions that end the subscription; empty before the `with` block
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._has_reader = False  # True while a reader waits; a second one is refused
-        self._waiter: asyncio.Future[None] | None = None  # set while a reader waits
+        self._has_reader = False  # True until the reader has stopped waiting; a second one is refused
+        self._waiter: asyncio.Future[None] | None = None  # wakes the waiting reader; None once it was woken
         self._error: Exception | None = None  # raised in the reader once the queue is empty
         self._closed = False
 
@@ -388,6 +389,7 @@ class Subscription(Generic[ItemT]):
         Raises:
             OperationTimeout: no item arrived within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
+            SubscriptionOverflow: with ``overflow="error"``, the queue was full when a further item arrived.
             BusyError: another task already reads the subscription.
             InvalidArgument: the subscription is closed; read it inside its ``with`` block.
         """

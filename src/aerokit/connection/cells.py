@@ -174,12 +174,15 @@ class StateCell(Generic[T]):
     ) -> T:
         """Wait until ``predicate(value)`` has been true for ``held_for`` seconds, and return the value.
 
-        The predicate is checked for the current value and for every value received, so a condition that lasts a
-        single message is not missed. Exceptions of the predicate are raised here.
+        The predicate is checked for the current value, however old, and for every value received, so a condition that
+        lasts a single message is not missed. Each value counts until the next one is received: ``held_for``, which
+        begins with the call at the earliest, also passes while the vehicle is silent. Call :meth:`fresh` afterwards if
+        the value must be recent. Exceptions of the predicate are raised here.
 
         Raises:
             OperationTimeout: the condition was not met within ``timeout`` seconds; the error names ``description`` and
                 the last values.
+            ConnectionClosed, LinkLost: the connection ended.
         """
         self._raise_if_closed()
         waiter = _Waiter(self, predicate, held_for)
@@ -396,7 +399,7 @@ class _Waiter(_Sink[T]):
         self._loop = asyncio.get_running_loop()
         self._future: asyncio.Future[T | None] = self._loop.create_future()
         self._error: BaseException | None = None  # raised by `wait` instead of returning a value
-        self._hold_timer: asyncio.TimerHandle | None = None  # runs while the predicate is true
+        self._hold_timer: asyncio.TimerHandle | None = None  # runs while the predicate is true for the last value
         # Last values that differ from the value before, for the time-out error.
         self._seen: deque[T] = deque(maxlen=_MAX_LISTED_VALUES)
         self._seen_count = 0  # number of values received, equal ones included

@@ -90,6 +90,8 @@ class Connection:
     ) -> None:
         if not 1 <= source_system <= 255:
             raise InvalidArgument(f"source_system = {source_system} is not allowed: it must be 1 to 255")
+        # 0 is the broadcast id, but DroneKit programs send with it. Answers to it look as if they were for all
+        # components of our system.
         if not 0 <= source_component <= 255:
             raise InvalidArgument(f"source_component = {source_component} is not allowed: it must be 0 to 255")
         _check_version(mavlink_version)
@@ -157,7 +159,11 @@ class Connection:
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
-        goes to every peer. ``to`` is the system id of the target; None: the message's ``target_system``.
+        goes to every peer. With several links, a message for a vehicle is not sent at all while the link in use leads
+        to another vehicle with the same id, which :class:`DuplicateSender` reports, and no other link works.
+
+        ``to`` is the id of the system whose peers get the message; None: the message's ``target_system``. The message
+        itself is not changed.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -169,7 +175,9 @@ class Connection:
     def write_raw(self, data: bytes) -> None:
         """Write one complete frame of another sender unchanged, for programs that forward frames. Never blocks.
 
-        The frame goes to the peers that :meth:`send` would choose for the same message. A signature is kept.
+        The frame goes to the peers that :meth:`send` would choose for the same message. A signature is kept. A frame
+        for all or for an unknown target goes to every peer, also to the peer it came from: forward only frames of
+        another connection, or they return to their sender.
 
         Raises:
             InvalidArgument: ``data`` is not exactly one MAVLink frame; nothing was sent.
@@ -262,6 +270,10 @@ class Connection:
     ) -> Subscription[ItemT]:
         """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
 
+        At most ``capacity`` unread items are kept, of all types together; by default only the newest. ``overflow`` says
+        what happens to a further item: ``"drop_oldest"`` or ``"drop_newest"`` drops an item, ``"error"`` ends the
+        subscription with an error, see :class:`Subscription`.
+
         Raises:
             InvalidArgument: no type is given, or the dialect does not have a given type.
         """
@@ -276,6 +288,8 @@ class Connection:
     async def vehicles(self) -> AsyncGenerator[VehicleFound, None]:
         """Yield every autopilot on the link once, until the connection ends. Autopilots already known come first.
 
+        A known autopilot is yielded even if it has left; ``at`` is then the time of its last heartbeat.
+
         To use a vehicle, connect to it: ``aerokit.connect(connection, system_id=found.system_id)``.
 
         Raises:
@@ -284,14 +298,19 @@ class Connection:
         self.raise_if_ended()
         # New discoveries are queued while the earlier ones are yielded.
         with self.subscribe(VehicleFound, capacity=MAX_ROUTES) as discoveries:
-            earlier_discoveries = [
-                discovery_event(heartbeat, self.now(), *source) for source, heartbeat in self.heartbeats.items()
-            ]
-            for event in earlier_discoveries:
+            known = {
+                source: discovery_event(heartbeat, self.last_heartbeat_at(*source), *source)
+                for source, heartbeat in self.heartbeats.items()
+            }
+            for event in known.values():
                 if isinstance(event, VehicleFound):
                     yield event
+            yielded = set(known)
             async for event in discoveries:
-                yield event
+                source = event.system_id, event.component_id
+                if source not in yielded:  # A component is found again if its heartbeat was forgotten meanwhile.
+                    yielded.add(source)
+                    yield event
 
     def attach(self, types: Sequence[type[Any]], sink: Sink, *, system_id: int = 0) -> list[Detach]:
         """Deliver these messages and events, of one system (0: of all), to ``sink``."""
@@ -374,8 +393,8 @@ class Connection:
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
         """Return why signatures block communication with a component, for error texts; "" if they do not.
 
-        ``component_id`` 0 means all components of the system. Without a ``system_id``, only frames that this program
-        has refused are considered.
+        With a key, the reason is that this program has refused frames, of any sender. Without a key, it is that the
+        last heartbeat of the component is signed. ``component_id`` 0 means all components of the system.
         """
         return self._gate.describe(
             heartbeat
@@ -414,7 +433,8 @@ class Connection:
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record all sent and received frames to a ``.tlog`` file until the connection is closed.
 
-        When the first frame is received, an existing file is renamed to the next free number: ``flight.1.tlog``.
+        When the first frame is received, an existing file is renamed to the next free number: ``flight.1.tlog``. Until
+        then nothing is written to it, and of the sent frames only the last 1000 are kept for the recording.
 
         Raises:
             LinkOpenError: the file cannot be written.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -23,17 +24,13 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
     Cancellation ends the exchange immediately. Errors of sending, and the error that ends the connection, are raised.
     """
     run = ExchangeRun(connection, exchange)
-    detachments = [
-        connection.bus.attach(message_type, run.receive, system_id=system_id) for message_type in exchange.expects
-    ]
-    detachments.append(connection.on_end(run.abort))
-    if connection.links is not None:
-        detachments.append(connection.bus.attach_event(LinkSelected, partial(run.on_link_selected, system_id)))
-    try:
+    with ExitStack() as attachments:
+        for message_type in exchange.expects:
+            attachments.callback(connection.bus.attach(message_type, run.receive, system_id=system_id))
+        attachments.callback(connection.on_end(run.abort))
+        if connection.links is not None:
+            attachments.callback(connection.bus.attach_event(LinkSelected, partial(run.on_link_selected, system_id)))
         return await run.result()
-    finally:
-        for detach in detachments:
-            detach()
 
 
 class ExchangeRun(Generic[ResultT]):

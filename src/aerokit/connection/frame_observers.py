@@ -42,27 +42,33 @@ class Recording:
     that clock. The recording therefore has no jump when the system clock is set in flight, e.g. on a companion computer
     that connects to a network.
 
+    A device or a pipe is opened and written without waiting: the event loop, and with it our heartbeats, must not wait
+    for the program that reads it. If that program is too slow, the recording ends.
+
     Raises:
-        LinkOpenError: the file cannot be written.
+        LinkOpenError: the file cannot be written, or no program reads the pipe.
     """
 
     def __init__(self, path: str | os.PathLike[str], now: float) -> None:
         self._path = os.fspath(path)
         self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
         self._writer: TlogWriter | None = None  # None before the first received frame and after the end
-        self._file: BinaryIO | None = None  # the file, if it was created here
-        # Sent frames that wait until a frame is received and the existing file is renamed. None if no frame must wait.
+        self._file: BinaryIO | None = None  # the file of the writer
+        # The last MAX_WAITING sent frames, until a frame is received and the existing file is renamed. None if no frame
+        # must wait.
         self._waiting: deque[tuple[bytes, float]] | None = None
         try:
             if os.path.exists(path) and not os.path.isfile(path):  # The path is that of a device or a pipe.
-                self._writer = TlogWriter(path)
+                self._file = open(path, "wb", opener=_open_without_waiting)  # noqa: SIM115 - closed by close()
+                self._writer = TlogWriter(self._file)
             elif os.path.exists(path):
                 _check_renamable(path)
                 self._waiting = deque(maxlen=MAX_WAITING)
             else:
                 self._open_new()
         except OSError as error:
-            raise LinkOpenError(f"cannot record to {self._path}: {error.strerror or error}") from None
+            reason = "no program reads this pipe yet" if error.errno == errno.ENXIO else error.strerror or error
+            raise LinkOpenError(f"cannot record to {self._path}: {reason}") from None
 
     def write(self, raw: bytes, at: float) -> None:
         """Add a frame received at this time. Never raises."""
@@ -145,6 +151,10 @@ class Recording:
         logger.error("recording to %s has ended: %s", self._path, error.strerror or error)
 
 
+def _open_without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))  # Windows has neither the flag nor pipes with a path.
+
+
 def _check_renamable(path: str | os.PathLike[str]) -> None:
     """Raise PermissionError if the file cannot be renamed, because its folder does not allow it."""
     if not os.access(os.path.dirname(os.path.abspath(path)), os.W_OK):
@@ -190,43 +200,45 @@ class FrameObservers:
 
     def __init__(self, on_change: Callable[[], object]) -> None:
         self._on_change = on_change
-        self._sent: tuple[SentFrameObserver, ...] = ()
-        self.received: tuple[FrameObserver, ...] = ()
-        """Callbacks for received frames."""
+        self._send_callbacks: tuple[SentFrameObserver, ...] = ()
+        self.receive_callbacks: tuple[FrameObserver, ...] = ()
+        """Called with each received frame."""
         self.recording: Recording | None = None
 
     @property
     def want_all(self) -> bool:
         """True if the framer must build all received frames, also those without subscribers."""
-        return self.recording is not None or bool(self.received)
+        return self.recording is not None or bool(self.receive_callbacks)
 
     def add(self, callback: FrameObserver) -> Detach:
-        self.received = (*self.received, callback)
+        """Call ``callback`` with each received frame. Returns a function that removes it."""
+        self.receive_callbacks = (*self.receive_callbacks, callback)
         self._on_change()
 
         def detach() -> None:
-            self.received = _without(self.received, callback)
+            self.receive_callbacks = _without(self.receive_callbacks, callback)
             self._on_change()
 
         return once(detach)
 
     def add_sent(self, callback: SentFrameObserver) -> Detach:
-        self._sent = (*self._sent, callback)
+        """Call ``callback`` with each sent frame. Returns a function that removes it."""
+        self._send_callbacks = (*self._send_callbacks, callback)
 
         def detach() -> None:
-            self._sent = _without(self._sent, callback)
+            self._send_callbacks = _without(self._send_callbacks, callback)
 
         return once(detach)
 
     def notify_received(self, frame: Frame, peer: Peer) -> None:
-        for observer in self.received:
+        for observer in self.receive_callbacks:
             try:
                 observer(frame, peer)
             except Exception:
                 logger.exception("frame observer %r raised an exception; the others are still called", observer)
 
     def notify_sent(self, raw: bytes) -> None:
-        for observer in self._sent:
+        for observer in self._send_callbacks:
             try:
                 observer(raw)
             except Exception:

@@ -32,7 +32,7 @@ MAX_PEERS = 256
 MAX_UNVERIFIED_PEERS = 32
 """Maximum number of tracked peers without a valid frame. A new peer replaces the oldest peer."""
 
-MAX_SENDERS = 2048
+MAX_SOURCES = 2048
 """Maximum number of (system id, component id) pairs, over all peers, that have their own counters."""
 
 
@@ -59,7 +59,7 @@ class PeerTable:
         self.framers: dict[Peer, Framer] = {}
         """Framers of verified peers."""
         self._unverified: dict[Peer, Framer] = {}  # framers of senders without a valid frame, oldest first
-        self._limit = SourceLimit(MAX_SENDERS)  # bounds the number of counters that all framers have together
+        self._limit = SourceLimit(MAX_SOURCES)  # shared by all framers
 
     def __iter__(self) -> Iterator[Framer]:
         yield from self.framers.values()
@@ -197,6 +197,7 @@ class FrameReceiver:
             # The delivery stopped after this frame, because one of its sinks closed the connection, set a signing key
             # or added an observer. The other frames now need checks. This frame was not yet passed to the observers.
             self.observers.notify_received(last_delivered, peer)
+            # Frames are compared by identity, so that an equal frame earlier in the list is not taken for this one.
             remaining = frames[frames.index(last_delivered) + 1 :]
             self._check_and_deliver(remaining, framer, peer)
 
@@ -206,14 +207,17 @@ class FrameReceiver:
         With one link, the recording gets every frame that passes the signature check, even if a later check refuses it.
         """
         framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
-        may_be_stale = bool(framer.late or framer.foreign)
+        # True if frames arrived out of order (late), or may be those of a second sender with the same ids (foreign).
+        has_suspects = bool(framer.late or framer.foreign)
         for frame in frames:
             if self._is_closed:  # A sink of an earlier frame has closed the connection.
                 return
-            if multilink is not None and multilink.is_copy(frame, peer):
-                continue
             is_other_peer = len(framers) > 1 and self._routes.arrived_on_other_peer(frame, peer)
-            if not gate.is_open and not self._is_admitted(frame, is_other_peer):
+            if multilink is not None and multilink.is_copy(frame, peer, is_other_peer=is_other_peer):
+                continue
+            # With several links, the check is also made while the gate is open, because it records what was admitted.
+            must_check = multilink is not None or not gate.is_open
+            if must_check and not self._is_admitted(frame, is_other_peer):
                 continue
             # With several links, frames are recorded further below, because `accepts` refuses telemetry of links that
             # are not in use.
@@ -221,7 +225,7 @@ class FrameReceiver:
                 observers.recording.write(frame.raw, self._clock())
             if is_other_peer and not self._claims_route(framer, frame, peer):
                 continue
-            if may_be_stale and self._must_be_dropped(framer, frame):
+            if has_suspects and self._must_be_dropped(framer, frame):
                 continue
             if multilink is not None:
                 if not multilink.accepts(frame, peer, framer.counters_of(frame)):
@@ -230,7 +234,7 @@ class FrameReceiver:
             if frame.message_id == _HEARTBEAT_ID:
                 self._record_heartbeat(frame, framer, peer)
             self._bus.deliver(frame)
-            if observers.received:
+            if observers.receive_callbacks:
                 observers.notify_received(frame, peer)
 
     def arrived_at(self) -> float:
@@ -252,7 +256,10 @@ class FrameReceiver:
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def _on_blocked(self, seconds: float) -> None:
-        """Publish that the event loop was blocked, and log a warning if it was blocked for long."""
+        """Publish that the event loop was blocked, and log a warning if it was blocked for long.
+
+        ``seconds`` is the greatest length that the pause may have had, see `LoopWatch`.
+        """
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(
                 "the event loop was blocked for %.1f s: no messages or heartbeats were processed; %s",
@@ -291,8 +298,7 @@ class FrameReceiver:
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
         """Return True if the signature check admits a frame.
 
-        Of the copies that arrive over several links, only the first is checked. A check of the next copy would refuse
-        it as a replay.
+        Copies of an admitted frame over other links are not checked, because the check would refuse them as replays.
         """
         # `copies` still refers to this frame, because `is_copy` was just called for it.
         if self._multilink is not None and self._multilink.copies.was_admitted:

@@ -54,9 +54,9 @@ class LoopWatch:
 
     Data may arrive during a pause and wait. Until all of this data has been read, its receive time is the time at which
     the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
-    ages may be too small by up to this time. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``,
-    ``on_slept`` the time that the computer was suspended. ``on_caught_up`` gets the length of a pause, and of the time
-    after it in which waiting data was read, once all of this data was read.
+    ages may be too small by up to this time. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``, or
+    up to ``CHECK_INTERVAL_S`` more. ``on_slept`` gets the time that the computer was suspended. ``on_caught_up`` gets
+    the length of a pause, and of the time after it in which waiting data was read, once all of this data was read.
     """
 
     def __init__(
@@ -105,9 +105,9 @@ class LoopWatch:
         if self.oldest_arrival == math.inf and not has_slept and now <= self._due + LATE_THRESHOLD_S:
             # Data that is read in time proves that the loop runs, so the timer need not fire. Postponing it costs less
             # than waking the process only for the timer.
-            if self._timer is not None:
+            if self._timer is not None:  # None after close(), which must not start the timer again
                 self._timer.cancel()
-            self._set_timer(now)
+                self._set_timer(now)
             return now
         self._has_read = True
         return self._assume_waiting_data()
@@ -136,7 +136,11 @@ class LoopWatch:
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _detect_sleep(self) -> bool:
-        """Return True if the computer was suspended since the last call. Record and report the suspension."""
+        """Return True if the computer was suspended for more than `LATE_THRESHOLD_S` since the last call.
+
+        Record and report the suspension. Shorter differences are dropped and never add up, because NTP may adjust only
+        one of the two clocks (macOS), which would soon look like a suspension.
+        """
         # `_suspended` subtracts two clock readings. Its result is too small if the process was preempted between the
         # readings. The true value never decreases, so the largest result so far is used.
         before = self._suspended_before
@@ -176,9 +180,9 @@ class LoopWatch:
         else:
             caught_up_after_s = self._loop.time() - self.oldest_arrival
             self.oldest_arrival = math.inf
-            self._on_caught_up(caught_up_after_s)
             # As in `_set_timer`: data that is read before this time has not waited.
             self.late_after = self._ran_at + CHECK_INTERVAL_S / 2
+            self._on_caught_up(caught_up_after_s)  # last, because it may close the watch
 
 
 IPYTHON_HINT = (

@@ -294,12 +294,15 @@ class StateCell(CellTwin[T]):
     ) -> T:
         """Wait until ``predicate(value)`` has been true for ``held_for`` seconds, and return the value.
 
-        The predicate is checked for the current value and for every value received, so a condition that lasts a
-        single message is not missed. Exceptions of the predicate are raised here.
+        The predicate is checked for the current value, however old, and for every value received, so a condition that
+        lasts a single message is not missed. Each value counts until the next one is received: ``held_for``, which
+        begins with the call at the earliest, also passes while the vehicle is silent. Call :meth:`fresh` afterwards if
+        the value must be recent. Exceptions of the predicate are raised here.
 
         Raises:
             OperationTimeout: the condition was not met within ``timeout`` seconds; the error names ``description`` and
                 the last values.
+            ConnectionClosed, LinkLost: the connection ended.
         """
         return self._loop.run(
             self.aio.wait_until,
@@ -338,7 +341,8 @@ class Subscription(SubscriptionTwin[ItemT]):
     """Asynchronous iterator over received items, for one reader. Active inside its ``with`` block.
 
     The default, ``capacity=1`` with ``drop_oldest``, always yields the latest item; ``missed`` counts the dropped
-    items. When the connection ends, queued items can still be read; after that, reading raises the connection's error.
+    items. With ``overflow="error"``, a reader that was too slow gets the queued items, then an error. When the
+    connection ends, queued items can still be read; after that, reading raises the connection's error.
     """
 
     @property
@@ -352,6 +356,7 @@ class Subscription(SubscriptionTwin[ItemT]):
         Raises:
             OperationTimeout: no item arrived within ``timeout`` seconds.
             ConnectionClosed, LinkLost: the connection ended.
+            SubscriptionOverflow: with ``overflow="error"``, the queue was full when a further item arrived.
             BusyError: another task already reads the subscription.
             InvalidArgument: the subscription is closed; read it inside its ``with`` block.
         """
@@ -393,7 +398,11 @@ class Connection(ConnectionTwin):
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
-        goes to every peer. ``to`` is the system id of the target; None: the message's ``target_system``.
+        goes to every peer. With several links, a message for a vehicle is not sent at all while the link in use leads
+        to another vehicle with the same id, which :class:`DuplicateSender` reports, and no other link works.
+
+        ``to`` is the id of the system whose peers get the message; None: the message's ``target_system``. The message
+        itself is not changed.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.
@@ -431,6 +440,10 @@ class Connection(ConnectionTwin):
         overflow: Overflow = "drop_oldest",
     ) -> Subscription[ItemT]:
         """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
+
+        At most ``capacity`` unread items are kept, of all types together; by default only the newest. ``overflow`` says
+        what happens to a further item: ``"drop_oldest"`` or ``"drop_newest"`` drops an item, ``"error"`` ends the
+        subscription with an error, see :class:`Subscription`.
 
         Raises:
             InvalidArgument: no type is given, or the dialect does not have a given type.

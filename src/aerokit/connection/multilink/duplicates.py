@@ -31,11 +31,12 @@ COPY_WINDOW_FRAMES = 128
 class _Seen:
     """Record of a received frame: its links, whether its signature is valid, and whether it was delivered."""
 
-    __slots__ = ("at", "count", "is_accepted", "is_admitted", "link_bits")
+    __slots__ = ("at", "count", "is_accepted", "is_admitted", "link_bits", "proving_bits")
 
     def __init__(self, at: float, link_bit: int, count: int) -> None:
         self.at = at  # receive time of the first copy
         self.link_bits = link_bit  # has one bit for each link over which the frame arrived
+        self.proving_bits = 0  # the same, without links over which a second sender with the same ids sent it
         self.count = count  # number of the sender's frames, this one included, when it arrived
         self.is_admitted = False  # see `Copies.was_admitted`
         self.is_accepted = False  # see `Copies.was_accepted`
@@ -56,11 +57,12 @@ class Copies:
         self.is_late: bool = False
         """True if the last checked frame may be a copy of one that was accepted over another link some seconds ago."""
 
-    def is_copy(self, frame: Frame, link: int) -> bool:
+    def is_copy(self, frame: Frame, link: int, *, may_prove: bool = True) -> bool:
         """Remember a frame. Return True if it is a copy: an equal frame arrived recently, but only over other links.
 
-        Recently means within `COPY_WINDOW_S` and `COPY_WINDOW_FRAMES`. The other methods, and :attr:`is_late`, refer to
-        the last frame for which this method was called.
+        Recently means within `COPY_WINDOW_S` and `COPY_WINDOW_FRAMES`. ``may_prove`` is False for a frame of a second
+        sender with the same ids. The other methods, and :attr:`is_late`, refer to the last frame for which this method
+        was called.
         """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
@@ -74,12 +76,14 @@ class Copies:
             is_recent = age_s <= COPY_WINDOW_S and count - earlier.count < COPY_WINDOW_FRAMES
             if is_recent and is_other_link:
                 earlier.link_bits |= link_bit
+                earlier.proving_bits |= link_bit * may_prove
                 self._current = earlier
                 return True
             self.is_late = is_other_link and earlier.is_accepted and age_s <= LATE_COPY_WINDOW_S
             del self._seen[key]  # The new frame, which is not a copy, takes the place of the earlier one.
         self._counts[sender] = count + 1
         self._current = self._seen[key] = _Seen(frame.received_at, link_bit, count + 1)
+        self._current.proving_bits = link_bit * may_prove
         if len(self._seen) > MAX_REMEMBERED:
             # Many frames are forgotten at once, because building the list takes time.
             for oldest_key in list(self._seen)[: MAX_REMEMBERED // 4]:
@@ -93,11 +97,15 @@ class Copies:
 
     @property
     def was_admitted(self) -> bool:
-        """True if the signature of the first copy of the last checked frame was valid."""
+        """True if the signature of an earlier copy of the last checked frame was valid, or needed no check."""
         return self._current is not None and self._current.is_admitted
 
+    def arrived_over(self, link: int) -> bool:
+        """Return True if the last checked frame, or an equal one, arrived over this link, not from a second sender."""
+        return self._current is not None and bool(self._current.proving_bits & 1 << link)
+
     def admit(self) -> None:
-        """Record that the signature of the last checked frame is valid. Its copies are then not taken for replays."""
+        """Record that the last checked frame passed the signature check. Its copies are then not taken for replays."""
         if self._current is not None:
             self._current.is_admitted = True
 
@@ -167,25 +175,38 @@ class MergedStreams:
     def reset(self, system_id: int) -> None:
         self._streams = {key: stream for key, stream in self._streams.items() if key & 0xFF != system_id}
 
-    def was_accepted(self, frame: Frame, link: int) -> bool:
+    def was_accepted(self, frame: Frame, link: int, *, may_prove: bool) -> bool:
         """Return True if this frame is a copy of a frame that was accepted over another link.
 
-        Also record what a copy proves: its link works, and may lead to the vehicle.
+        Also record what a copy proves: its link works, and may lead to the vehicle. ``may_prove`` is False for a frame
+        of a second sender with the same ids.
         """
-        if not self.copies.is_copy(frame, link):
+        if not self.copies.is_copy(frame, link, may_prove=may_prove):
             return False
         choice = self._choices.get(frame.system_id)
-        # Equal frames prove that both links lead to one vehicle if they contain the time since boot. Frames without
-        # that time, such as heartbeats, may be equal although they come from two vehicles.
-        if choice is not None and boot_time_ms(frame):
-            links_to_vehicle = {link} if choice.used is None else {link, choice.used.link}
-            for link_to_vehicle in links_to_vehicle:
-                if (candidate := choice.candidates.get(link_to_vehicle)) is not None:
-                    candidate.record_copy(frame.received_at)
+        # Equal frames prove that their links lead to one vehicle if they contain the time since boot. Frames without
+        # that time, such as heartbeats, may be equal although they come from two vehicles. Frames that were refused
+        # prove nothing, because any sender can send them over two links.
+        if choice is not None and boot_time_ms(frame) and self.copies.was_admitted:
+            self._record_copy(choice, link, frame.received_at)
         if not self.copies.was_accepted:
             return False
         self._stream(frame).received_at[link] = frame.received_at
         return True
+
+    def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
+        """Record what a copy over this link proves: links that carry the frames of the link in use lead to its vehicle.
+
+        Copies over other links prove only that these lead to one vehicle, which may be another one.
+        """
+        used = choice.used
+        if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
+            return
+        for candidate in choice.candidates.values():
+            # The copy over the link in use completes the evidence for all links that were faster.
+            is_new = link == used.link or candidate.link in (link, used.link)
+            if is_new and self.copies.arrived_over(candidate.link):
+                candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
         """Return True if a frame, of which no copy was accepted yet, is to be delivered. Then record it as accepted."""
@@ -211,7 +232,8 @@ class MergedStreams:
             is_repeated = stream.is_repeated(frame.payload, link)
             if is_repeated and link != choice.used.link:
                 return False
-        # An answer that another link delivers late must not make older telemetry of this link acceptable.
+        # An answer that another link delivers late must not make older telemetry of this link acceptable. The link in
+        # use always sets the number, because a rebooted vehicle begins again with any number.
         if link == choice.used.link or not stream.has_newer(frame):
             stream.newest_sequence = frame.sequence
         self.copies.accept()

@@ -37,7 +37,7 @@ class Candidate:
         self.link = link
         self.is_costly = is_costly
         self.received_at: float = now
-        """Time of the last frame of the system over the link."""
+        """Time of the last frame of the system over the link, up to an interval of `record_counts` (0.1 s) too late."""
         self.answered_at: float = -math.inf
         """Time of the last answer to a probe."""
         self.shared_at: float = -math.inf
@@ -47,7 +47,7 @@ class Candidate:
         self.is_stalled: bool = False
         """True while written data stays in this machine's buffers."""
         self.loss: float | None = None
-        """Fraction of frames lost over the last seconds, 0 to 1; None if unknown."""
+        """Fraction of frames lost, mostly of the last dozen frames, 0 to 1; None if unknown. A silence keeps it."""
         self.round_trip_s: float | None = None
         """Smoothed round-trip time of the probes; None before the first answer."""
         self.is_proven: bool = False
@@ -200,11 +200,13 @@ class LinkChoice:
 
     def __init__(self, *, needs_proof: bool) -> None:
         self.needs_proof: bool = needs_proof
+        """True if an autopilot was received, so that a second link must be proven before it is used."""
         self.candidates: dict[int, Candidate] = {}
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, which was received over the link in use at that time."""
-        self._hardware_link = -1  # link over which `hardware` was received; the next id over it replaces `hardware`
+        # The next id over this link replaces `hardware`: it delivered `hardware`, or showed that the vehicle rebooted.
+        self._hardware_link = -1
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
         self.previous: Candidate | None = None
@@ -353,8 +355,9 @@ class LinkChoice:
             # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
             self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
-            # A link is chosen only if it leads to the same vehicle as the previous link. The choice therefore also
-            # proves the previous link, unless its hardware id belongs to another vehicle.
+            # The chosen link was proven by comparison with the previous one (see `may_be_used`), so both lead to one
+            # vehicle, unless the hardware id of the previous link shows another one. Nothing else makes the previous
+            # link doubted, because its clock is not compared while it is in use.
             previous.is_proven = not previous.is_other_hardware
         self.previous = previous
         self.used = chosen

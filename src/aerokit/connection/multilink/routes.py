@@ -164,7 +164,8 @@ class MultiLinkRoutes:
             choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
         is_costly = _link_index(peer) in self._link.costly
         candidate = choice.record_heartbeat(_link_index(peer), frame.received_at, is_costly=is_costly)
-        if is_autopilot and not choice.needs_proof:  # So far, only other components of this system were received.
+        is_first_autopilot = is_autopilot and not choice.needs_proof
+        if is_first_autopilot:  # The links known so far lead to other components of this system.
             choice.start_with(candidate)
         if counters is not None:
             self._counters.setdefault((frame.system_id, _link_index(peer)), {})[frame.component_id] = counters
@@ -202,9 +203,11 @@ class MultiLinkRoutes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers that get a message for this component: those on the best link that reaches it.
 
-        A message for an unknown system goes to every peer. A broadcast reaches each known system once if possible, and
-        is also sent over links without a known system. Heartbeats and time messages go to all peers of all links.
-        ``message`` is None for raw frames, which count as commands.
+        No peer gets it if the link in use leads to another vehicle with the same id, and no other link works. For its
+        sender, the vehicle is then as silent as behind a lost link. A message for a system without a link in use goes
+        to every peer. A broadcast reaches each known system once if possible, and is also sent over links without a
+        known system; broadcasts of heartbeats and time go to all peers of all links. ``message`` is None for raw
+        frames, which count as commands. The call may change the link in use, and records the time of commands.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
@@ -213,7 +216,7 @@ class MultiLinkRoutes:
             now = self._now()
             self._choose(system_id, choice, now)
             if choice.used.is_other_hardware:
-                return ()  # The link in use leads to another vehicle with this id, and no other link works.
+                return ()  # DuplicateSender has reported the other vehicle.
             if message is None or message.ID in COMMANDS:
                 choice.record_command(now)
             return self._peers_on(self._link_reaching(choice, (system_id, component_id)), system_id, component_id)
@@ -223,20 +226,20 @@ class MultiLinkRoutes:
 
     # -------------------------------------------------------------------- received frames
 
-    def is_copy(self, frame: Frame, peer: Peer) -> bool:
-        """Return True if this frame was already accepted over another link, or is our own.
+    def is_copy(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
+        """Return True if this frame was already accepted over another link, or has our own ids.
 
-        PX4 forwards our heartbeats from one of its ports to its other ports. What a copy proves about its link is
-        recorded.
+        PX4 forwards our heartbeats from one of its ports to its other ports. Another program with our ids is ignored,
+        too. What a copy proves about its link is recorded. ``is_other_peer`` is the result of `arrived_on_other_peer`.
         """
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link_index(peer)
-        if not self._merged.was_accepted(frame, link):
+        if not self._merged.was_accepted(frame, link, may_prove=not is_other_peer):
             return False
         # A copy is not delivered. It still proves that this link works, and which vehicle the link leads to.
         self._probes.record_hardware(frame, link)
-        if frame.message_id == m.Heartbeat.ID and not self.arrived_on_other_peer(frame, peer):
+        if frame.message_id == m.Heartbeat.ID and not is_other_peer:
             counters = self._counters.get((frame.system_id, link), {}).get(frame.component_id)
             self.record_heartbeat(frame, peer, counters)
         return True
