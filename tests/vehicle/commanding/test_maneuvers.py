@@ -244,6 +244,14 @@ async def test_loiter_returns_after_its_time_at_the_place(kind: Callable[..., Ki
         assert now() - began == pytest.approx(7, abs=0.6)
 
 
+async def test_hold_mode_of_pilot_ends_loiter() -> None:
+    """The hold mode is one of the modes of the order, so it does not end the order itself."""
+    async with in_the_air() as flight:
+        asyncio.get_running_loop().call_later(5, flight.pilot_takes_over, CopterMode.BRAKE)
+        with pytest.raises(OperationRejected, match="the mode changed to BRAKE"):
+            await flight.vehicle.loiter(duration_s=30)
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", [SimulatedPlane, SimulatedPx4Plane])
 async def test_loiter_of_plane_circles_with_its_radius(kind: Callable[..., SimulatedVehicle]) -> None:
