@@ -61,8 +61,8 @@ async def await_progress(
 ) -> None:
     """Return when ``is_done()`` has been true for ``held_for`` seconds.
 
-    The functions are called at least every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
-    with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
+    The functions are called at least every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state
+    changes; with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
 
     Raises:
         OperationRejected: ``failure_reason()`` returned a reason why the operation cannot succeed.
