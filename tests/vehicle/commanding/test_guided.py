@@ -321,6 +321,14 @@ async def test_setpoint_stream_not_fed_stops(flying: Flight) -> None:
     await sends_nothing(flying)
 
 
+async def test_setpoint_stream_program_error_is_cause_of_stop(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match=r"has stopped: AssertionError\(\)") as caught:
+        async with flying.vehicle.guided.velocity() as stream:
+            stream._message = None
+            await anyio.sleep(1.0)
+    assert isinstance(caught.value.__cause__, AssertionError)
+
+
 async def test_setpoint_stream_stop_is_raised_once(flying: Flight) -> None:
     async with flying.vehicle.guided.velocity(valid_for_s=0.5) as stream:
         await anyio.sleep(2.0)

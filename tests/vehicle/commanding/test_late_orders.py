@@ -389,6 +389,22 @@ async def test_arm_command_is_not_sent_after_computer_slept() -> None:
         assert not flight.wire.commands(C.COMPONENT_ARM_DISARM)
 
 
+async def test_vehicle_in_mode_of_stream_holds_when_computer_slept() -> None:
+    """The mode was changed, but no value may be sent after the sleep."""
+    async with in_the_air() as flight:
+        await flight.vehicle.set_mode("LOITER")
+        heartbeats = HeldHeartbeats(flight.wire)
+        entering = asyncio.ensure_future(flight.vehicle.guided.velocity().__aenter__())
+        await anyio.sleep(1.2)
+        suspend_computer(flight.vehicle, 600.0)
+        heartbeats.stop()
+        with pytest.raises(OperationRejected, match="the computer slept; the rest of the order was not sent"):
+            await entering
+        await anyio.sleep(3.0)
+        assert flight.vehicle.mode_name == "BRAKE"
+        assert not flight.wire.setpoints()
+
+
 async def test_hold_at_end_of_orbit_is_sent_although_computer_slept() -> None:
     """The vehicle still flies the circle, so that the hold only stops it."""
     async with open_px4() as flight:

@@ -134,8 +134,9 @@ class RoundFlight:
             """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
             nonlocal wrong_radius
             flown_m = abs(status.radius)
-            is_wrong = radius_m > 0 and abs(flown_m - radius_m) > RADIUS_ERROR_M
-            wrong_radius = f"the vehicle flies a circle of {flown_m:.1f} m instead of {radius_m:g} m" if is_wrong else ""
+            wrong_radius = ""
+            if radius_m > 0 and abs(flown_m - radius_m) > RADIUS_ERROR_M:
+                wrong_radius = f"the vehicle flies a circle of {flown_m:.1f} m instead of {radius_m:g} m"
 
         def failure_reason() -> str | None:
             """Return why the rounds cannot succeed: the mode, a status text that refuses them, or a wrong radius."""
