@@ -6,7 +6,6 @@ import inspect
 import math
 import types
 from collections.abc import Callable
-from contextlib import suppress
 from enum import Enum
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
@@ -56,23 +55,22 @@ class CommandArgument(Snapshot):
             if self.is_optional and math.isnan(value):  # NaN means that the parameter is missing.
                 return None
             raise InvalidArgument(f"{self.name} = {value} is not allowed: it must be a finite number")
-        # In the texts below, nine digits identify each 32-bit float.
         if not self.range.minimum <= value <= self.range.maximum:
             low, high = self.range.minimum, self.range.maximum
-            raise InvalidArgument(f"{self.name} = {value:.9g} is not allowed: it must be {low:g} to {high:g}")
+            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: it must be {low:g} to {high:g}")
         if self.type is float:
             return value
         if value != int(value):
-            raise InvalidArgument(f"{self.name} = {value:.9g} is not allowed: it must be a whole number")
+            raise InvalidArgument(f"{self.name} = {value:g} is not allowed: it must be a whole number")
         if self.type is bool:
             if value not in (0, 1):
-                raise InvalidArgument(f"{self.name} = {value:.9g} is not allowed: it must be 0 or 1")
+                raise InvalidArgument(f"{self.name} = {value:g} is not allowed: it must be 0 or 1")
             return bool(value)
         try:
             return self.type(int(value))
         except ValueError:
             raise InvalidArgument(
-                f"{self.name} = {value:.9g} is not allowed: it must be a {self.type.__name__}"
+                f"{self.name} = {value:g} is not allowed: it must be a {self.type.__name__}"
             ) from None
 
 
@@ -100,12 +98,8 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
     inner = inspect.unwrap(getattr(function, "__func__", function))
     # get_type_hints would evaluate all annotations of the function. `holder` has only the annotation of this parameter.
     holder = types.SimpleNamespace(__annotations__={"hint": parameter.annotation})
-    if not inspect.isfunction(inner):  # functools.partial, or an object with `__call__`
-        raise InvalidArgument(f"{short_repr(inner)} is not allowed as a handler: it must be a function or a method")
-    closure = {}
-    for name, cell in zip(inner.__code__.co_freevars, inner.__closure__ or ()):  # noqa: B905 - equal lengths
-        with suppress(ValueError):  # The variable has no value yet, e.g. the function itself.
-            closure[name] = cell.cell_contents
+    cells = zip(inner.__code__.co_freevars, inner.__closure__ or ())  # noqa: B905 - equal lengths
+    closure = {name: cell.cell_contents for name, cell in cells}
     try:
         return get_type_hints(holder, inner.__globals__, closure, include_extras=True)["hint"]
     except NameError as error:
@@ -118,21 +112,19 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
 def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandArgument:
     """Interpret an annotation: a number type, which may be optional, or Annotated with a Range or a Param."""
     allowed = Range()
+    if get_origin(hint) is Annotated:
+        hint, *extras = get_args(hint)
+        for extra in extras:
+            if isinstance(extra, Range):
+                allowed = extra
+            elif isinstance(extra, Param):
+                number = extra.number
     is_optional = False
-    while (origin := get_origin(hint)) in (Annotated, Union, types.UnionType):  # Each may contain the other.
-        if origin is Annotated:
-            hint, *extras = get_args(hint)
-            for extra in extras:
-                if isinstance(extra, Range):
-                    allowed = extra
-                elif isinstance(extra, Param):
-                    number = extra.number
-        else:
-            members = [member for member in get_args(hint) if member is not type(None)]
-            is_optional = len(members) < len(get_args(hint))
-            hint = members[0] if len(members) == 1 else None  # None is refused below.
-    is_enum = isinstance(hint, type) and issubclass(hint, Enum)
-    is_number = hint in (float, int, bool) or (is_enum and all(isinstance(member.value, int) for member in hint))
+    if get_origin(hint) in (Union, types.UnionType):
+        members = [member for member in get_args(hint) if member is not type(None)]
+        is_optional = len(members) < len(get_args(hint))
+        hint = members[0] if len(members) == 1 else None  # None is refused below.
+    is_number = hint in (float, int, bool) or (isinstance(hint, type) and issubclass(hint, Enum))
     if not is_number:
         raise InvalidArgument(
             f"{function_name}(): argument {name} must be annotated with float, int, bool or an enum of integers"

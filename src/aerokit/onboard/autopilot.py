@@ -6,9 +6,9 @@ import math
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from aerokit.errors import InvalidArgument, NotSupported
-from aerokit.mavlink.enums import MavCmd, MavModeFlag
-from aerokit.onboard.commands import RELATIVE_FRAMES, overrides
+from aerokit.errors import NotSupported
+from aerokit.mavlink.enums import MavCmd
+from aerokit.onboard.commands import overrides
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
@@ -86,19 +86,13 @@ def add_autopilot(
         await call("arm" if is_armed else "disarm", is_forced)
         set_flight_state(is_armed, None)
 
-    async def set_mode(_: CommandRequest, base_mode: int, custom_mode: int) -> None:
-        if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:  # ArduPilot refuses this, too.
-            raise InvalidArgument(f"base_mode = {base_mode} is not allowed: CUSTOM_MODE_ENABLED (1) must be set")
+    async def set_mode(_: CommandRequest, base_mode: float | None, custom_mode: int) -> None:
         await call("set_mode", custom_mode)
         set_flight_state(None, custom_mode)
 
     async def take_off(request: CommandRequest) -> None:
         *_, altitude_m = request.params
-        is_given = not math.isnan(altitude_m)
-        is_relative = request._command.altitude_frame in RELATIVE_FRAMES
-        if is_given and not (is_relative and math.isfinite(altitude_m)):
-            raise InvalidArgument(f"altitude = {altitude_m:g} is not allowed: it must be metres above home")
-        await call("take_off", altitude_m if is_given else None)
+        await call("take_off", None if math.isnan(altitude_m) else altitude_m)
 
     async def reboot(_: CommandRequest, action: int) -> None:
         if action not in (_REBOOT, _SHUTDOWN):

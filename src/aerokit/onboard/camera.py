@@ -322,7 +322,7 @@ class CameraAdapter(CameraDevice):
         One method serves both, because CAMERA_ZOOM_TYPE and SET_FOCUS_TYPE have the same numbers. A step becomes a
         move to a percentage.
         """
-        if kind == CameraZoomType.STEP and math.isfinite(current_percent) and math.isfinite(value):
+        if kind == CameraZoomType.STEP and math.isfinite(current_percent):
             kind = CameraZoomType.RANGE
             value = max(0.0, min(100.0, current_percent + value * _STEP_PERCENT))
         if kind == CameraZoomType.RANGE and 0.0 <= value <= 100.0:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
 _AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
-RELATIVE_FRAMES: frozenset[int] = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
+_RELATIVE_FRAMES = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
 
 
 class CommandResult(Snapshot):
@@ -69,18 +69,16 @@ class CommandRequest:
         """Position of the command, with the altitude above home or above mean sea level.
 
         Raises:
-            InvalidArgument: latitude or longitude is missing or out of range, or the frame has another altitude.
+            InvalidArgument: latitude or longitude is missing or out of range, or the frame is not global.
         """
         frame = self._command.altitude_frame
         *_, latitude, longitude, altitude = self.params
         altitude_m = altitude if math.isfinite(altitude) else None
         if frame in _AMSL_FRAMES:
             return Position(latitude, longitude, altitude_amsl_m=altitude_m)
-        if frame in RELATIVE_FRAMES:
+        if frame in _RELATIVE_FRAMES:
             return Position(latitude, longitude, altitude_relative_m=altitude_m)
-        raise InvalidArgument(
-            f"frame = {frame} is not allowed: it must be a global MAV_FRAME with the altitude above home or sea level"
-        )
+        raise InvalidArgument(f"frame = {frame} is not allowed: it must be a global MAV_FRAME")
 
     def report_progress(self, percent: int) -> None:
         """Send IN_PROGRESS with this percentage (0 to 100) now, and repeat it until the next report."""
@@ -141,18 +139,9 @@ class ComponentCommands:
         Raises:
             InvalidArgument: the command already has a handler, or an annotation of the function is not supported.
         """
-        self.add_handlers({command: partial(self._execute, function, arguments_of(function))})
-
-    def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
-        """Register handlers of a protocol server, which check the parameters themselves.
-
-        Raises:
-            InvalidArgument: a command already has a handler.
-        """
-        for command in handlers:
-            if command in self.handlers:
-                raise InvalidArgument(f"{command_name(command)} already has a handler")
-        self.handlers.update(handlers)
+        if command in self.handlers:
+            raise InvalidArgument(f"{command_name(command)} already has a handler")
+        self.handlers[command] = partial(self._execute, function, arguments_of(function))
 
     def add_guarded(self, handlers: Mapping[int, CommandHandler]) -> None:
         """Register handlers that call the program's code. An exception of this code is answered as a MAV_RESULT."""
@@ -167,7 +156,7 @@ class ComponentCommands:
 
             return guarded
 
-        self.add_handlers({command: guard(handler) for command, handler in handlers.items()})
+        self.handlers.update({command: guard(handler) for command, handler in handlers.items()})
 
     async def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function of the program, in a thread if it may block (`uses_threads`), and wait for its result."""
@@ -195,7 +184,7 @@ class ComponentCommands:
         async def run(request: CommandRequest) -> int:
             return await function(request._command)
 
-        self.add_handlers({command: partial(self._execute, run, ())})
+        self.handlers[command] = partial(self._execute, run, ())
 
     def cancel_all(self) -> None:
         self._running.cancel_all()
@@ -230,7 +219,7 @@ class ComponentCommands:
         def report(percent: int) -> None:
             if loop is None:
                 self._running.report(running, percent)
-            else:  # The handler may run in a thread, which must not call the event loop's objects directly.
+            else:  # The handler runs in a thread, which must not call the event loop's objects directly.
                 loop.call_soon_threadsafe(self._running.report, running, percent)
 
         request = CommandRequest(command, report)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import anyio
 
 from aerokit._internal.arguments import checks_arguments
-from aerokit.connection.tasks import BackgroundTasks, run_shielded
+from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import CompMetadataType, MavCmd, MavModeFlag, MavSeverity, MavState, MavType
@@ -98,12 +98,11 @@ class OnboardComponent:
         self._commands.cancel_all()
         try:
             await self._tasks.aclose()
+            with anyio.CancelScope(shield=True):  # A cancelled program must save its parameters too.
+                await self.parameters.aclose()
         finally:
-            try:
-                await run_shielded(self.parameters.aclose())  # A cancelled program must save its parameters too.
-            finally:
-                self._ftp.close()
-                self._host.close()
+            self._ftp.close()
+            self._host.close()
 
     def _use_threads(self) -> None:
         """Call the program's plain functions in threads, because they may block. aerokit.sync calls this method."""
@@ -136,13 +135,13 @@ class OnboardComponent:
         """Milliseconds since the component started, for the field ``time_boot_ms`` of messages."""
         return self._host.time_boot_ms
 
-    def set_state(self, state: int, *, base_mode: int | None = None, custom_mode: int | None = None) -> None:
+    def set_state(self, state: int, *, base_mode: int = 0, custom_mode: int = 0) -> None:
         """Change the state and mode in the heartbeat, and send a heartbeat at once.
 
         Args:
             state: MAV_STATE: ACTIVE, STANDBY, CALIBRATING, CRITICAL …
-            base_mode: MAV_MODE_FLAG; None leaves it unchanged.
-            custom_mode: mode number of this component, 0 to 4294967295; None leaves it unchanged.
+            base_mode: MAV_MODE_FLAG.
+            custom_mode: mode number of this component, 0 to 4294967295.
 
         Raises:
             InvalidArgument: a value is out of range.
@@ -151,12 +150,7 @@ class OnboardComponent:
             raise InvalidArgument(f"state = {state} is not allowed: it must be a MAV_STATE (0 to 8)")
         old = self._heartbeat
         heartbeat = m.Heartbeat(
-            old.type,
-            old.autopilot,
-            old.base_mode if base_mode is None else base_mode,
-            old.custom_mode if custom_mode is None else custom_mode,
-            system_status=state,
-            mavlink_version=MAVLINK_VERSION,
+            old.type, old.autopilot, base_mode, custom_mode, system_status=state, mavlink_version=MAVLINK_VERSION
         )
         heartbeat.encode()  # Raises InvalidArgument before the old heartbeat is replaced.
         self._heartbeat = heartbeat
@@ -176,10 +170,9 @@ class OnboardComponent:
         float, int, bool or an enum. Add ``| None`` if the parameter may be missing, and limit its range by
         ``Annotated[float, Range(0, 50)]``. A command whose values do not fit is DENIED, and the function is not called.
 
-        The function returns None or True for ACCEPTED, False for FAILED, a MAV_RESULT, or a
-        :class:`~aerokit.onboard.CommandResult`. An exception becomes the result and a status text: InvalidArgument,
-        ValueError and PermissionError DENIED, BusyError TEMPORARILY_REJECTED, NotSupported UNSUPPORTED, all others
-        FAILED.
+        The function returns None for ACCEPTED, a MAV_RESULT, or a :class:`~aerokit.onboard.CommandResult`. An exception
+        becomes the result and a status text: InvalidArgument and ValueError DENIED, BusyError TEMPORARILY_REJECTED,
+        NotSupported UNSUPPORTED, all others FAILED.
 
         While a coroutine runs, the sender gets IN_PROGRESS, and COMMAND_CANCEL cancels the coroutine (CANCELLED).
         Another command with the same MAV_CMD is TEMPORARILY_REJECTED meanwhile; a repeated transmission is not executed
@@ -327,7 +320,8 @@ class OnboardComponent:
             flags |= MavModeFlag.SAFETY_ARMED
         elif is_armed is False:
             flags &= ~MavModeFlag.SAFETY_ARMED
-        self.set_state(old.system_status, base_mode=int(flags), custom_mode=custom_mode)
+        mode = old.custom_mode if custom_mode is None else custom_mode
+        self.set_state(old.system_status, base_mode=int(flags), custom_mode=mode)
 
     def add_camera(self, camera: CameraDriver) -> None:
         """Serve the camera protocol: photos, videos, storage, streams, zoom, focus, tracking, settings.
@@ -338,8 +332,8 @@ class OnboardComponent:
             camera: an instance of your subclass of :class:`~aerokit.onboard.CameraDriver`.
 
         Raises:
-            InvalidArgument: the component already has a camera, or a handler for one of its commands; or it has
-                parameters although the camera has a definition file.
+            InvalidArgument: the component already has a camera, or has parameters although the camera has a definition
+                file.
             FileFormatError: the definition file is damaged.
         """
         from aerokit.onboard.parts import add_camera  # Imported here, because few components need it.
@@ -355,7 +349,7 @@ class OnboardComponent:
             gimbal: an instance of your subclass of :class:`~aerokit.onboard.GimbalDriver`.
 
         Raises:
-            InvalidArgument: the component already has a gimbal, or a handler for one of its commands.
+            InvalidArgument: the component already has a gimbal.
         """
         from aerokit.onboard.parts import add_gimbal  # Imported here, because few components need it.
 

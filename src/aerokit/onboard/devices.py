@@ -99,24 +99,14 @@ _WINCH_METHODS: dict[int, str] = {
 STATUS_HZ = 5.0
 
 
-def _check_instance(services: ComponentServices, instance: float | None) -> None:
-    """Refuse a command for another winch or gripper. Several components get a command that is sent to all components.
-
-    A component has one device. Its number is 1 or the component id; 0 means all devices (DO_GRIPPER in common.xml).
-    """
-    if instance not in (None, 0, 1, services.host.component_id):
-        raise InvalidArgument(f"instance = {instance} is not allowed: this component has only number 1")
-
-
 def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
     """Execute DO_WINCH by the driver, and send WINCH_STATUS."""
 
-    # The arguments are the parameters of the command, in order.
+    # The arguments are the parameters of the command, in order. A component has one winch, so `instance` is ignored.
     async def do_winch(
         _: CommandRequest, instance: float | None, action: int, length: float | None, rate: float | None
     ) -> None:
         """Call the driver's method for the action, with the parameters that the action needs."""
-        _check_instance(services, instance)
         method = _WINCH_METHODS.get(action, "")
         if not method or not overrides(winch, WinchDriver, method):
             raise NotSupported(f"this winch does not support action {action}")
@@ -149,9 +139,8 @@ def add_gripper(
 ) -> None:
     """Execute DO_GRIPPER by the two functions."""
 
-    # The arguments are the parameters of the command, in order.
+    # The arguments are the parameters of the command. A component has one gripper, so `instance` is ignored.
     async def do_gripper(_: CommandRequest, instance: float | None, action: GripperActions) -> None:
-        _check_instance(services, instance)
         if action == GripperActions.RELEASE:
             await services.commands.call(release)
         elif action == GripperActions.GRAB:
@@ -177,8 +166,8 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
-            # NONE means that the reason was sent as a status text. If the authorizer itself has failed, there is no
-            # reason (GENERIC).
+            # After DENIED, the status text has the program's reason, which NONE stands for. Any other result means that
+            # the authorizer itself failed, so there is no specific reason (GENERIC).
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)
         if isinstance(answer, CommandResult):

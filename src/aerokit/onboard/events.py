@@ -69,7 +69,8 @@ class EventSender:
         """Send requested events again; answer with an error if none of them is stored any more."""
         # Sequence numbers have 16 bits and wrap around, so `last_sequence` may be below `first_sequence`.
         count = ((request.last_sequence - request.first_sequence) & 0xFFFF) + 1
-        stored = [event for event in self._sent if (event.sequence - request.first_sequence) & 0xFFFF < count]
+        requested = {(request.first_sequence + i) & 0xFFFF for i in range(min(count, MAX_STORED_EVENTS))}
+        stored = [event for event in self._sent if event.sequence in requested]
         for event in stored:
             self._host.send(event, sender)
         if not stored:

@@ -123,7 +123,7 @@ class DirectoryFiles:
 
     @_raises_file_fault
     def entries(self, path: str) -> list[Entry]:
-        """Return the regular files and directories in a directory, at most `MAX_ENTRIES`, sorted by name."""
+        """Return the files and directories in a directory, sorted by name."""
         sizes: dict[str, int | None] = {}  # None for directories
         if self._root is not None:
             try:

@@ -27,7 +27,7 @@ GENERAL_PATH, PARAMETER_PATH = "/general.json", "/parameter.json"
 class Identity(Snapshot):
     """Name and versions of a component.
 
-    ``version`` has one to four numbers: ``"1.4.2"``. ``uid`` is a 64-bit serial number, 0 if there is none.
+    ``version`` has three or four numbers: ``"1.4.2"``. ``uid`` is a 64-bit serial number, 0 if there is none.
     """
 
     vendor: str = "aerokit"
@@ -39,8 +39,7 @@ class Identity(Snapshot):
 
     def _check(self) -> None:
         # The texts must fit into the fields of COMPONENT_INFORMATION_BASIC.
-        sizes = {"vendor": 32, "model": 32, "version": 24, "hardware_version": 24, "serial_number": 32}
-        for name, size in sizes.items():
+        for name, size in (("vendor", 32), ("model", 32), ("version", 24), ("hardware_version", 24)):
             value = getattr(self, name)
             if not isinstance(value, str) or len(value.encode()) > size:
                 raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a text of at most {size} bytes")
@@ -51,12 +50,12 @@ class Identity(Snapshot):
     @property
     def version_number(self) -> int:
         """The version as an integer with one byte for each number, as AUTOPILOT_VERSION has it."""
-        parts = self.version.split(".")
-        if len(parts) > 4 or not all(part.isdecimal() and int(part) <= 255 for part in parts):
+        parts = [*self.version.split("."), "0", "0", "0"][:4]
+        if not all(part.isdecimal() and int(part) <= 255 for part in parts):
             raise InvalidArgument(
-                f"version = {self.version!r} is not allowed: it must be one to four numbers up to 255, such as '1.4.2'"
+                f"version = {self.version!r} is not allowed: it must consist of numbers up to 255, such as '1.4.2'"
             )
-        major, minor, patch, release_type = [*map(int, parts), 0, 0, 0][:4]
+        major, minor, patch, release_type = map(int, parts)
         return major << 24 | minor << 16 | patch << 8 | release_type
 
 

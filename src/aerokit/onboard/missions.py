@@ -67,12 +67,7 @@ class ComponentMissions:
 
         A request to change the current item is refused if the function returns False or raises an exception. Without a
         function, all requests are refused.
-
-        Raises:
-            InvalidArgument: the function is a coroutine function.
         """
-        if inspect.iscoroutinefunction(function):
-            raise InvalidArgument("on_set_current needs a plain function, because the request is answered at once")
         self._on_current = function
         return function
 

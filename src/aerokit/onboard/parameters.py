@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
@@ -94,15 +93,13 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             values: maps each allowed number to its name; other numbers are refused.
             read_only: True if only this program can change it.
             reboot_required: True if a change takes effect only after a reboot; reported in the metadata.
-            on_set: plain function, called on the event loop with a value that another program sets, before the value is
-                stored. To refuse the value, this function raises InvalidArgument.
+            on_set: called on the event loop with a value that another program sets, before the value is stored. To
+                refuse the value, this function raises InvalidArgument.
 
         Raises:
-            InvalidArgument: the name is invalid or in use, the default or ``on_set`` is not allowed, or the component
-                already has 1000 parameters.
+            InvalidArgument: the name is invalid or in use, the default is not allowed, or the component already has
+                1000 parameters.
         """
-        if inspect.iscoroutinefunction(on_set):
-            raise InvalidArgument("on_set must be a plain function, because the value is answered at once")
         check_name(name)
         if self._has_camera_settings:
             raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
@@ -190,7 +187,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a text")
         if metadata.values and checked not in metadata.values:
             raise InvalidArgument(
-                f"{name} = {checked} is not allowed: it must be {', '.join(map(str, metadata.values))}"
+                f"{name} = {checked:g} is not allowed: it must be {', '.join(map(str, metadata.values))}"
             )
         # Leave out two checks of `problem`. The allowed values were checked above, and this program may change
         # read-only parameters.
@@ -222,18 +219,14 @@ class ComponentParameters(Mapping[str, ParameterValue]):
                 write = partial(write_atomically, path, self._file_text())
                 await asyncio.get_running_loop().run_in_executor(None, write)
         except OSError as error:
-            self._is_dirty = True
             logger.error("the parameters of the component could not be saved: %s", error)
-            self._host.send_text(MavSeverity.ERROR, f"parameters could not be saved: {error.strerror or error}")
+            self._host.send_text(MavSeverity.ERROR, f"parameters could not be saved: {error.strerror}")
         finally:
             self._save_task = None
 
     async def aclose(self) -> None:
-        """Wait until the file contains the last change. A failed write is tried once more."""
+        """Wait until the file contains the last change."""
         if self._save_task is not None:
-            await self._save_task
-        if self._is_dirty and self._path is not None:
-            self._save_task = asyncio.get_running_loop().create_task(self._save(self._path))
             await self._save_task
 
     def json(self) -> bytes:

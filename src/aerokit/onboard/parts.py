@@ -59,7 +59,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
         if command == MavCmd.STORAGE_FORMAT and not overrides(camera, CameraDriver, "format_storage"):
             continue  # The command stays UNSUPPORTED.
         services.commands.add_raw(command, partial(_run_if_implemented, handler))
-    services.commands.add_handlers(legacy_requests(streams))
+    services.commands.handlers.update(legacy_requests(streams))
     return adapter
 
 

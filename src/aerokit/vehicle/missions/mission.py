@@ -374,13 +374,17 @@ class MissionControl(VehiclePlan["Mission"]):
                 session,
                 "mission.wait_finished",
                 is_done=end.has_ended,
-                failure_reason=lambda: end.failure(self._order, is_paused=self._is_paused),
+                failure_reason=lambda: end.failure(self._order, is_paused=self._is_held_by_pause()),
                 describe=end.describe,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                stall_reason=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
+                stall_reason=MissionStallDetector(session, self._tracker, mode, items, self._is_held_by_pause),
                 at_positions=False,  # The next poll is soon enough, and a mission may take hours.
             )
+
+    def _is_held_by_pause(self) -> bool:
+        """Return True from `pause` until `start` or `resume`, or until another party has changed the mode."""
+        return self._is_paused and self._order is not None and not self._order.has_lost_mode
 
     @property
     def explains_mode(self) -> bool:
