@@ -9,6 +9,7 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from call_table import Row
@@ -98,7 +99,8 @@ def test_arm_is_not_repeated_against_other_station(autopilot: str) -> None:
 def test_directed_turn_without_ack_is_sent_once(lost: str, place: str) -> None:
     """Several HEARTBEATs report the state from before the order, which would allow a repetition of other orders."""
     row = replace(BY_NAME["set_heading with a direction"], place=place)
-    disturbances = Disturbances(command=row.command, **{f"lost_{lost}": 9})
+    losses: dict[str, Any] = {f"lost_{lost}": 9}
+    disturbances = Disturbances(command=row.command, **losses)
     flown = fly(Case(row, "ardupilot", disturbances))
     assert isinstance(flown.error, CommandTimeout)
     sent_at = [sent.at for sent in flown.traffic.sent if getattr(sent.message, "command", 0) == row.command]
