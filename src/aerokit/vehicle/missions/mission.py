@@ -345,7 +345,8 @@ class MissionControl(VehiclePlan["Mission"]):
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end, including a landing at its end.
 
-        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
+        A :meth:`pause` by another task does not end the wait, but a pilot who then changes to another mode than that of
+        the mission does. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
         a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
         completion shows whether the vehicle lands.
