@@ -25,7 +25,7 @@ from provoked import (
 )
 
 import aerokit
-from aerokit import Position, PositionSetpoint, Signing, VelocitySetpoint, errors, messages
+from aerokit import BodyVelocitySetpoint, Position, PositionSetpoint, Signing, VelocitySetpoint, errors, messages
 from aerokit.mavlink.enums import MavCmd
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.vehicle.commanding.setpoints import AttitudeSetpoint, LocalPositionSetpoint
@@ -440,6 +440,7 @@ def _parts() -> Table:
         ("SetpointStream", stopped): P(lambda s: _stop(s, _nothing), airborne),
         ("SetpointStream.set", stopped): P(lambda s: _stop(s, _set_after_the_end), airborne),
         ("SetpointStream.set", "InvalidArgument"): P(_set_too_much, airborne),
+        ("SetpointStream.set", "ValueUnknownError"): P(_set_body_velocity_without_heading, airborne),
         ("SetpointStream.fly", stopped): later(lambda s: _fly(s), pilot, 1.0),
         ("StateCell.fresh", "StaleValueError"): P(_old_value, grounded),
         ("StateCell.fresh", "ValueUnknownError"): P(
@@ -459,6 +460,12 @@ def _parts() -> Table:
         ("Subscription.get", "ConnectionClosed"): later(_read, lambda s: s.vehicle.connection.close(), 0.1, alone=True),
         ("Subscription.get", "LinkLost"): later(_read, lost, 0.1, alone=True),
     }
+
+
+async def _set_body_velocity_without_heading(stage: Stage) -> None:
+    async with stage.vehicle.guided.body_velocity() as stream:
+        _clear_state("heading_deg")(stage)
+        stream.set(BodyVelocitySetpoint(forward_m_s=1, yaw_deg=90))
 
 
 async def _fly(stage: Stage) -> None:

@@ -490,6 +490,7 @@ class SetpointStream(StreamTwin[SetpointT]):
 
         Raises:
             InvalidArgument: a value is out of range; the previous set-point remains in force until it expires.
+            ValueUnknownError: a body velocity has a ``yaw_deg``, and ArduPilot has not reported its heading for 2 s.
             SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         self._loop.call(self.aio.set, setpoint)
@@ -534,7 +535,11 @@ class Guided(TwinOf["AsyncGuided"]):
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[BodyVelocitySetpoint]:
-        """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
+        """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
+
+        With ``yaw_deg`` on ArduPilot, the direction is that of the vehicle's nose at the time of ``set``. Supply a new
+        set-point often while the vehicle turns.
+        """
         return SetpointStream(
             self._loop,
             self._loop.call(
@@ -1341,7 +1346,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
         Args:
             command: the MAV_CMD.
-            params: param1 to param7; missing ones are 0.
+            params: param1 to param7; missing ones are 0, even where the command allows NaN.
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
@@ -1363,8 +1368,9 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
         z: float = 0.0,
         component_id: int | None = None,
     ) -> None:
-        """Send a COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` in metres in ``frame``.
+        """Send a COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
         Otherwise works like :meth:`command`.
         """
         self._loop.run(self.aio.command_int, command, *params, frame=frame, x=x, y=y, z=z, component_id=component_id)
@@ -2674,7 +2680,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end, including a landing at its end.
 
-        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
+        A :meth:`pause` by another task does not end the wait, but a pilot who then changes to another mode than that of
+        the mission does. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
         a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
         completion shows whether the vehicle lands.
@@ -4093,7 +4100,7 @@ class Vehicle(VehicleTwin):
 
         Args:
             command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, or NaN where the command allows it.
+            params: param1 to param7; missing ones are 0, even where the command allows NaN.
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
                 command that changes more than streams is sent again only right after a HEARTBEAT, and only if the mode
@@ -4190,9 +4197,8 @@ class Vehicle(VehicleTwin):
         vehicle hold nor monitors late arming; use the actions for that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order. This
-                order ends earlier orders about any of its subjects. An order about mode or motion also ends the action
-                in progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. An order ends each earlier order whose first subject is one
+                of its own subjects. An order about mode or motion also ends the action in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
@@ -4210,11 +4216,12 @@ class Vehicle(VehicleTwin):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped messages. For the duration of the
-        block, aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if
-        another subscriber needs it. None requests streamed messages at their default rate. Messages that are not
-        streamed (STATUSTEXT, acks), and HEARTBEAT, are not requested. For a camera or another component use
-        ``vehicle.component(100).subscribe(...)``.
+        Messages of all components of the vehicle are delivered. ``capacity=1`` keeps only the latest message;
+        ``missed`` counts the dropped messages. For the duration of the block, aerokit requests these messages from the
+        autopilot at ``rate_hz`` (above 0, at most 1000), or faster if another subscriber needs it. With
+        ``rate_hz=None``, streamed messages are requested at their default rate. Messages that are not streamed
+        (STATUSTEXT, acks), and HEARTBEAT, are not requested. To request messages from a camera or another component,
+        use ``vehicle.component(100).subscribe(...)``.
 
         Raises:
             InvalidArgument: no type was given, the rate is out of range, or the dialect does not contain a message.
@@ -4237,7 +4244,7 @@ class Vehicle(VehicleTwin):
         requests only those common states that are missing.
 
         Raises:
-            InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
+            InvalidArgument: the rate is out of range: it must be above 0 and at most 1000. Nothing was sent.
         """
         return self._block(self.aio.streams(rate_hz))
 

@@ -59,6 +59,13 @@ async def test_distance_is_compared_exactly(flying: Flight, metres: float, is_al
     assert bool(flying.wire.commands(192)) is is_allowed
 
 
+async def test_go_to_place_far_above_sends_nothing(flying: Flight) -> None:
+    target = flying.vehicle.position.value.offset(up_m=2000.0)
+    with pytest.raises(InvalidArgument, match=r"the place is 2,000 m away, more than max_distance_m = 1,000;"):
+        await flying.vehicle.go_to(target, max_distance_m=1000.0)
+    assert not flying.wire.commands(192)
+
+
 @pytest.mark.parametrize("kind", ["mission", "rally"])
 async def test_plan_with_far_item_is_not_uploaded(grounded: Flight, kind: str) -> None:
     here, far = grounded.vehicle.position.value, exchanged(grounded)

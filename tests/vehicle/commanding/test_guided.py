@@ -21,6 +21,7 @@ from aerokit.errors import (
     InvalidArgument,
     NotSupported,
     SetpointStreamStopped,
+    StaleValueError,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.sim import SimulatedPx4
@@ -241,6 +242,18 @@ async def test_body_velocity_with_heading_keeps_heading(flying: Flight) -> None:
         assert flying.copter.motion.velocity_north == pytest.approx(-2.0, abs=0.2)
 
 
+async def test_body_velocity_with_old_heading_is_not_sent(flying: Flight) -> None:
+    async with flying.vehicle.guided.body_velocity(valid_for_s=10.0) as stream:
+        for message_type in (m.GlobalPositionInt, m.VfrHud):
+            flying.copter.faults.lose(message_type, times=1000)
+        await anyio.sleep(3.0)
+        with pytest.raises(StaleValueError, match="heading_deg"):
+            stream.set(BodyVelocitySetpoint(forward_m_s=2.0, yaw_deg=180.0))
+        flying.wire.clear()
+        await anyio.sleep(1.0)
+        assert {(sent.vx, sent.vy) for sent in flying.wire.all(m.SetPositionTargetLocalNed)} == {(0.0, 0.0)}
+
+
 async def test_setpoint_stream_entry_changes_to_guided(flying: Flight) -> None:
     flying.pilot_takes_over()
     await anyio.sleep(1.0)
@@ -319,6 +332,14 @@ async def test_setpoint_stream_not_fed_stops(flying: Flight) -> None:
             assert fed_at + 0.8 <= last <= fed_at + 1.01
             assert flying.copter.mode.number == BRAKE
     await sends_nothing(flying)
+
+
+async def test_setpoint_stream_program_error_is_cause_of_stop(flying: Flight) -> None:
+    with pytest.raises(SetpointStreamStopped, match=r"has stopped: AssertionError\(\)") as caught:
+        async with flying.vehicle.guided.velocity() as stream:
+            stream._message = None
+            await anyio.sleep(1.0)
+    assert isinstance(caught.value.__cause__, AssertionError)
 
 
 async def test_setpoint_stream_stop_is_raised_once(flying: Flight) -> None:

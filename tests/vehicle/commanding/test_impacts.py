@@ -38,6 +38,12 @@ async def orbit(flight: Any) -> None:
     await flight.vehicle.orbit(place_of(flight), radius_m=20.0, turns=20)
 
 
+async def loiter(flight: Any) -> None:
+    here = place_of(flight)
+    # Without an altitude, the vehicle on the ground is still at the place.
+    await flight.vehicle.loiter(Position(here.latitude_deg, here.longitude_deg), duration_s=60.0)
+
+
 async def figure_eight(flight: Any) -> None:
     await flight.vehicle.figure_eight(place_of(flight), major_radius_m=40.0, minor_radius_m=15.0, rounds=20)
 
@@ -66,7 +72,7 @@ async def fly_mission(flight: Any) -> None:
 
 CALLS: dict[str, Callable[[Any], Awaitable[None]]] = {
     call.__name__: call
-    for call in (go_to, take_off, orbit, figure_eight, fly_velocity, follow, return_to_launch, fly_mission)
+    for call in (go_to, take_off, orbit, loiter, figure_eight, fly_velocity, follow, return_to_launch, fly_mission)
 }
 
 

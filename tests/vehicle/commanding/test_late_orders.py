@@ -389,6 +389,35 @@ async def test_arm_command_is_not_sent_after_computer_slept() -> None:
         assert not flight.wire.commands(C.COMPONENT_ARM_DISARM)
 
 
+async def test_vehicle_in_mode_of_stream_holds_when_computer_slept() -> None:
+    """The mode was changed, but no value may be sent after the sleep."""
+    async with in_the_air() as flight:
+        await flight.vehicle.set_mode("LOITER")
+        heartbeats = HeldHeartbeats(flight.wire)
+        entering = asyncio.ensure_future(flight.vehicle.guided.velocity().__aenter__())
+        await anyio.sleep(1.2)
+        suspend_computer(flight.vehicle, 600.0)
+        heartbeats.stop()
+        with pytest.raises(OperationRejected, match="the computer slept; the rest of the order was not sent"):
+            await entering
+        await anyio.sleep(3.0)
+        assert flight.vehicle.mode_name == "BRAKE"
+        assert not flight.wire.setpoints()
+
+
+async def test_go_to_holds_when_computer_slept_before_its_speed() -> None:
+    async with in_the_air(latency_s=0.2) as flight:
+        going = flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500), speed_m_s=3.0)
+        task = asyncio.ensure_future(going)
+        await anyio.sleep(0.1)
+        suspend_computer(flight.vehicle, 600.0)
+        with pytest.raises(OperationRejected, match="the computer slept; the rest of the order was not sent"):
+            await task
+        await anyio.sleep(4.0)
+        assert not flight.wire.commands(C.DO_CHANGE_SPEED)
+        assert flight.vehicle.mode_name == "BRAKE"
+
+
 async def test_hold_at_end_of_orbit_is_sent_although_computer_slept() -> None:
     """The vehicle still flies the circle, so that the hold only stops it."""
     async with open_px4() as flight:

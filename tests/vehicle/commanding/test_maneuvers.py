@@ -37,6 +37,7 @@ from aerokit.sim import (
     SimulatedVehicle,
     simulated_link,
 )
+from aerokit.sim.px4.modes import HOLD
 from aerokit.vehicle.commanding.follow import FollowedTarget
 from aerokit.vehicle.state.movement import Velocity
 
@@ -208,6 +209,35 @@ async def test_orbit_px4_flying_another_circle_is_held() -> None:
         await vehicle.mode.wait_until(lambda mode: mode.name == "LOITER", timeout=5)
 
 
+async def test_hold_mode_of_pilot_during_orbit_sends_no_hold() -> None:
+    """The status of the previous circle, with another radius, is no reason to order a hold."""
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    async with hovering(simulated) as (vehicle, wire):
+        plan = simulated.flight.orbit.plan
+        simulated.flight.orbit.plan = lambda _, *others: plan(20.0, *others)  # type: ignore[method-assign]
+        asyncio.get_running_loop().call_later(1.5, simulated.switch_to, HOLD)
+        with pytest.raises(OperationRejected, match="the mode changed to LOITER"):
+            await vehicle.orbit(vehicle.position.value, radius_m=500)
+        await anyio.sleep(3)
+        assert wire.commands(MavCmd.DO_REPOSITION) == []
+
+
+async def test_orbit_of_moving_copter_needs_new_positions() -> None:
+    """Otherwise the center would be displaced by the distance that the vehicle has flown since its last position."""
+    async with in_the_air() as flight:
+        vehicle, here = flight.vehicle, flight.copter.motion
+        center, center_north_m, center_east_m = vehicle.position.value.offset(north_m=60), here.north + 60, here.east
+        going = asyncio.ensure_future(vehicle.go_to(vehicle.position.value.offset(north_m=300)))
+        await anyio.sleep(8)
+        flight.copter.faults.lose(m.GlobalPositionInt, times=20)
+        await anyio.sleep(1.2)
+        await vehicle.orbit(center, radius_m=12, speed_m_s=4, turns=0.25)
+        with pytest.raises(OperationRejected):
+            await going
+        last = flight.wire.last(m.SetPositionTargetLocalNed)
+        assert math.hypot(last.x - center_north_m, last.y - center_east_m) == pytest.approx(12, abs=0.5)
+
+
 @pytest.mark.exhaustive
 @BOTH
 async def test_figure_eight_reaches_both_lobes_and_its_center(kind: Callable[..., Kind]) -> None:
@@ -242,6 +272,14 @@ async def test_loiter_returns_after_its_time_at_the_place(kind: Callable[..., Ki
         began = now()
         await vehicle.loiter(duration_s=7)
         assert now() - began == pytest.approx(7, abs=0.6)
+
+
+async def test_hold_mode_of_pilot_ends_loiter() -> None:
+    """The hold mode is one of the modes of the order, so it does not end the order itself."""
+    async with in_the_air() as flight:
+        asyncio.get_running_loop().call_later(5, flight.pilot_takes_over, CopterMode.BRAKE)
+        with pytest.raises(OperationRejected, match="the mode changed to BRAKE"):
+            await flight.vehicle.loiter(duration_s=30)
 
 
 @pytest.mark.exhaustive

@@ -560,6 +560,18 @@ async def test_mode_reported_after_refusal_succeeds(grounded: Flight) -> None:
 
 
 @pytest.mark.anyio
+async def test_refused_second_mode_of_posted_order_raises(grounded: Flight) -> None:
+    vehicle = grounded.vehicle
+    guided, loiter = map(vehicle.autopilot.find_mode, ("GUIDED", "LOITER"))
+    with vehicle.posted("mode", modes=(guided, loiter)) as order:
+        await order.set_mode(guided)
+        grounded.copter.faults.refuse(SET_MODE, MavResult.DENIED)
+        with pytest.raises(CommandRejected, match="DENIED"):
+            await order.set_mode(loiter)
+    assert vehicle.mode_name == "GUIDED"
+
+
+@pytest.mark.anyio
 @pytest.mark.parametrize("ends", ["the order", "the vehicle", "silence"])
 async def test_legacy_set_mode_is_not_sent_in_silence(grounded: Flight, ends: str) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -210,6 +211,23 @@ async def test_pilot_mode_change_after_refused_pause_ends_wait_finished() -> Non
         flight.pilot_takes_over(CopterMode.LOITER)
         with pytest.raises(OperationRejected, match="the mode changed to LOITER"):
             await mission.wait_finished(timeout=30)
+
+
+async def test_pilot_after_resuming_paused_mission_ends_wait_finished() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        waiting = asyncio.ensure_future(mission.wait_finished())
+        await mission.pause()
+        flight.pilot_takes_over(CopterMode.AUTO)
+        await anyio.sleep(3.0)
+        assert not waiting.done()
+        assert not flight.vehicle.is_flown_by_program
+        flight.pilot_takes_over(CopterMode.LOITER)
+        with pytest.raises(OperationRejected, match="the mode changed to LOITER"):
+            await asyncio.wait_for(waiting, 30)
 
 
 async def test_pause_at_last_item_is_not_end_of_mission() -> None:

@@ -88,7 +88,11 @@ class Guided:
         valid_for_s: float = 1.0,
         max_lag_s: float = 0.5,
     ) -> SetpointStream[BodyVelocitySetpoint]:
-        """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED)."""
+        """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
+
+        With ``yaw_deg`` on ArduPilot, the direction is that of the vehicle's nose at the time of ``set``. Supply a new
+        set-point often while the vehicle turns.
+        """
         return self._stream("velocity", self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
 
     def acceleration(
@@ -245,6 +249,7 @@ class SetpointStream(SteeringStream[SetpointT]):
 
         Raises:
             InvalidArgument: a value is out of range; the previous set-point remains in force until it expires.
+            ValueUnknownError: a body velocity has a ``yaw_deg``, and ArduPilot has not reported its heading for 2 s.
             SetpointStreamStopped: the stream has ended by itself, or its `async with` block was left.
         """
         check_kind("setpoint", setpoint, type(self._value))

@@ -139,6 +139,7 @@ class Health:
             if MavBatteryChargeState.CRITICAL <= battery.charge_state <= MavBatteryChargeState.UNHEALTHY:
                 state = MavBatteryChargeState(battery.charge_state).name.lower()
                 charge = "" if battery.remaining_percent is None else f" ({battery.remaining_percent} %)"
+                # The parameters of ArduPilot and PX4 count batteries from 1, BATTERY_STATUS from 0.
                 low_batteries.append(f"battery {battery.id + 1} reports the charge state {state}{charge}")
         return low_batteries or [CHECKS_FAIL]
 
@@ -200,7 +201,7 @@ class Health:
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
-        """Return one text for each missing estimate, after a missing GPS fix, which is the probable cause."""
+        """Return one text for each missing estimate; the first one is a missing GPS fix, the probable cause."""
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []

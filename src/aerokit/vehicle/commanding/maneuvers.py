@@ -320,6 +320,7 @@ class ManeuverActions(VehicleBase):
         """
         if MavCmd.DO_VTOL_TRANSITION in self.autopilot.unsupported_commands or not self.telemetry.is_vtol:
             raise NotSupported(f"transition_to: this {self.autopilot.firmware} vehicle is not a VTOL; nothing was sent")
+        # The decorator `checks_arguments` has refused every other state.
         target_state, cell = VTOL_STATES[state], self.telemetry.vtol_state
         with self._arbiter.auxiliary_order() as order:
             started = self.connection.now()

@@ -173,7 +173,7 @@ class MessagingActions(VehicleBase):
 
         Args:
             command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, or NaN where the command allows it.
+            params: param1 to param7; missing ones are 0, even where the command allows NaN.
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
             retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
                 command that changes more than streams is sent again only right after a HEARTBEAT, and only if the mode
@@ -258,7 +258,7 @@ class MessagingActions(VehicleBase):
 
     def note_sent(self, message: Message) -> None:
         """Register a message that the program sent by ``connection.send``, as if it had called :meth:`send`."""
-        target = getattr(message, "target_system", self.system_id)
+        target = getattr(message, "target_system", self.system_id)  # All messages with subjects have this field.
         subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
             self._arbiter.record_own_arming(message.param1 == 1)
@@ -287,9 +287,8 @@ class MessagingActions(VehicleBase):
         vehicle hold nor monitors late arming; use the actions for that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. A newer order about the first subject ends this order. This
-                order ends earlier orders about any of its subjects. An order about mode or motion also ends the action
-                in progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. An order ends each earlier order whose first subject is one
+                of its own subjects. An order about mode or motion also ends the action in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
@@ -317,11 +316,12 @@ class MessagingActions(VehicleBase):
     ) -> Subscription[ItemT]:
         """Return a stream of messages or events of this vehicle, for use in a ``with`` block.
 
-        ``capacity=1`` keeps only the latest message; ``missed`` counts the dropped messages. For the duration of the
-        block, aerokit requests these messages from the autopilot at ``rate_hz`` (above 0, at most 1000), or faster if
-        another subscriber needs it. None requests streamed messages at their default rate. Messages that are not
-        streamed (STATUSTEXT, acks), and HEARTBEAT, are not requested. For a camera or another component use
-        ``vehicle.component(100).subscribe(...)``.
+        Messages of all components of the vehicle are delivered. ``capacity=1`` keeps only the latest message;
+        ``missed`` counts the dropped messages. For the duration of the block, aerokit requests these messages from the
+        autopilot at ``rate_hz`` (above 0, at most 1000), or faster if another subscriber needs it. With
+        ``rate_hz=None``, streamed messages are requested at their default rate. Messages that are not streamed
+        (STATUSTEXT, acks), and HEARTBEAT, are not requested. To request messages from a camera or another component,
+        use ``vehicle.component(100).subscribe(...)``.
 
         Raises:
             InvalidArgument: no type was given, the rate is out of range, or the dialect does not contain a message.
@@ -347,7 +347,7 @@ class MessagingActions(VehicleBase):
         requests only those common states that are missing.
 
         Raises:
-            InvalidArgument: the rate is not above 0 and at most 1000. Nothing was sent.
+            InvalidArgument: the rate is out of range: it must be above 0 and at most 1000. Nothing was sent.
         """
         with every_stream(self._session, rate_hz):
             yield

@@ -154,6 +154,7 @@ class Order:
         self.number: int = number
         """Sequence number: a newer order has a greater number."""
         self.ended_by: tuple[Topic, ...] = tuple(ended_by)
+        """Topics of the order: a newer order about any of them ends this order."""
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.armed = armed
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
@@ -184,7 +185,7 @@ class Order:
         self.arm_command: int | None = None
         """Number of the order's arm or disarm command among those of the program; None until it was sent."""
         self.was_sent: bool = False
-        """True once a command of the order was sent. The next command is a further step."""
+        """True once the first transmission of a command of the order began. The next command is a further step."""
         self.only_stops: bool = False
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
         self.is_confirmed: bool = False
@@ -258,6 +259,8 @@ class Order:
         is_expected = number in self._expected_modes and number in self._accepted_modes
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
+            # Orders with `requires_mode_change` are posted ones, which are always settled. A change is therefore never
+            # reported before the order has settled.
             has_taken_effect = is_change or not self._requires_mode_change
             if has_taken_effect and is_settled:
                 self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.

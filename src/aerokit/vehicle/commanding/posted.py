@@ -64,7 +64,7 @@ class PostedOrder:
 
         Args:
             command: the MAV_CMD.
-            params: param1 to param7; missing ones are 0.
+            params: param1 to param7; missing ones are 0, even where the command allows NaN.
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
 
         Raises:
@@ -86,8 +86,9 @@ class PostedOrder:
         z: float = 0.0,
         component_id: int | None = None,
     ) -> None:
-        """Send a COMMAND_INT: param1 to param4, ``x`` and ``y`` in 1e-7 degrees, ``z`` in metres in ``frame``.
+        """Send a COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres.
         Otherwise works like :meth:`command`.
         """
         place: dict[str, Any] = {"frame": frame, "x": x, "y": y, "z": z}
@@ -120,7 +121,8 @@ class PostedOrder:
                 await self._sender.request_mode(mode, self._order, base_mode=mode.base_mode, component_id=component_id)
                 await self.wait_confirmed(timeout)
             except CommandRejected as error:
-                if self._order.is_confirmed:
+                # The order may have other modes, too, so its effect does not show that this mode was accepted.
+                if self._order.is_confirmed and self._session.telemetry.is_in(mode):
                     return
                 if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
                     raise
@@ -150,7 +152,7 @@ class PostedOrder:
             OperationTimeout: the effect was not reported within ``timeout`` seconds.
         """
         await self._sender.await_effect(
-            "the order was accepted",
+            "posted order",
             self._refusals,
             is_done=self._is_done,
             failure_reason=lambda: None,

@@ -61,8 +61,8 @@ async def await_progress(
 ) -> None:
     """Return when ``is_done()`` has been true for ``held_for`` seconds.
 
-    The functions are called every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state changes;
-    with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
+    The functions are called at least every ``POLL_INTERVAL_S``, and whenever the mode, the arming or the landed state
+    changes; with ``at_positions`` also at each new position. ``operation`` is the name for error texts.
 
     Raises:
         OperationRejected: ``failure_reason()`` returned a reason why the operation cannot succeed.
@@ -87,7 +87,7 @@ async def await_progress(
                 done_since = now
             if done_since is not None and now - done_since >= held_for:
                 return
-            if done_since is None and (reason := failure_reason()):
+            if reason := failure_reason():
                 reason += _height_when_disarmed(session)
                 raise OperationRejected(f"{operation}: {reason}", reasons=_reasons(session, reason, started))
             if max_silence_s is not None and session.watch.silent_for_s > max_silence_s:
@@ -154,7 +154,7 @@ class StallDetector:
 
     def __init__(self, session: VehicleSession) -> None:
         self._session = session
-        # The place that the vehicle has not left recently, and the time at which it arrived there.
+        # The place where the vehicle stands still, and the time at which it arrived there.
         self._place: Position | None = None
         self._there_since = -math.inf
         # The highest place and the fastest descent so far, for the error text.
@@ -264,7 +264,7 @@ class VehiclePosition:
     def check_reach(
         self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
     ) -> None:
-        """Raise InvalidArgument for a place farther away than ``max_distance_m``.
+        """Raise InvalidArgument for a place farther away than ``max_distance_m`` from the last reported position.
 
         While the vehicle's position is unknown, all places are accepted. With ``are_items``, ``places`` has one entry
         for each item of a plan: None for an item without a place.
@@ -279,7 +279,8 @@ class VehiclePosition:
             degrees = abs(place.latitude_deg - here.latitude_deg) + abs(place.longitude_deg - here.longitude_deg)
             # The upper limit of the distance is compared first, because the exact distance is slow to compute and a
             # mission may have thousands of places.
-            if degrees * MAX_METRES_PER_DEGREE < max_distance_m:
+            max_possible_m = degrees * MAX_METRES_PER_DEGREE + abs(self.height_above(here, place))
+            if max_possible_m < max_distance_m:
                 continue
             distance_m = self.distance_to(place)
             if distance_m > max_distance_m:
@@ -301,7 +302,10 @@ class VehiclePosition:
 
     @staticmethod
     def height_above(here: Position, target: Position) -> float:
-        """Return how many metres ``here`` is above ``target``; 0 if no altitude is known for both."""
+        """Return how many metres ``here`` is above ``target``.
+
+        Return 0 if they have no altitude of the same kind (above home, or above mean sea level).
+        """
         for here_m, target_m in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),

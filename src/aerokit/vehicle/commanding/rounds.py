@@ -37,13 +37,13 @@ LAG_ROUNDS = 0.02
 END_TIMEOUT_S = 15.0
 """Seconds to reach the end of a path after its last set-point."""
 FRAME_TIMEOUT_S = 5.0
-"""Seconds to wait for the local position, because set-points are in the local frame."""
+"""Seconds to wait for a new position in each frame, because set-points are in the local frame."""
 
 
 class RoundFlight:
     """One flight around a place, or to the place if there is no ``counter``.
 
-    Without ``rounds``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s.
+    With ``rounds=None``, the flight lasts until cancelled. ``limits`` are max_distance_m, timeout and max_silence_s.
     ``center_name`` is the name of the public method's argument with the place, for error texts. The constructor raises
     if the vehicle cannot fly there.
     """
@@ -112,7 +112,7 @@ class RoundFlight:
                 await cleanup.stop_in(hold_mode, order)
             elif radius_m:
                 context.vehicle_position.record_circle(radius_m)
-        except (anyio.get_cancelled_exc_class(), OperationTimeout):
+        except (anyio.get_cancelled_exc_class(), OperationTimeout):  # also CommandTimeout and HeartbeatTimeout
             # The vehicle may have received the command, so it is ordered to hold.
             cleanup.hold_in_background(order)
             raise
@@ -122,32 +122,35 @@ class RoundFlight:
             raise
 
     async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, radius_m: float) -> None:
-        """Wait until the rounds are flown; without rounds, until the vehicle is at the place."""
+        """Wait until the rounds are flown and another ``stay_s`` seconds have passed.
+
+        With 0 rounds, wait until the vehicle has been at the place for ``stay_s`` seconds.
+        """
         session, started = self._session, self._session.connection.now()
         detect_stall, mode_failure = StallDetector(session), self._context.sender.mode_failure(order, mode)
+        wrong_radius = ""  # a clause about the last reported radius; empty if it is the ordered one
 
         def on_status(status: OrbitExecutionStatus) -> None:
             """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
+            nonlocal wrong_radius
             flown_m = abs(status.radius)
+            wrong_radius = ""
             if radius_m > 0 and abs(flown_m - radius_m) > RADIUS_ERROR_M:
-                self._circle_problem = f"the vehicle flies a circle of {flown_m:.1f} m instead of {radius_m:g} m"
-            else:
-                self._circle_problem = ""
+                wrong_radius = f"the vehicle flies a circle of {flown_m:.1f} m instead of {radius_m:g} m"
 
         def failure_reason() -> str | None:
             """Return why the rounds cannot succeed: the mode, a status text that refuses them, or a wrong radius."""
-            refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
-            refusal = next(refusals, "")
-            if refusal:
-                self._circle_problem = refusal  # `fly_by_command` then orders the vehicle to hold.
-            if reason := mode_failure() or refusal:
+            if reason := mode_failure():
                 return reason
-            if session.connection.now() <= started + CIRCLE_REPORT_S:  # PX4 may still report the previous circle.
-                return None
+            refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
+            # For a moment, PX4 may still report the previous circle.
+            is_radius_reported = session.connection.now() > started + CIRCLE_REPORT_S
+            # `fly_by_command` orders the vehicle to hold if there is a problem.
+            self._circle_problem = next(refusals, wrong_radius if is_radius_reported else "")
             return self._circle_problem or None
 
         def stall_reason() -> str | None:
-            is_staying = not self._rounds and self._is_in_place
+            is_staying = self._rounds == 0 and self._is_in_place
             return None if is_staying else detect_stall()
 
         detach = session.connection.bus.attach(OrbitExecutionStatus, on_status, system_id=session.system_id)
@@ -167,7 +170,7 @@ class RoundFlight:
             detach()
 
     def _is_flown_since(self, started: float) -> bool:
-        """Return True if the rounds are flown; without rounds, if the vehicle is in place."""
+        """Return True if the rounds are flown; with 0 rounds, if the vehicle is in place."""
         is_known = self._context.vehicle_position.is_known_since(started)
         if not is_known or self._count_rounds() < self._rounds:
             return False
@@ -219,10 +222,13 @@ class RoundFlight:
         """Return the flight along the path, with the center in the local frame.
 
         The vehicle's position is known in both frames, so the center can be converted from the global to the local one.
+        Both positions must be new, because a moving vehicle has left the place of an older one.
         """
-        local_position, since = self._telemetry.local_position, self._session.connection.now()
+        position, local_position = self._telemetry.position, self._telemetry.local_position
+        since = self._session.connection.now()
+        await position.wait_until(lambda _: position.updated_at >= since, timeout=FRAME_TIMEOUT_S)
         local = await local_position.wait_until(lambda _: local_position.updated_at >= since, timeout=FRAME_TIMEOUT_S)
-        here = self._telemetry.position.fresh(POSITION_MAX_AGE_S)
+        here = position.fresh(POSITION_MAX_AGE_S)
         north, east = self._offset(here)
         up = self._context.vehicle_position.height_above(here, self._center)
         centre = (local.north_m - north, local.east_m - east, local.down_m + up)
@@ -244,7 +250,7 @@ class RoundFlight:
         return heading
 
     async def _stream(self, flight: PathFlight, order: Order) -> None:
-        """Stream the set-points of the flight until the vehicle itself has flown the rounds."""
+        """Stream the set-points of the flight until the vehicle itself has flown the rounds, except ``LAG_ROUNDS``."""
         stream = Guided(self._context).trajectory(
             flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
         )

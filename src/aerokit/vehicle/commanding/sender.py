@@ -101,6 +101,8 @@ class OrderSender:
             self.raise_if_slept(order)
         if self._arbiter.is_state_recent:
             return
+        # After `MAX_SILENCE_S`, the command would be too late. This also applies if the event loop was blocked for so
+        # long, and HEARTBEATs are waiting to be read.
         with anyio.move_on_after(max(0.0, MAX_SILENCE_S - self._session.telemetry.armed.age)) as scope:
             await self._session.wait_for_heartbeat()
         if scope.cancelled_caught:

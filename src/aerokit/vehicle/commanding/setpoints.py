@@ -19,6 +19,7 @@ from aerokit.mavlink.messages import (
     SetPositionTargetLocalNed,
 )
 from aerokit.position import Position
+from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
 from aerokit.vehicle.state.movement import Attitude
 
 if TYPE_CHECKING:
@@ -159,7 +160,10 @@ LocalSetpoint = VelocitySetpoint | AccelerationSetpoint | LocalPositionSetpoint 
 
 
 def wants_motion(setpoint: object, context: VehicleContext) -> bool:
-    """Return True if a vehicle that follows this set-point must move now; False if unknown."""
+    """Return True if a vehicle that follows this set-point must move now; False if unknown.
+
+    Of a trajectory, only the velocity is considered.
+    """
     if isinstance(setpoint, (VelocitySetpoint, TrajectorySetpoint)):
         return math.hypot(setpoint.north_m_s, setpoint.east_m_s, setpoint.down_m_s) >= SLOW_M_S
     if isinstance(setpoint, BodyVelocitySetpoint):
@@ -168,7 +172,8 @@ def wants_motion(setpoint: object, context: VehicleContext) -> bool:
     if isinstance(setpoint, PositionSetpoint):
         distance_m = context.vehicle_position.distance_to(setpoint.position)  # infinite if the position is unknown
         return max_resting_m < distance_m < math.inf
-    # The position is read only here, because reading decodes it and set-points are sent at up to 400 Hz.
+    # Positions are read last and only if they are needed, because reading one decodes it, and set-points are sent at up
+    # to 400 Hz.
     if isinstance(setpoint, LocalPositionSetpoint) and (here := context.session.telemetry.local_position.latest):
         north_m, east_m = setpoint.north_m - here.north_m, setpoint.east_m - here.east_m
         return math.hypot(north_m, east_m, setpoint.down_m - here.down_m) > max_resting_m
@@ -202,12 +207,13 @@ class SetpointEncoder:
 
         For ArduPilot, a set-point with a heading is converted to MAV_FRAME_LOCAL_NED by the present heading, because
         in MAV_FRAME_BODY_NED ArduPilot adds each yaw to the previous target. Correcting the yaw by telemetry instead
-        would make the vehicle's heading oscillate.
+        would make the vehicle's heading oscillate. An old heading would send the vehicle in a wrong direction, so it
+        raises StaleValueError.
         """
         forward, right, frame = setpoint.forward_m_s, setpoint.right_m_s, MavFrame.BODY_NED
         if setpoint.yaw_deg is not None and self._session.autopilot.setpoints.body_yaw_is_relative:
             frame = MavFrame.LOCAL_NED
-            heading = math.radians(self._session.telemetry.heading_deg.value)
+            heading = math.radians(self._session.telemetry.heading_deg.fresh(POSITION_MAX_AGE_S))
             forward, right = (
                 forward * math.cos(heading) - right * math.sin(heading),
                 forward * math.sin(heading) + right * math.cos(heading),

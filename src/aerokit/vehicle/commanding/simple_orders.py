@@ -142,8 +142,8 @@ class SimpleOrder(Snapshot):
     ) -> None:
         """Send the command and wait for a status text that reports its effect.
 
-        ``is_done(text, seconds_since_ack)`` is called repeatedly, with all texts so far. The seconds are from the
-        acknowledgement until now, not until the text arrived.
+        ``is_done(text, seconds_since_ack)`` is called for each text so far, again and again. The seconds are from the
+        acknowledgement until now, not until the text arrived. Only for orders without ``effect``.
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """
@@ -226,7 +226,7 @@ def _supersession(order: Order | None) -> str | None:
 
 
 async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
-    """Request a message; return False if the vehicle refuses, which means that it does not have the message."""
+    """Request a message; return False if the vehicle refuses, so that it probably does not have the message."""
     with suppress(CommandTimeout):  # A vehicle that does not answer may still have the message.
         try:
             await context.session.commands.send_long(
@@ -240,7 +240,7 @@ async def _has_message(context: VehicleContext, message_id: int, component_id: i
 async def receive_once(
     context: VehicleContext, message_type: type[MessageT], component_id: int | None = None
 ) -> MessageT | None:
-    """Request one message and return it; None if the vehicle refuses, or does not send it.
+    """Request one message and return it; None if the vehicle refuses, does not acknowledge, or does not send it.
 
     Waits up to a second for the acknowledgement, and up to another second for the message.
     """

@@ -14,6 +14,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit.errors import (
     AerokitError,
+    CommandRejected,
     OperationRejected,
     OperationTimeout,
     ParameterTimeout,
@@ -142,7 +143,9 @@ class ValueStream(Generic[ValueT]):
         try:
             self._send()
         except Exception as error:
-            self._stop(str(error))
+            self._stop(str(error) or repr(error))
+            assert self._stop_error is not None
+            self._stop_error.__cause__ = error
             return
         due = max(due + self._period_s, self._now())  # Ticks that were missed during a delay are left out.
         self._timer = asyncio.get_running_loop().call_at(due, self._tick, due)
@@ -240,10 +243,10 @@ class SteeringStream(ValueStream[ValueT]):
         cleanup = self._context.flight_cleanup
         cleanup.check_no_stream()
         mode = self._stream_mode()
+        takeover_check = TakeoverCheck(self._context, mode)
         self._was_entered = True
         # The stream is registered before the first await, so that no second stream can begin meanwhile.
         cleanup.stop_stream = self._stop
-        takeover_check = TakeoverCheck(self._context, mode)
         try:
             await self._check_support()
             takeover_check.raise_if_changed(self._NAME)
@@ -258,9 +261,9 @@ class SteeringStream(ValueStream[ValueT]):
             await self._enter(mode, order)
         except BaseException as error:
             self._end()
-            # OperationRejected means that a pilot or a failsafe has taken over, and keeps control. After all other
-            # errors, the vehicle is ordered to hold.
-            if not isinstance(error, OperationRejected):
+            # After a refusal, the vehicle continues its previous task. After all other errors, it is ordered to hold,
+            # unless the order has ended, for example because a pilot took over.
+            if not isinstance(error, CommandRejected):
                 self._hold()
             self._release()
             raise
@@ -287,6 +290,7 @@ class SteeringStream(ValueStream[ValueT]):
         elif not self._context.arbiter.is_state_recent:
             # The vehicle is silent, so there may have been a takeover whose report was not received. The hold is
             # therefore sent after the next HEARTBEAT, unless that shows a takeover. This call does not wait for it.
+            # `_stop` replaces the error from above by one about the silence.
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stop_error
         elif not self._session.telemetry.is_confirmed_disarmed:
@@ -294,7 +298,8 @@ class SteeringStream(ValueStream[ValueT]):
             order = self._context.arbiter.order(hold_mode)
             try:
                 await cleanup.stop_in(hold_mode, order)
-            except (anyio.get_cancelled_exc_class(), OperationTimeout):  # The order to hold may have been lost.
+            except (anyio.get_cancelled_exc_class(), OperationTimeout):
+                # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
                 cleanup.hold_in_background(order)
                 raise
 

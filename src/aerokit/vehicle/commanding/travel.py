@@ -118,16 +118,17 @@ class TravelActions(VehicleBase):
         mode = self._sender.mode_for("go_to", self.autopilot.reposition_purpose)
         order = self._arbiter.order(mode, self._sender.mode_for("go_to", "setpoint"))
         yaw = self._reposition_yaw(heading_deg)
-        is_under_way = False  # True once the vehicle has accepted the target.
+        is_incomplete = False  # True once the vehicle has accepted the target, until the speed and the heading are set.
         try:
             unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
-            is_under_way = True
+            is_incomplete = True
             if speed_m_s is not None and not self._speeds_by_reposition:
                 # ArduPilot applies the speed only once the vehicle is on its way.
                 change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
                 await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, *change)
             if heading_deg is not None and math.isnan(yaw):  # On this autopilot, MAV_CMD_DO_REPOSITION does not set it.
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
+            is_incomplete = False
             with self._flight_cleanup.flying(order):
                 await self._await_arrival(
                     target,
@@ -142,8 +143,10 @@ class TravelActions(VehicleBase):
             # The vehicle may have received the command, so it is ordered to hold.
             self._flight_cleanup.hold_in_background(order)
             raise
-        except CommandRejected:
-            if is_under_way:  # The vehicle has accepted the target, and refused only the speed or the heading.
+        except OperationRejected:
+            # The vehicle is on its way, but has refused the speed or the heading, or the computer slept before it was
+            # sent. After a takeover, nothing is sent.
+            if is_incomplete:
                 self._flight_cleanup.hold_in_background(order)
             raise
 

@@ -345,7 +345,8 @@ class MissionControl(VehiclePlan["Mission"]):
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end, including a landing at its end.
 
-        A :meth:`pause` by another task does not end the wait. Cancelling this call does not stop the vehicle, and no
+        A :meth:`pause` by another task does not end the wait, but a pilot who then changes to another mode than that of
+        the mission does. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
         a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
         completion shows whether the vehicle lands.
@@ -374,13 +375,17 @@ class MissionControl(VehiclePlan["Mission"]):
                 session,
                 "mission.wait_finished",
                 is_done=end.has_ended,
-                failure_reason=lambda: end.failure(self._order, is_paused=self._is_paused),
+                failure_reason=lambda: end.failure(self._order, is_paused=self._is_held_by_pause()),
                 describe=end.describe,
                 timeout=timeout,
                 max_silence_s=max_silence_s,
-                stall_reason=MissionStallDetector(session, self._tracker, mode, items, lambda: self._is_paused),
+                stall_reason=MissionStallDetector(session, self._tracker, mode, items, self._is_held_by_pause),
                 at_positions=False,  # The next poll is soon enough, and a mission may take hours.
             )
+
+    def _is_held_by_pause(self) -> bool:
+        """Return True from `pause` until `start` or `resume`, or until another party has changed the mode."""
+        return self._is_paused and self._order is not None and not self._order.has_lost_mode
 
     @property
     def explains_mode(self) -> bool:

@@ -11,6 +11,7 @@ from order_table import ARM, REPOSITION, SET_MODE
 
 from aerokit.autopilots import autopilot_for, is_armed
 from aerokit.errors import OperationTimeout
+from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.messages import (
     CommandInt,
@@ -101,12 +102,19 @@ def _sent_again(flown: Flown) -> Iterator[str]:
         if key in first:
             before = _states_between(flown, -1, first[key])[-1:]
             since = _states_between(flown, first[key], order.number)
-            if not _states_between(flown, last[key], order.number):
+            if _is_directed_turn(order.message):
+                yield f"{_text_of(flown, order)} was sent again, and might begin another circle"
+            elif not _states_between(flown, last[key], order.number):
                 yield f"{_text_of(flown, order)} was sent again without a HEARTBEAT since"
             elif any(state != before[0] and not _may_report_effect(flown, order.message, state) for state in since):
                 yield f"{_text_of(flown, order)} was sent again although HEARTBEAT had reported a change"
         first.setdefault(key, order.number)
         last[key] = order.number
+
+
+def _is_directed_turn(message: Message) -> bool:
+    """Return True for a turn to a heading in a given direction (param3)."""
+    return isinstance(message, CommandLong) and message.command == MavCmd.CONDITION_YAW and message.param3 != 0
 
 
 def _may_report_effect(flown: Flown, message: Message, state: State) -> bool:

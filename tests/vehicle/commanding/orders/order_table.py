@@ -202,6 +202,13 @@ ROWS = (
         on=("ardupilot",),
     ),
     Row(
+        "set_heading with a direction",
+        lambda v: v.set_heading(-200.0, relative=True, timeout=15),
+        int(MavCmd.CONDITION_YAW),
+        modes=(("GUIDED",), ()),
+        on=("ardupilot",),
+    ),
+    Row(
         "guided.velocity",
         _fly_setpoints,
         SET_MODE,

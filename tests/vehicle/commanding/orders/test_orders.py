@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from call_table import Row
@@ -90,6 +92,21 @@ def test_arm_is_not_repeated_against_other_station(autopilot: str) -> None:
     flown = fly(Case(BY_NAME["arm"], autopilot, Disturbances(command=ARM, lost_acks=9), pilot_at=1.3))
     assert len([message for message in flown.traffic.sent if getattr(message.message, "command", 0) == ARM]) == 1
     assert not flown.is_armed_at_end
+
+
+@pytest.mark.parametrize("lost", ["acks", "commands"])
+@pytest.mark.parametrize("place", ["air", "air, flown by hand"])
+def test_directed_turn_without_ack_is_sent_once(lost: str, place: str) -> None:
+    """Several HEARTBEATs report the state from before the order, which would allow a repetition of other orders."""
+    row = replace(BY_NAME["set_heading with a direction"], place=place)
+    losses: dict[str, Any] = {f"lost_{lost}": 9}
+    disturbances = Disturbances(command=row.command, **losses)
+    flown = fly(Case(row, "ardupilot", disturbances))
+    assert isinstance(flown.error, CommandTimeout)
+    sent_at = [sent.at for sent in flown.traffic.sent if getattr(sent.message, "command", 0) == row.command]
+    assert len(sent_at) == 1
+    assert len([beat for beat in flown.traffic.heartbeats if sent_at[0] < beat.at < flown.ended_at]) >= 2
+    assert faults(flown) == []
 
 
 @pytest.mark.sampled(3)
