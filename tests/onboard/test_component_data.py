@@ -139,7 +139,7 @@ async def test_files_are_listed_read_and_written(tmp_path: Path) -> None:
     assert (tmp_path / "logs" / "c.bin").read_bytes() == bytes(range(256)) * 10
 
 
-async def test_name_too_long_for_a_message_does_not_end_the_listing(tmp_path: Path) -> None:
+async def test_too_long_name_does_not_end_listing(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
     for name in ("a", "b" * 240, "c"):
         (tmp_path / "logs" / name).write_bytes(b"1")
