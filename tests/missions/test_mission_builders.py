@@ -180,6 +180,7 @@ WRONG: list[tuple[Callable[[], object], str]] = [
     (lambda: missions.take_off(10, altitude_amsl_m=3), "give both or none of them"),
     (lambda: missions.land(10), "give both or none of them"),
     (lambda: missions.take_off(altitude_relative_m=3, pitch_deg=91), "pitch_deg = 91"),
+    (lambda: missions.land(precision=1.5), "precision = 1.5 .* whole"),  # type: ignore[call-overload]
     (lambda: missions.loiter_turns(256, altitude_relative_m=3), "turns = 256 .* 0 to 255"),
     (lambda: missions.loiter_time(math.inf, altitude_relative_m=3), "duration_s = inf"),
     (lambda: missions.rally_point(47, 8, altitude_relative_m=40_000), "altitude = 40000"),

@@ -161,6 +161,13 @@ def test_fence_items_round_trip() -> None:
     assert Fence.from_items(()) == Fence()
 
 
+@pytest.mark.parametrize("frame", [MavFrame.GLOBAL, MavFrame.GLOBAL_INT])
+def test_return_point_without_altitude_has_none(frame: int) -> None:
+    fence = Fence(return_point=SQUARE[0])
+    [item] = fence.to_items()
+    assert Fence.from_items([item.replace(frame=frame)]) == fence
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

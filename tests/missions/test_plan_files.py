@@ -173,6 +173,15 @@ def test_plan_file_with_fence_only() -> None:
         read(document)
 
 
+def test_return_point_in_fence_of_version_1_is_refused() -> None:
+    document = samples.document()
+    document["geoFence"] = {"version": 1}
+    assert read(document).fence == Fence()
+    document["geoFence"]["breachReturn"] = [47.0, 8.0]
+    with pytest.raises(FileFormatError, match=r"geoFence.version = 1: expected 2"):
+        read(document)
+
+
 # ------------------------------------------------------------------------------------------ writing
 
 
@@ -270,6 +279,7 @@ def test_plan_comparison_ignores_source() -> None:
         ),
         (Plan(fence=Fence(return_point=Position(47, 8, 500.0))), "return_point.altitude_amsl_m = 500.0"),
         (Plan(Mission([MissionItem(16, 3, math.inf)])), "not finite"),
+        (Plan(source="{"), "the plan cannot be written: .*the text is not valid JSON"),
     ],
 )
 def test_plan_file_rejects_values_it_cannot_store(plan: Plan, message: str) -> None:

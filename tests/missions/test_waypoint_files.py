@@ -29,6 +29,7 @@ from aerokit.missions import (
     waypoint,
     write_waypoint_file,
 )
+from aerokit.missions.item import has_place
 from aerokit.position import Position
 
 MISSION_PLANNER = """QGC WPL 110
@@ -100,9 +101,14 @@ def test_waypoint_file_writes_enough_digits() -> None:
     assert parse_waypoints(format_waypoints(mission)) == mission
 
 
-def test_place_without_altitude_is_not_written() -> None:
+@pytest.mark.parametrize(
+    "item",
+    [MissionItem(16, 3, x=1, y=2), MissionItem(22, 3), MissionItem(16, 1, x=10_000)],
+    ids=["place", "take-off", "local place"],
+)
+def test_place_without_altitude_is_not_written(item: MissionItem) -> None:
     with pytest.raises(InvalidArgument, match="a place without an altitude"):
-        format_waypoints(Mission([MissionItem(16, 3, x=1, y=2, z=math.nan)]))
+        format_waypoints(Mission([item.replace(z=math.nan)]))
 
 
 NUMBERS = ("param1", "param2", "param3", "param4", "z")
@@ -120,7 +126,9 @@ items = st.builds(
     numbers,
     st.booleans(),
 ).map(lambda item: item.replace(param1=float(round(item.x / 1e6))) if item.command == 177 else item)
-items = items.map(lambda item: item.replace(z=0.0) if math.isnan(item.z) and item.position is not None else item)
+items = items.map(
+    lambda item: item.replace(z=0.0) if math.isnan(item.z) and (has_place(item.command) or item.position) else item
+)
 homes = st.none() | st.builds(Position, st.floats(1, 90), st.floats(-180, 180), st.floats(-1e6, 1e6))
 missions = st.builds(Mission, st.lists(items, max_size=6), homes)
 
@@ -153,8 +161,9 @@ def test_damaged_waypoint_file_raises_only_our_errors(junk: str, start: int, len
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("QGC WPL 110", "QGC WPL 100", "line 1: expected 'QGC WPL 110', found 'QGC WPL 100'"),
-        ("QGC WPL 110", "# survey\n\nQGC WPL 100", "line 3: expected 'QGC WPL 110', found 'QGC WPL 100'"),
+        ("QGC WPL 110", "QGC WPL 100", "line 1: expected 'QGC WPL 110' or 'QGC WPL 120', found 'QGC WPL 100'"),
+        ("QGC WPL 110", "# survey\n\nQGC WPL 100", "line 3: expected .*, found 'QGC WPL 100'"),
+        (MISSION_PLANNER, " ", "line 1: expected .*, found no text"),
         ("\n2\t0", "\n3\t0", "line 4: index = 3: expected 2; lines are missing"),
         ("\t0.000000\t0\n", "\t0\n", "line 7: expected 12 columns, found 11"),
         ("-35.36180530", "91.0", "line 4: latitude = '91.0': expected a number from -90 to 90"),

@@ -206,6 +206,15 @@ async def test_files_are_listed_read_and_written(tmp_path: Path) -> None:
     assert (tmp_path / "logs" / "c.bin").read_bytes() == bytes(range(256)) * 10
 
 
+async def test_too_long_name_does_not_end_listing(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    for name in ("a", "b" * 240, "c"):
+        (tmp_path / "logs" / name).write_bytes(b"1")
+    async with autopilot_and_client() as (node, vehicle):
+        node.serve_files(tmp_path)
+        assert [entry.name for entry in await vehicle.files.list("/logs")] == ["a", "c"]
+
+
 @pytest.mark.skipif(os.name == "nt", reason="needs links and pipes")
 @pytest.mark.parametrize("path", ["/../secret", "/link", "/folder/secret", "/pipe", "/logs/../../secret"])
 async def test_nothing_outside_the_directory_is_read(tmp_path: Path, path: str) -> None:

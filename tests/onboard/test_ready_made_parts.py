@@ -106,6 +106,25 @@ async def test_series_waits_for_slow_camera(delay_s: float) -> None:
     assert indices == [0, 1, 2, 3]
 
 
+async def test_video_that_is_stopped_while_it_starts_ends() -> None:
+    class SlowEye(Eye):
+        async def start_video(self) -> None:
+            await is_stopped.wait()
+            self.calls.append("start")
+
+    is_stopped = asyncio.Event()
+    eye = SlowEye()
+    async with payload_and_station() as (component, station):
+        component.add_camera(eye)
+        station.connection.send(station.command_long(MavCmd.VIDEO_START_CAPTURE))
+        await station.command(MavCmd.VIDEO_STOP_CAPTURE)
+        with station.collecting(m.CommandAck) as acks:
+            is_stopped.set()
+            await asyncio.sleep(1.0)
+    assert eye.calls == ["start", "stop"]
+    assert acks[-1].result == MavResult.ACCEPTED
+
+
 async def test_video_zoom_tracking_and_storage_call_the_program() -> None:
     eye = Eye()
     async with device_and_client(100, MavType.CAMERA) as (component, vehicle):

@@ -128,6 +128,7 @@ def test_range_applies_under_its_condition() -> None:
         ("A=text", {"A": "text"}, True),
         ("A!=text", {"A": "text"}, False),
         ("A>text", {"A": "text"}, False),
+        ("A = Auto Low AND B=1", {"A": "Auto Low", "B": 1}, True),
         ("A=text", {"A": 1}, False),
         ("A=0.016666", {"A": 0.016666000708937645}, True),
     ],

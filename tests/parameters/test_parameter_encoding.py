@@ -91,3 +91,8 @@ def test_eight_byte_type_is_rejected() -> None:
     with pytest.raises(InvalidArgument, match="INT64"):
         to_wire(value, ParameterType.INT64, bytewise=True)
     assert to_wire(value, ParameterType.INT64, bytewise=False) == 5.0
+
+
+def test_number_too_large_for_message_is_rejected() -> None:
+    with pytest.raises(InvalidArgument, match=r"1e\+300 cannot be sent"):
+        set_message(1, 1, "X", 1e300, ParameterType.REAL64, bytewise=False)

@@ -169,6 +169,7 @@ def test_rename_warning_has_own_category() -> None:
     assert older.endswith("The firmware, perhaps a -dev version, is older than the change in 4.7.")
     assert "Use" not in older
     assert "converted" not in known("SYSID_THISMAV", "MAV_SYSID").warning
+    assert "Use PSC_JERK_NE," in known("PSC_NE_JERK", "PSC_JERK_NE").warning
 
 
 @pytest.mark.parametrize(
@@ -224,6 +225,10 @@ def test_older_rename_table_is_consistent() -> None:
     old, new = ({pair.split(">")[place] for pair in rows} for place in (0, 1))
     for name in (*old, *new, *REPLACED):
         check_name(name)
+    # Names that were renamed twice have one divisor (`_by_name`).
+    renamed_twice = {pair.split(">")[0] for _, _, pairs in GROUPS for pair in pairs.split()}
+    for _, _, divisor, text in OLDER:
+        assert divisor == 1 or not {pair.split(">")[1] for pair in text.split()} & renamed_twice
     assert not old & REPLACED.keys()
     assert not any(find_rename(name) for name in REPLACED)
     for name in old:

@@ -95,6 +95,32 @@ def test_full_card_refuses_writes(kind: str) -> None:
 
 
 @both
+def test_full_card_accepts_changes_that_need_no_space(kind: str) -> None:
+    vehicle, ftp = either(kind)
+    ftp.upload("/empty", b"")
+    ftp.upload("/t", bytes(90))
+    vehicle.files.free_bytes = 0
+    ftp.upload("/empty", b"")
+    assert ftp.refusal(Op.CREATEFILE, "/new") == (Err.FAILERRNO, ENOSPC)
+    assert ftp.refusal(Op.CREATEDIRECTORY, "/new") == (Err.FAILERRNO, ENOSPC)
+    ftp.data(Op.OPENFILEWO, "/t")
+    ftp.data(Op.WRITEFILE, bytes(90))
+    ftp.data(Op.TERMINATESESSION)
+
+
+@both
+def test_replaced_file_frees_its_space(kind: str) -> None:
+    vehicle, ftp = either(kind)
+    ftp.upload("/old", bytes(90))
+    ftp.upload("/new", b"1")
+    vehicle.files.free_bytes = 0
+    ftp.data(Op.RENAME, b"/new\0/old")
+    assert vehicle.files.free_bytes == 90
+    ftp.data(Op.RENAME, b"/old\0/old")
+    assert vehicle.files.free_bytes == 90
+
+
+@both
 def test_no_ftp_fault_removes_the_capability(kind: str) -> None:
     vehicle, ftp = either(kind)
 

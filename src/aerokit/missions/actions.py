@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from aerokit.missions.item import MissionItem
     from aerokit.position import Home, Position
 
+# With a delay of 0, ArduPilot waits until a time of day.
+_MIN_DELAY_S = 0.001
+
 _MAX_DURATION_S = 86_400.0 * 365
 
 _SPEEDS = {"air": 0.0, "ground": 1.0, "climb": 2.0, "descent": 3.0}
@@ -27,8 +30,9 @@ def change_speed(
     kind: Literal["air", "ground", "climb", "descent"] = "ground",
     throttle_percent: float | None = None,
 ) -> MissionItem:
-    """Change the speed (0 to 1,000 m/s). -2 stands for the vehicle's default speed, on PX4 -1.
+    """Change the speed (0 to 1,000 m/s).
 
+    -2 stands for the vehicle's default speed (ArduCopter ignores it), -1 for no change (PX4: the default speed).
     ``kind`` selects the speed; ``"climb"`` and ``"descent"`` are for copters. ``throttle_percent`` (0 to 100) is for
     planes without airspeed sensor; None leaves it unchanged.
     https://mavlink.io/en/messages/common.html#MAV_CMD_DO_CHANGE_SPEED
@@ -44,16 +48,14 @@ def change_speed(
 
 
 def delay(duration_s: float) -> MissionItem:
-    """Hold the position for ``duration_s`` seconds, above 0.
+    """Hold the position for ``duration_s`` seconds (at least a millisecond).
 
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_DELAY
     """
-    if duration_s == 0:
-        raise InvalidArgument(
-            "duration_s = 0 is not allowed: it must be above 0, because with 0 ArduPilot waits until a time of day"
-        )
     no_time_of_day = (-1.0, -1.0, -1.0)
-    return action_item(MavCmd.NAV_DELAY, in_range("duration_s", duration_s, 0, _MAX_DURATION_S), *no_time_of_day)
+    return action_item(
+        MavCmd.NAV_DELAY, in_range("duration_s", duration_s, _MIN_DELAY_S, _MAX_DURATION_S), *no_time_of_day
+    )
 
 
 def delay_until(hour: int, minute: int = 0, second: int = 0) -> MissionItem:

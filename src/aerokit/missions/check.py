@@ -62,7 +62,7 @@ def check_count(count: int, *, home_is_item_0: bool = False) -> None:
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`InvalidArgument` if MISSION_ITEM_INT cannot carry the item.
+    """Raise :class:`InvalidArgument` if the item is not valid in a plan of this MAV_MISSION_TYPE.
 
     The error text begins with ``where``.
     """

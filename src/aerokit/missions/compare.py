@@ -159,7 +159,10 @@ def _px4_letters(item: MissionItem) -> str:
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the value as stored in the form that ``letter`` stands for; nothing if a C conversion is undefined."""
+    """Yield the value as stored in the form that ``letter`` stands for; nothing if a C conversion is undefined.
+
+    The result is NaN for values that are not finite.
+    """
     if letter == "-":  # not stored
         yield 0.0
     elif letter == "2":  # always 2
@@ -233,7 +236,8 @@ def changed_items(
 ) -> tuple[int, ...]:
     """Return the indices at which ``actual`` does not have the expected item, and which a partial update must send.
 
-    By default, only changes made by the protocol itself are tolerated.
+    Items that ``actual`` has in excess are not reported. By default, only changes made by the protocol itself are
+    tolerated.
     """
     common = min(len(expected), len(actual))
     changed = [i for i in range(common) if item_differences(expected[i], actual[i], storage)]
@@ -289,10 +293,10 @@ def _frames_match(expected: MissionItem, actual: MissionItem, storage: ItemStora
     expected_frame, actual_frame = canonical_frame(expected.frame), canonical_frame(actual.frame)
     if expected_frame == actual_frame:
         return True
-    # A fence has no altitudes, so the reference of the altitude does not matter.
+    # Autopilots use no altitudes of a fence, so their reference does not matter.
     if expected.command in FENCE_COMMANDS and {expected.frame, actual.frame} <= GLOBAL_FRAMES:
         return True
-    # ArduPilot returns the frame GLOBAL for items without a place.
+    # ArduPilot returns the frame GLOBAL for items without a place, and for the frame MISSION.
     if storage not in (ItemStorage.ARDUPILOT, ItemStorage.ANY) or actual_frame != MavFrame.GLOBAL:
         return False
     return not has_place(expected.command) or expected_frame == MavFrame.MISSION
@@ -322,7 +326,7 @@ def _same_place(
         if single_precision:
             tolerance += _float_step(value / scale) * scale
         return bool(abs(value - actual_value) <= tolerance)
-    if has_place(expected.command):  # In the frame MISSION, coordinates are floats that are not scaled.
+    if has_place(expected.command):  # In the frame MISSION, x and y are integers that are not scaled.
         return bool(value == actual_value)
     stored_values = _stored_values(expected, field, storage)
     return value == actual_value or any(_close(stored, actual_value) for stored in stored_values)
@@ -337,7 +341,9 @@ def _float_step(value: float) -> float:
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
     """Return True if the altitudes (``z``) are equal, apart from how the vehicle stores them."""
-    if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):  # A fence has no altitudes.
+    # Autopilots use no altitudes of a fence, not even that of a return point: ArduPilot does not store it
+    # (MissionItemProtocol_Fence.cpp), PX4 ignores it (geofence.cpp).
+    if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):
         return True
     if not has_place(expected.command):
         return any(_close(stored, actual.z) for stored in _stored_values(expected, "z", storage))

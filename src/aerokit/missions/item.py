@@ -212,8 +212,9 @@ class MissionItem(Snapshot):
     def position(self) -> Position | None:
         """Position of the item, with the altitude above home or above mean sea level, depending on the frame.
 
-        None for commands without a place, for local frames, and for 0°, 0°, which means "the current position". If the
-        frame is relative to terrain, the position has no altitude; use ``z``.
+        None for commands without a place, for local frames, for 0°, 0° (on ArduPilot the current position), and if x
+        and y are not given or out of range. If the frame is relative to terrain, the position has no altitude; use
+        ``z``.
         """
         if xy_scale(self.command, self.frame) != DEGREE_SCALE:
             return None

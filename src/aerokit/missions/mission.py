@@ -14,7 +14,7 @@ from aerokit.errors import InvalidArgument, RemoteProtocolError
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.check import check_items
 from aerokit.missions.compare import ItemStorage, plan_differences
-from aerokit.missions.item import MissionItem
+from aerokit.missions.item import MissionItem, canonical_frame
 from aerokit.missions.wire import with_home, without_home
 from aerokit.position import Position
 
@@ -174,7 +174,10 @@ class Fence(Snapshot):
 
     @classmethod
     def from_items(cls, items: Sequence[MissionItem], *, home_is_item_0: bool = False) -> Self:
-        """Create a fence from the items of a vehicle, in any order; the inverse of :meth:`to_items`.
+        """Create a fence from the items of a vehicle; the inverse of :meth:`to_items`.
+
+        The order does not matter, except that the vertices of a polygon must follow each other. If there are several
+        return points, the last one counts.
 
         Raises:
             RemoteProtocolError: the items do not form a fence; the text names the item.
@@ -257,7 +260,9 @@ def _place(item: MissionItem, index: int) -> Position:
     except InvalidArgument as error:
         raise RemoteProtocolError(f"item {index} ({item.name}): {error}") from error
     # Only a return point has an altitude. In the frame GLOBAL, 0 means that it is unknown (`_return_item`).
-    has_altitude = item.command == MavCmd.NAV_FENCE_RETURN_POINT and (item.z != 0 or item.frame != MavFrame.GLOBAL)
+    has_altitude = item.command == MavCmd.NAV_FENCE_RETURN_POINT and (
+        item.z != 0 or canonical_frame(item.frame) != MavFrame.GLOBAL
+    )
     position_with_altitude = item.position if has_altitude else None
     return position_with_altitude or place
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, overload
 
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions.item import action_item, heading, in_range, place_item
+from aerokit.missions.item import action_item, heading, in_range, place_item, whole_number
 
 if TYPE_CHECKING:
     from aerokit.missions.item import Altitudes, MissionItem
@@ -286,7 +286,7 @@ def land(
         longitude_deg,
         _altitudes_or_home(altitude_relative_m, altitude_amsl_m, altitude_terrain_m),
         in_range("abort_altitude_m", abort_altitude_m, 0, _MAX_METRES),
-        in_range("precision", precision, 0, 2),
+        whole_number("precision", precision, 0, 2),
         _UNSET,
         heading("yaw_deg", yaw_deg),
     )

@@ -111,7 +111,8 @@ def _document(plan: Plan) -> dict[str, Any]:
     """Return the JSON object of a .plan file: that in ``plan.source``, in which only changed parts are replaced."""
     document: dict[str, Any]
     if plan.source:
-        document, old = json.loads(plan.source), parse_plan(plan.source)
+        old = parse_plan(plan.source)  # first, because it raises FileFormatError if the text is no plan
+        document = json.loads(plan.source)
     else:
         document, old = _new_document(), None
     if old is None or (plan.mission, _numbers(plan)) != (old.mission, _numbers(old)):
@@ -207,7 +208,8 @@ def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
 
 def _read_fence(value: JsonValue) -> Fence:
     """Read the member ``geoFence``."""
-    if _check_version(value, "polygon", "polygons", "circles") == 1:  # Version 1 is allowed only for empty fences.
+    version = _check_version(value, "polygon", "polygons", "circles", "breachReturn")
+    if version == 1:  # Version 1 is allowed only for empty fences.
         return Fence()
     polygons, circles = (value.child(key) for key in ("polygons", "circles"))
     point = value.child("breachReturn")

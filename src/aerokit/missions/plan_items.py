@@ -187,24 +187,24 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
 def _jump_ids(
     entries: Sequence[JsonValue], groups: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
 ) -> dict[int, int]:
-    """Map each doJumpId to the index of its item. Simple items take precedence over those inside surveys.
+    """Map each doJumpId to the index of its item. Items with an entry of their own precede those inside surveys.
 
     ``groups`` has the simple items of each entry (None for a landing pattern), ``sizes`` its number of mission items.
     """
-    ids_of_simple_items: dict[int, int] = {}
+    ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
     first = 0
     for entry, group, size in zip(entries, groups, sizes):  # noqa: B905 - same length
         for index, value in enumerate(group or (), first):
             member = value.child("doJumpId")
             jump_id = index + 1 if member is None else member.integer(-1, 2**31)
-            is_simple_item = value is entry  # A simple item is the only item of its own entry.
-            if is_simple_item:
-                ids_of_simple_items.setdefault(jump_id, index)
+            has_own_entry = value is entry
+            if has_own_entry:
+                ids_of_entries.setdefault(jump_id, index)
             else:
                 ids_in_surveys.setdefault(jump_id, index)
         first += size
-    return ids_in_surveys | ids_of_simple_items
+    return ids_in_surveys | ids_of_entries
 
 
 def _read_item(value: JsonValue, ids: dict[int, int]) -> MissionItem:

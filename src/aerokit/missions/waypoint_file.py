@@ -15,7 +15,7 @@ from aerokit._internal.files import read_text, write_atomically
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
-from aerokit.missions.item import DEGREE_SCALE, MissionItem, canonical_frame, xy_scale
+from aerokit.missions.item import DEGREE_SCALE, DESTINATIONS, MissionItem, canonical_frame, xy_scale
 from aerokit.missions.mission import Mission
 from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps
 from aerokit.position import Position
@@ -61,10 +61,11 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
     """Parse the text of a ``QGC WPL`` file. Error texts begin with ``name``."""
     numbered_lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     numbered_lines = [(number, line) for number, line in numbered_lines if line and not line.startswith("#")]
-    first_number, first_line = numbered_lines[0] if numbered_lines else (1, "nothing")
+    first_number, first_line = numbered_lines[0] if numbered_lines else (1, "")
     *file_type, version = first_line.split() or [""]
     if file_type != ["QGC", "WPL"] or version not in ("110", "120"):
-        raise FileFormatError(f"{name}: line {first_number}: expected 'QGC WPL 110', found {first_line[:40]!r}")
+        found = repr(first_line[:40]) if first_line else "no text"
+        raise FileFormatError(f"{name}: line {first_number}: expected 'QGC WPL 110' or 'QGC WPL 120', found {found}")
     rows = [
         _Row(f"{name}: line {number}", line.split(), index) for index, (number, line) in enumerate(numbered_lines[1:])
     ]
@@ -183,7 +184,7 @@ def _item_row(item: MissionItem, index: int) -> str:
     numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):
         raise InvalidArgument(f"{item!r} has an infinite number, which a waypoint file cannot store")
-    if math.isnan(item.z) and item.position is not None:
+    if math.isnan(item.z) and (item.command in DESTINATIONS or item.position is not None):
         raise InvalidArgument(f"{item!r} has a place without an altitude, which a waypoint file cannot store")
     # Mission Planner writes 8 decimal places of each number, but 6 of the altitude.
     columns = [(number, 8) for number in numbers] + [(item.z, 6)]

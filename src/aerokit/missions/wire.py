@@ -160,8 +160,9 @@ def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, floa
     """Convert the items of a mission that was made for ArduPilot, so that another autopilot accepts them.
 
     For a command that has no position, ArduPilot accepts any frame, PX4 only MAV_FRAME_MISSION. In ArduPilot, the
-    position 0°, 0° means the current position. It is replaced by the destination of the previous item, or in the first
-    item by ``here`` (latitude and longitude in degrees, None if unknown).
+    position 0°, 0° means the current position. It is replaced by the last destination before it, or by ``here``
+    (latitude and longitude in degrees) if there is none. If ``here`` is None, 0°, 0° is kept, and `check_items` refuses
+    the mission.
     """
     current_xy: tuple[int, int] | None = None
     if here is not None:
@@ -251,7 +252,7 @@ def read_header(data: bytes) -> PlanHeader:
 
 
 def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
-    """Decode the items of a packed plan, with the vehicle's numbering: on ArduPilot, item 0 is home.
+    """Decode the items of a packed plan, from the ``first_index`` of its header on: on ArduPilot, item 0 is home.
 
     Raises:
         RemoteProtocolError: the data is not a packed plan, is truncated, or has another ``mission_type``.

@@ -276,7 +276,10 @@ def _check_option(
 
 
 def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
-    """Return the value in the setting's type; raise InvalidArgument if it is out of range or between two steps."""
+    """Return the value in the setting's type; raise InvalidArgument if it is not allowed.
+
+    It must be in range. An integer must also be a multiple of the step, counted from the minimum.
+    """
     number = checked_setting(setting.name, value, setting.wire_type)
     if isinstance(number, (str, bytes)):
         return number
@@ -320,12 +323,12 @@ def _parse_condition(condition: str) -> list[tuple[str, str, str, str]]:
         if word not in ("AND", "OR"):
             words.append(word)
             continue
-        text = "".join(words)
+        text = " ".join(words)
         operator = next((candidate for candidate in OPERATORS if candidate in text), None)
         if operator is None:
             raise ValueError(f"{condition!r} is not a condition")
         name, _, value = text.partition(operator)
-        tests.append((name, operator, value, joiner))
+        tests.append((name.strip(), operator, value.strip(), joiner))
         joiner, words = word, []
     return tests
 

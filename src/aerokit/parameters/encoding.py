@@ -40,7 +40,10 @@ _M = TypeVar("_M", ParamSet, ParamValue)
 def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa: A002
     """Encode a value as the four bytes of ``param_value``. :func:`checked_value` must have accepted the value."""
     if not bytewise or type is ParameterType.REAL32:  # Without `bytewise`, integers are sent as floats.
-        return _FLOAT.pack(value)
+        try:
+            return _FLOAT.pack(value)
+        except OverflowError:
+            raise InvalidArgument(f"{value!r} cannot be sent: it is too large for a 32-bit float") from None
     if type not in _FORMATS:
         raise InvalidArgument(
             f"{value!r} cannot be sent: an {type.name} has eight bytes, but the message has room for four"
@@ -172,7 +175,7 @@ def number_text(value: float) -> str:
     """
     if isinstance(value, int):
         return str(int(value))
-    if value == int(value) and abs(value) < 1e9:  # Larger numbers are shorter with an exponent.
+    if value == int(value) and abs(value) < 1e9:  # Larger numbers get an exponent.
         return "-0.0" if str(value) == "-0.0" else str(int(value))  # int() would lose the sign of -0.0.
     number = to_float32(value)
     # Nine digits identify every 32-bit float.

@@ -235,7 +235,7 @@ def setting_bytes(value: SettingValue, type: int) -> bytes:  # noqa: A002
 def checked_setting(name: str, value: object, type: int) -> SettingValue:  # noqa: A002
     """Convert a value to the form in which a component stores it in this type.
 
-    The result is an int, a 32-bit float, a string or bytes.
+    The result is an int, a float (rounded to 32 bits for REAL32), a string or bytes.
 
     Raises:
         InvalidArgument: the type cannot hold the value: 300 as a UINT8, 1.5 as an integer, a string for a number, a
@@ -279,7 +279,10 @@ _FLOAT = _STRUCTS[MavParamExtType.REAL32]
 
 
 def setting_key(value: SettingValue) -> object:
-    """Return a key that is the same for values that are equal according to :func:`settings_equal`."""
+    """Return a key that is the same for values that are equal according to :func:`settings_equal`.
+
+    The exception is an int above 2**24, which has its own key, but may equal the nearest 32-bit float.
+    """
     if isinstance(value, (str, bytes)):
         return _encoded(value)
     if not isinstance(value, float):

@@ -113,7 +113,7 @@ class Renamed(Snapshot):
             text += f"; values were converted ({old} = {self.rename.divisor} × {new})"
         if is_old_firmware:
             return f"{text}. The firmware, perhaps a -dev version, is older than the change in {self.rename.since}."
-        return f"{text}. Use {self.rename.new}, its name since ArduPilot {self.rename.since}."
+        return f"{text}. Use {self.name}, its name since ArduPilot {self.rename.since}."
 
     def _convert(self, value: float, source: str) -> int | float:
         if not self._has_other_units:
@@ -168,8 +168,8 @@ def translate_values(
     """Convert the values of a file or table to the names and units of a vehicle with the ``known`` names.
 
     Names of parameters that the vehicle does not have are kept. If ``values`` also has the vehicle's own name of a
-    parameter, the value under that name is used. ``types`` are the vehicle's types, for rounding. The second result
-    lists the converted parameters.
+    parameter, the value under that name is used; of several other names, the last one counts. ``types`` are the
+    vehicle's types, for rounding. The second result lists the converted parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []
@@ -226,7 +226,8 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
             two_way.update(dict.fromkeys(rename.names, rename))
     for since, vehicles, divisor, pairs in OLDER:
         for old, new in _pairs(pairs):
-            # If the new name was renamed again later, both renames become one with several old names.
+            # If the new name was renamed again later, both renames become one with several old names. The units changed
+            # only at the later rename, so its divisor applies to all of them.
             rename = two_way.get(new) or Rename(old, new, divisor, vehicles=vehicles, since=since)
             if old not in rename.names:
                 rename = rename.replace(other_old=(*rename.other_old, old))

@@ -30,7 +30,7 @@ class ParameterTable(Mapping[str, Parameter]):
         values: Mapping[str, int | float],
         types: Mapping[str, ParameterType] = MappingProxyType({}),
     ) -> ParameterTable:
-        """Create a table from values. Parameters without a type become REAL32; their values are not converted."""
+        """Create a table from values, which are not converted. Parameters without a type become REAL32."""
         return cls(
             Parameter(name, value, types.get(name, ParameterType.REAL32), None, index)
             for index, (name, value) in enumerate(values.items())
@@ -71,7 +71,7 @@ class ParameterTable(Mapping[str, Parameter]):
         return all(parameter.default is not None for parameter in self._by_name.values())
 
     def changed_from_default(self) -> ParameterTable:
-        """Return the parameters whose value differs from their default.
+        """Return the parameters whose value differs from their default. Those without a known default are left out.
 
         Raises:
             ValueUnknownError: no default is known, because the list protocol does not report defaults.

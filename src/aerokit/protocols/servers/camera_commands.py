@@ -126,6 +126,7 @@ class _Videos:
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
+        self._must_stop = False  # True from a command to stop until the next command to start
 
     async def start(self, command: ReceivedCommand) -> int:
         """Start recording. Param 2 is the rate in Hz at which CAMERA_CAPTURE_STATUS is sent during the recording."""
@@ -139,17 +140,24 @@ class _Videos:
             return MavResult.TEMPORARILY_REJECTED
         if camera.free_mib <= 0:
             return MavResult.FAILED
+        self._must_stop = False
         await camera.start_video()
         status_interval_s = 1.0 / command.param2 if command.param2 else 0.0  # 0 requests no status.
         captures.record(status_interval_s)
+        if self._must_stop:  # The command to stop arrived while the camera was starting.
+            await self._stop_recording()
         return MavResult.ACCEPTED
 
     async def stop(self, _: ReceivedCommand) -> int:
+        self._must_stop = True
+        await self._stop_recording()
+        return MavResult.ACCEPTED
+
+    async def _stop_recording(self) -> None:
         if self._camera.captures.is_recording:
             await self._camera.stop_video()
             self._camera.captures.stop_recording()
             self._camera.host.send(self._camera.captures.status())
-        return MavResult.ACCEPTED
 
     async def stream(self, command: ReceivedCommand, *, runs: bool) -> int:
         """Start or stop the stream with the number in param 1; 0 selects all streams."""

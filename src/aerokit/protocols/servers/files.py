@@ -194,7 +194,11 @@ class FileTree:
         self._root: _Folder = {}
 
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
-        """Create or replace a file, and create its folders. A function as content is called at the first access."""
+        """Create or replace a file, and create its folders.
+
+        A function as content is called when the content is first needed; until then, ``size`` is reported. A folder
+        with this path is replaced, with all its files.
+        """
         folder = self._root
         *parents, name = _parts(path)
         for parent in parents:
@@ -238,7 +242,11 @@ class FileTree:
         return 4096 if isinstance(node, dict) else node.size
 
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
-        """Open a file; ``create`` creates a missing file and empties an existing one."""
+        """Open a file; ``create`` creates a missing file and empties an existing one.
+
+        In a mount, ``writing`` decides whether the file can be written, and ``create`` is ignored. Outside of mounts,
+        every file can be written.
+        """
         mounted = self.mounted(path)
         if mounted is not None:
             mount, path_in_mount = mounted
@@ -254,7 +262,7 @@ class FileTree:
         if isinstance(node, dict):
             raise FileFault(EISDIR)
         if node is None:
-            self.reserve(0)  # A new name also needs free space.
+            self._check_space_for_entry()
             folder[name] = _File()
         else:
             self.reserve(-node.size)
@@ -285,20 +293,24 @@ class FileTree:
             raise FileFault(ENOTDIR)
         if isinstance(node, dict) and _contains(node, folder):  # A folder cannot be moved into itself.
             raise FileFault(EINVAL)
+        if isinstance(existing, _File) and existing is not node:
+            self.reserve(-existing.size)
         old_folder, old_name = self._parent(path)
         del old_folder[old_name]
         folder[name] = node
 
     def reserve(self, size: int) -> None:
-        """Take ``size`` from the free bytes; a negative size returns bytes.
-
-        Raises FileFault if too few bytes are free. Size 0 (a new, empty file) also needs a free byte.
-        """
+        """Take ``size`` from the free bytes; a negative size returns bytes. FileFault if too few bytes are free."""
         if self.free_bytes is None:
             return
-        if size >= 0 and max(size, 1) > self.free_bytes:
+        if size > self.free_bytes:
             raise FileFault(ENOSPC)
         self.free_bytes -= size
+
+    def _check_space_for_entry(self) -> None:
+        """Raise FileFault if no byte is free, because even an empty file or folder needs space."""
+        if self.free_bytes == 0:
+            raise FileFault(ENOSPC)
 
     def entries(self, path: str) -> list[Entry]:
         """Return the entries of a folder, oldest first."""
@@ -318,7 +330,7 @@ class FileTree:
         folder, name = self._parent(path)
         if name in folder:
             raise FileFault(EEXIST)
-        self.reserve(0)
+        self._check_space_for_entry()
         folder[name] = {}
 
     def remove_folder(self, path: str) -> None:

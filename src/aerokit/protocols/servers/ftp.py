@@ -344,7 +344,10 @@ class SessionFtpServer(Generic[FilesT]):
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
         """Answer with the folder's entries from number ``offset`` on: as many as fit into one message."""
+        max_line_size = DATA_SIZE - len(self.line_end)
         lines = [*self.list_prefix, *map(_line, self._entries(self._path(request)))]
+        # A line that fits into no message becomes S ("skip"). Otherwise the answer would be EOF, the end of the list.
+        lines = [line if len(line) <= max_line_size else b"S" for line in lines]
         listing = b""
         for line in lines[request.offset :]:
             if len(listing) + len(line) + len(self.line_end) > DATA_SIZE:

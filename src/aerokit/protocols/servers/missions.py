@@ -50,7 +50,8 @@ _TYPES = (MavMissionType.MISSION, MavMissionType.FENCE, MavMissionType.RALLY)
 _Result = MavMissionResult
 
 # Function that accepts or refuses an uploaded list, now or later. Its arguments are the MAV_MISSION_TYPE, the items,
-# and a function to call with the MAV_MISSION_RESULT.
+# and a function to call with the MAV_MISSION_RESULT. It raises InvalidArgument or nothing, because any other exception
+# would leave the sender without an answer.
 Validator = Callable[[int, tuple[MissionItem, ...], Callable[[int], None]], None]
 
 
@@ -307,7 +308,11 @@ class MissionServer:
         self._end(upload, _Result.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        """Process an item. Only the expected item from the client that uploads is stored."""
+        """Process an item. Only the expected item from the client that uploads is stored.
+
+        As in ArduPilot (MissionItemProtocol.cpp), the sequence is checked before the sender, and the upload's channel
+        gets the answer.
+        """
         upload = self._uploads.get(self._key(message.mission_type))
         if upload is None or message.mission_type != upload.mission_type:
             self._answer_item(message, _Result.ERROR, channel)
