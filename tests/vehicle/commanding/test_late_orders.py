@@ -341,7 +341,7 @@ async def _fly_velocity(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize("fly", [_fly_sticks, _fly_velocity])
-async def test_lost_hold_of_left_block_survives_cancellation(
+async def test_lost_hold_of_cancelled_block_waits_for_heartbeat(
     fly: Callable[[Flight], Coroutine[None, None, None]],
 ) -> None:
     async with in_the_air() as flight:
@@ -349,9 +349,14 @@ async def test_lost_hold_of_left_block_survives_cancellation(
         while not flight.copter.faults.drop_incoming:  # noqa: ASYNC110
             await anyio.sleep(0.05)
         await anyio.sleep(0.1)
+        orders_before, heartbeats = flight.wire.mode_orders(), HeldHeartbeats(flight.wire)
+        assert orders_before[-1] == CopterMode.BRAKE
         task.cancel()
         await asyncio.wait([task])
         assert task.cancelled()
+        await anyio.sleep(0.9)
+        assert flight.wire.mode_orders() == orders_before  # The hold is not sent again before the next HEARTBEAT.
+        heartbeats.stop()
         await anyio.sleep(5.0)
         assert flight.vehicle.mode_name == "BRAKE"
 

@@ -164,9 +164,10 @@ class FlightCleanup:
         Return False if nothing is sent: the order cannot have moved the vehicle, no hold can be sent, the vehicle is
         disarmed, or the order has ended, for example because a pilot took over.
 
-        Otherwise return True. If the last HEARTBEAT is recent, one command is sent at once. If not, it is sent after
-        the next HEARTBEAT, unless the order has ended or the vehicle is disarmed by then. While the connection is open,
-        a background task waits for the confirmation, and sends the hold again if there is none.
+        Otherwise return True. If the last HEARTBEAT is recent, one command is sent at once, unless the order has begun
+        to hold itself. If not, it is sent after the next HEARTBEAT, unless the order has ended or the vehicle is
+        disarmed by then. While the connection is open, a background task waits for the confirmation, and sends the hold
+        again if there is none.
         """
         if not order.may_move:
             return False
@@ -176,7 +177,8 @@ class FlightCleanup:
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:  # A hold must not be sent.
             return False
-        can_send_now = self._arbiter.is_state_recent
+        # If `stop_in` was abandoned, its command was probably sent, and must not be repeated without a HEARTBEAT.
+        can_send_now = self._arbiter.is_state_recent and not order.only_stops
         if can_send_now:
             self._send_hold(mode)
             order = self._arbiter.order(*order.modes, mode)
