@@ -73,7 +73,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         information: CameraInformation | None = None
         with anyio.move_on_after(timeout) as scope:
             information = await self._link.identify()
-        if information is None:  # Without a time-out, an autopilot has no information about a camera attached to it.
+        if information is None:  # If no time-out has expired, the autopilot has sent no information about its camera.
             limit = f" within {timeout:g} s" if scope.cancelled_caught else ""
             raise self._link.timeout_error(f"did not identify itself{limit}")
         return information
@@ -125,8 +125,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         """Request missing captures, and return all captures in the camera's log.
 
         These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. Requests stop after three successive captures that the
-        camera does not send.
+        attached to the autopilot has only the newest capture. The oldest are requested first, and requests stop after
+        three successive captures that the camera does not send.
 
         Args:
             timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
