@@ -172,6 +172,20 @@ async def test_shell_output_of_other_station_is_ignored() -> None:
         assert text == "echo 1\n1\npxh> "
 
 
+async def test_shell_read_ends_despite_messages_of_others() -> None:
+    async with on_px4() as flight, flight.vehicle.shell() as shell, anyio.create_task_group() as tasks:
+
+        async def talk() -> None:
+            while True:
+                flight.px4.send(m.SerialControl(10, 1, 0, 0, 3, b"no!".ljust(70, b"\0"), 254, 190))
+                await anyio.sleep(0.5)
+
+        tasks.start_soon(talk)
+        with anyio.fail_after(5), pytest.raises(OperationTimeout):
+            await shell.read(timeout=2)
+        tasks.cancel_scope.cancel()
+
+
 async def test_shell_without_answer_times_out_and_is_closed() -> None:
     async with on_px4() as flight:
         flight.px4.handlers[m.SerialControl.ID] = lambda *_: None
