@@ -236,6 +236,24 @@ async def test_log_stream_without_ack_of_start_is_stopped() -> None:
         assert params(flight, C.LOGGING_STOP) != []
 
 
+@pytest.mark.parametrize("target", [254, 255])
+async def test_log_stream_without_usable_data_times_out(target: int) -> None:
+    async with on_px4() as flight, anyio.create_task_group() as tasks:
+        flight.px4.faults.lost_messages.update({m.LoggingData.ID: 10_000, m.LoggingDataAcked.ID: 10_000})
+
+        async def send() -> None:
+            for sequence in range(1000):  # The message with the header was lost.
+                data = m.LoggingData(target, 190, sequence, 3, 0, b"abc".ljust(249, b"\0"))
+                flight.wire.deliver(FrameEncoder(1, 1).encode(data))
+                await anyio.sleep(0.5)
+
+        async with flight.vehicle.logs.stream(idle_timeout_s=3.0) as stream:
+            tasks.start_soon(send)
+            with anyio.fail_after(10), pytest.raises(OperationTimeout):
+                await anext(stream)
+        tasks.cancel_scope.cancel()
+
+
 def message(sequence: int, data: bytes, first: int = 0) -> m.LoggingData:
     return m.LoggingData(255, 190, sequence, len(data), first, data.ljust(249, b"\0"))
 
