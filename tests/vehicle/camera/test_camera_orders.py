@@ -238,7 +238,8 @@ async def test_refused_repetition_of_executed_order_is_no_refusal() -> None:
             return effects.pop(0)
 
         await link.order_once(link.begin_order("video"), send, had_effect)
-        assert answers == effects == []
+        assert answers == []
+        assert effects == []
 
 
 async def test_two_objects_of_a_camera_share_orders() -> None:
