@@ -373,7 +373,7 @@ async def test_load_captures_is_bounded_for_huge_counts() -> None:
         began = anyio.current_time()
         assert await vehicle.camera.load_captures(timeout=5.0) == []  # stops after three missing captures
         assert anyio.current_time() - began < 6
-        assert {command[2] for command in commands} <= {0, *range(1_999_980_000, 2_000_000_000)}
+        assert {command[2] for command in commands} <= {0, 2_000_000_000}  # the index as a float
 
 
 # --------------------------------------------------------------------------------------- command line

@@ -345,6 +345,18 @@ async def test_load_captures_requests_earlier_pictures() -> None:
         assert [capture.index for capture in await vehicle.camera.load_captures()] == [0, 1, 2]
 
 
+async def test_load_captures_returns_those_that_camera_still_has() -> None:
+    camera = SimulatedCamera()
+    camera.max_images = 4
+    async with on_board(camera, settle_s=0.5) as vehicle:
+        camera.faults.lose(m.CameraImageCaptured, times=9)
+        for _ in range(9):
+            camera.captures.take()
+            await anyio.sleep(1.0)
+        assert [capture.index for capture in await vehicle.camera.load_captures()] == [5, 6, 7, 8]
+        assert vehicle.camera.capture.value.index == 8
+
+
 # ---------------------------------------------------------------------- cameras attached to the autopilot
 
 

@@ -125,7 +125,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         """Request missing captures, and return all captures in the camera's log.
 
         These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. The oldest are requested first, and requests stop after
+        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
         three successive captures that the camera does not send.
 
         Args:
@@ -145,7 +145,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             consecutive_missing = 0
             # The autopilot stores only its newest capture.
             max_stored = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
-            for index in range(max(0, count - max_stored), count):
+            for index in reversed(range(max(0, count - max_stored), count)):  # A camera deletes the oldest first.
                 capture = await self._log.fetch(index)
                 consecutive_missing = consecutive_missing + 1 if capture is None else 0
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:

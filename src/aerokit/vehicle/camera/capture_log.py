@@ -107,6 +107,8 @@ class CaptureLog:
         self.reset_at: float = -math.inf
         # True if the camera sends CAMERA_IMAGE_CAPTURED; CAMERA_TRIGGER is then ignored.
         self._has_images = False
+        # Called with every capture that is new or more complete. The state value has only the latest picture.
+        self.on_capture: list[Callable[[Capture], None]] = []
         self.cell: StateCell[Capture] = link.new_cell(
             "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"
         )
@@ -288,14 +290,16 @@ class CaptureLog:
         self._publish(message, entry.capture, is_new=True)
 
     def _store(self, entry: _Entry) -> None:
-        # Remove an older entry first, so that the dictionary has the newest entry last and the oldest can be dropped.
-        self._by_index.pop(entry.capture.index, None)
         self._by_index[entry.capture.index] = entry
         if len(self._by_index) > MAX_CAPTURES:
-            del self._by_index[next(iter(self._by_index))]
+            del self._by_index[min(self._by_index)]
 
     def _publish(self, message: Message, capture: Capture, *, is_new: bool) -> None:
-        self._link.set_cell(self.cell, capture, message)
+        for callback in tuple(self.on_capture):
+            callback(capture)
+        is_older = self._highest is not None and capture.index < self._highest.capture.index
+        if not is_older or capture.success is False:  # An older capture was requested, or arrived late.
+            self._link.set_cell(self.cell, capture, message)
         if is_new:
             self._link.publish(
                 ImageCaptured, capture.camera, capture.index, capture.success, capture.place, capture.file_url
@@ -305,19 +309,18 @@ class CaptureLog:
 class CaptureQueue:
     """Queue of the captures that arrive during a ``with`` block."""
 
-    def __init__(self, cell: StateCell[Capture]) -> None:
-        self._cell = cell
+    def __init__(self, log: CaptureLog) -> None:
+        self._log = log
         self._queue: deque[Capture] = deque(maxlen=MAX_CAPTURES)
         self._event = anyio.Event()
-        self._detach: Callable[[], None] | None = None
 
     def __enter__(self) -> CaptureQueue:
-        self._detach = self._cell.observe(self._add, every_arrival=True)
+        self._log.on_capture.append(self._add)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        if self._detach is not None:
-            self._detach()
+        if self._add in self._log.on_capture:
+            self._log.on_capture.remove(self._add)
 
     def pop(self) -> Capture | None:
         """Return the oldest capture in the queue and remove it; None if the queue is empty."""
@@ -327,11 +330,11 @@ class CaptureQueue:
         """Wait for a capture; return False if none arrives in time."""
         with anyio.move_on_after(seconds):
             while not self._queue:
-                self._cell._raise_if_closed()
+                self._log.cell._raise_if_closed()
                 self._event = anyio.Event()
                 await self._event.wait()
         return bool(self._queue)
 
-    def _add(self, _: Capture | None, capture: Capture) -> None:
+    def _add(self, capture: Capture) -> None:
         self._queue.append(capture)
         self._event.set()

@@ -82,7 +82,7 @@ class Shutter:
                 f"{self.link.describe()} did not acknowledge the order for a picture within {timeout:g} s;"
                 " it may have taken one"
             )
-            with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
+            with CaptureQueue(self.log) as new_captures, anyio.move_on_after(timeout):
                 attempts = 1
                 error = await self.order_photo(before)
                 while True:
@@ -219,7 +219,7 @@ class PhotoInterval:
         self._count = count  # number of ordered pictures; 0 for a series without an end
         self._link = shutter.link
         self._log = shutter.log
-        self._new_captures = CaptureQueue(self._log.cell)
+        self._new_captures = CaptureQueue(self._log)
         # Index of the capture to deliver next.
         self._next_index: int | None = None
         # `reset_at` of the log when `_next_index` was determined. After a newer reset, the camera counts from 0 again,

@@ -90,8 +90,8 @@ class Logs:
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit; for each step of finding and reading a log). You can cancel any call; the vehicle then
-    stops sending.
+    total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
+    it. You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
     By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
