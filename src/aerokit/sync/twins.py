@@ -1393,8 +1393,8 @@ class Files(TwinOf["AsyncFiles"]):
     Paths are the vehicle's: ``/APM/LOGS`` and ``@PARAM/param.pck`` on ArduPilot, ``/fs/microsd/log`` on PX4.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit; for each of the steps of a resumed download). You can cancel any call; the file is then
-    closed on the vehicle.
+    total; None for no limit). For a resumed download, ``timeout`` limits each step: reading, comparing the CRC-32, and
+    reading again. You can cancel any call; the file is then closed on the vehicle.
 
     Every method but ``is_supported`` raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
@@ -1609,8 +1609,8 @@ class Logs(TwinOf["AsyncLogs"]):
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit; for each step of finding and reading a log). You can cancel any call; the vehicle then
-    stops sending.
+    total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
+    it. You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
     By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
@@ -3406,7 +3406,7 @@ class Camera(TwinOf["AsyncCamera"]):
         """Request missing captures, and return all captures in the camera's log.
 
         These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. The oldest are requested first, and requests stop after
+        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
         three successive captures that the camera does not send.
 
         Args:
