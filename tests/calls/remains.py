@@ -61,7 +61,7 @@ def _all(stage: Stage) -> Iterator[str]:
     yield from _times("sending", vehicle._arbiter._sent)
     yield from _times("held parameter", vehicle.parameters._registry._blocks)
     closing = vehicle.files._channel._closing.values()
-    yield from _times("file that is being closed", [file for file in closing if not file.ended.is_set()])
+    yield from _times("file that is being closed", [task for _, task in closing if not task.done()])
     yield from _times("open session", range(stage.simulated.ftp.open_sessions))
     yield from _times("log on its way", range(stage.simulated.storage.logs.is_busy))
     yield from _times("set-point stream", range(vehicle._flight_cleanup.stop_stream is not None))

@@ -34,12 +34,17 @@ class BackgroundTasks:
     def __len__(self) -> int:
         return len(self._tasks)
 
-    def start(self, function: Callable[[], Awaitable[None]], name: str | None = None) -> None:
-        """Run ``function()`` in a new task. Does nothing after :meth:`cancel`."""
-        if not self._is_cancelled:
-            task = asyncio.get_running_loop().create_task(self._guarded(function), name=name)
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+    def start(self, function: Callable[[], Awaitable[None]], name: str | None = None) -> asyncio.Task[None] | None:
+        """Run ``function()`` in a new task, and return the task. Does nothing after :meth:`cancel`, and returns None.
+
+        A task that is cancelled before its first step never calls the function.
+        """
+        if self._is_cancelled:
+            return None
+        task = asyncio.get_running_loop().create_task(self._guarded(function), name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
 
     def cancel(self) -> None:
         """Cancel all tasks and start no more. Never blocks; idempotent."""

@@ -1412,7 +1412,8 @@ class Files(TwinOf["AsyncFiles"]):
     Paths are the vehicle's: ``/APM/LOGS`` and ``@PARAM/param.pck`` on ArduPilot, ``/fs/microsd/log`` on PX4.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). You can cancel any call; the file is then closed on the vehicle.
+    total; None for no limit). For a resumed download, ``timeout`` limits each step: reading, comparing the CRC-32, and
+    reading again. You can cancel any call; the file is then closed on the vehicle.
 
     Every method but ``is_supported`` raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.
@@ -1627,7 +1628,8 @@ class Logs(TwinOf["AsyncLogs"]):
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). You can cancel any call; the vehicle then stops sending.
+    total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
+    it. You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
     By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
@@ -1666,7 +1668,7 @@ class Logs(TwinOf["AsyncLogs"]):
             method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster of the two for this autopilot,
                 or the slower if the faster is not available. MAVFTP requires that the log's file can be identified.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total.
+            timeout: seconds for each step: finding the log, and reading it.
             on_progress: called with the bytes so far and in total.
 
         Raises:
@@ -1833,7 +1835,7 @@ class Actuators(TwinOf["AsyncActuators"]):
 
         Raises:
             NotSupported: the firmware (PX4, Rover or Sub) does not support the command. Nothing was sent.
-            OperationRejected: the vehicle is disarmed, or on the ground. Nothing was sent.
+            OperationRejected: the vehicle is disarmed, or last reported that it is on the ground. Nothing was sent.
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no acknowledgement.
         """
@@ -2433,7 +2435,8 @@ class Calibration(CalibrationTwin):
     def cancel(self) -> None:
         """Cancel the calibration, and return when the vehicle has confirmed the end.
 
-        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps.
+        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps: a
+        loop that waits for the next step in another task ends.
 
         Raises:
             NotSupported: the vehicle cannot cancel this calibration.
@@ -3068,7 +3071,7 @@ class Camera(TwinOf["AsyncCamera"]):
         self._loop.run(self.aio.set_mode, mode, timeout=timeout)
 
     def load_storage(self) -> tuple[CameraStorage, ...]:
-        """Request information about the storage media (STORAGE_INFORMATION), and return it.
+        """Request information about the storage media (STORAGE_INFORMATION), and return what the camera reports.
 
         Raises:
             OperationTimeout: the camera reported no storage, or no camera was found.
@@ -3423,8 +3426,8 @@ class Camera(TwinOf["AsyncCamera"]):
         """Request missing captures, and return all captures in the camera's log.
 
         These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. Requests stop after three successive captures that the
-        camera does not send.
+        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
+        three successive captures that the camera does not send.
 
         Args:
             timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
@@ -3512,7 +3515,7 @@ class Settings(TwinOf["AsyncSettings"]):
                 and ``https://`` are fetched from the web. The default is the address in CAMERA_INFORMATION.
             locale: as for :meth:`load`.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total; at most one minute from the web.
+            timeout: seconds in total. A download from the web ends after one minute in any case.
 
         Raises:
             NotSupported: the camera names no definition file.
@@ -3594,7 +3597,8 @@ class Settings(TwinOf["AsyncSettings"]):
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
                 setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
-            ParameterTimeout: the component did not confirm the value, but may have set it.
+            ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that it may
+                change could not be read again.
         """
         return self._loop.run(self.aio.set, name, value, idle_timeout_s=idle_timeout_s, timeout=timeout)
 
@@ -3649,7 +3653,8 @@ class Component(TwinOf["AsyncComponent"]):
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: the component has no such file, or names a file that is not stored on the vehicle.
+            NotSupported: the component has no such file, does not answer the request for its address, or names a file
+                that is not stored on the vehicle.
             FileFormatError: the file is damaged.
             FileError, FileTimeout: the file cannot be read.
         """
@@ -4051,7 +4056,7 @@ class Vehicle(VehicleTwin):
         """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
 
         There is no acknowledgement. ArduPilot writes the text to its flight log. A text of more than 50 bytes is sent
-        in chunks. To reach ground stations but not the vehicle, send a ``Statustext`` by ``connection.send``.
+        in chunks.
 
         Args:
             text: 1 to 1000 bytes in UTF-8.

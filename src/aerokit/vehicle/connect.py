@@ -222,11 +222,12 @@ async def _attached(
         was_left_by_exception = True
         raise
     finally:
+        was_flight_abandoned = True  # It stays true if `finish` is cancelled.
         try:
             was_flight_abandoned = await context.finish()
+        finally:
             if was_left_by_exception or was_flight_abandoned:
                 warn_if_left_flying(vehicle)
-        finally:
             context.session.close()
             connection.attached.discard(vehicle.system_id)
             await context.session.background.aclose()
@@ -355,7 +356,7 @@ async def vehicles_on(
         connection: the result of :func:`aerokit.open_connection`.
         rates: rates to request from each vehicle, as a mapping of message class to Hz; see :func:`aerokit.connect`.
             ``{}`` requests nothing.
-        on_found: called in the event loop with each new vehicle.
+        on_found: called in the event loop with each new vehicle. Its exceptions are logged.
 
     Returns:
         Mapping of system id to vehicle, in the order in which they were found; grows while the block lasts.
@@ -372,11 +373,14 @@ async def vehicles_on(
         try:
             async with connect(connection, system_id=system_id, rates=rates) as vehicle:
                 vehicles[system_id] = vehicle
-                if on_found is not None:
-                    on_found(vehicle)
+                try:
+                    if on_found is not None:
+                        on_found(vehicle)
+                except Exception:  # All vehicles stay connected.
+                    logger.exception("on_found failed for vehicle %d", system_id)
                 await asyncio.Event().wait()  # This event is never set: `vehicles_on` cancels the task at its end.
         except AerokitError as error:
-            # The vehicle fell silent again, the program is connected to it already, or the connection has ended.
+            # No other heartbeat came in time, the program is connected already, or the connection has ended.
             logger.info("the connection to system %d failed or ended: %s", system_id, error)
 
     async def search() -> None:

@@ -224,6 +224,54 @@ async def test_lost_cancel_is_repeated(kind: type[Any]) -> None:
         assert len([params for params in orders(wire, CANCELS[kind][0]) if not any(params)]) >= 3
 
 
+async def test_unconfirmed_cancel_is_sent_six_times_and_raises() -> None:
+    async with stage(SimulatedCopter) as (copter, vehicle, wire):
+        calibration = vehicle.calibrate.compass()
+        await calibration.__anext__()
+        copter.faults.ignore(MavCmd.DO_CANCEL_MAG_CAL)
+        with pytest.raises(OperationTimeout, match="did not confirm the cancellation"):
+            await calibration.cancel()
+        await anyio.sleep(5)
+        assert len(orders(wire, MavCmd.DO_CANCEL_MAG_CAL)) == 6
+
+
+async def test_calibration_after_unconfirmed_cancel_raises() -> None:
+    async with stage(SimulatedCopter) as (copter, vehicle, _):
+        calibration = vehicle.calibrate.compass()
+        await calibration.__anext__()
+        copter.faults.ignore(MavCmd.DO_CANCEL_MAG_CAL)
+        with anyio.move_on_after(10), suppress(OperationTimeout):
+            await calibration.cancel()
+        with pytest.raises(OperationTimeout, match="did not confirm the cancellation"):
+            await vehicle.calibrate.compass().__anext__()
+
+
+async def test_two_calibrations_after_cancel_do_not_both_begin() -> None:
+    async with stage(SimulatedCopter) as (copter, vehicle, wire):
+        calibration = vehicle.calibrate.compass()
+        await calibration.__anext__()
+        copter.faults.ignore(MavCmd.DO_CANCEL_MAG_CAL, times=1)
+        cancelling = asyncio.create_task(calibration.cancel())
+        await anyio.sleep(0.5)
+        following = [vehicle.calibrate.compass() for _ in range(2)]
+        results = await asyncio.gather(*(each.__anext__() for each in following), return_exceptions=True)
+        assert [type(result) for result in results] == [CalibrationStep, BusyError]
+        await cancelling
+        assert len(orders(wire, MavCmd.DO_START_MAG_CAL)) == 2
+
+
+@pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPx4])
+async def test_cancel_by_other_task_ends_waiting_loop(kind: type[Any]) -> None:
+    async with stage(kind) as (simulated, vehicle, _):
+        calibration = vehicle.calibrate.compass()
+        await calibration.__anext__()
+        loop = asyncio.create_task(steps_of(calibration))
+        await anyio.sleep(0.01)
+        await calibration.cancel()
+        assert not is_running(simulated)
+        await loop
+
+
 async def test_cancel_is_not_sent_into_silence() -> None:
     async with stage(SimulatedCopter) as (copter, vehicle, wire):
         calibration = vehicle.calibrate.compass()
@@ -405,6 +453,25 @@ async def test_radio_that_was_not_moved_writes_nothing() -> None:
         await anyio.sleep(2)
         assert wire.all(m.ParamSet) == []
         assert orders(wire, CALIBRATION)[-1] == (0,) * 7
+
+
+async def test_lost_end_of_ardupilot_radio_calibration_is_repeated() -> None:
+    async with stage(SimulatedCopter) as (copter, vehicle, wire):
+        calibration = vehicle.calibrate.radio()
+        await calibration.__anext__()
+        copter.faults.ignore(CALIBRATION)
+        asyncio.get_running_loop().call_later(6.0, copter.faults.clear)
+        await calibration.cancel()
+        assert orders(wire, CALIBRATION)[1:] == [(0,) * 7] * 4
+
+
+async def test_radio_takes_no_trim_from_old_channels() -> None:
+    async with stage(SimulatedCopter) as (copter, vehicle, wire):
+        with pytest.raises(OperationTimeout, match="no RC_CHANNELS was received"):
+            async for step in vehicle.calibrate.radio():
+                if step.progress == 0.5:
+                    copter.faults.lost_messages[m.RcChannels.ID] = 1000
+        assert wire.all(m.ParamSet) == []
 
 
 async def test_unknown_autopilot_is_not_supported(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -141,7 +141,7 @@ async def test_start_video_accepted_without_recording_times_out() -> None:
     camera = SimulatedCamera(capabilities=BOTH)
     async with on_board(camera) as vehicle:
         camera.captures.record = lambda status_interval_s: None  # type: ignore[method-assign]
-        with pytest.raises(OperationTimeout, match="accepted the order, but does not record after 2 s"):
+        with pytest.raises(OperationTimeout, match="accepted the order, but did not report within 2 s that it records"):
             await vehicle.camera.start_video(timeout=2.0)
 
 
@@ -199,6 +199,31 @@ async def test_storage_is_reported_and_formatted() -> None:
         camera.card.is_inserted = False
         (medium,) = await vehicle.camera.load_storage()
         assert (medium.status, medium.total_mib, medium.available_mib) == ("empty", None, None)
+
+
+async def test_load_storage_returns_all_media() -> None:
+    camera = SimulatedCamera()
+
+    def storage(number: int) -> list[m.StorageInformation]:
+        """A camera that is slow to report its second medium unless that one is requested."""
+        (card,) = camera.card.information(camera, 1)
+        fields = {name: getattr(card, name) for name in card.__match_args__}
+        return [m.StorageInformation(**fields | {"storage_count": 2, "storage_id": number or 1})]
+
+    camera.storage = storage  # type: ignore[method-assign]
+    async with on_board(camera) as vehicle:
+        assert [medium.number for medium in await vehicle.camera.load_storage()] == [1, 2]
+
+
+async def test_unanswered_legacy_request_does_not_replace_standard_request() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        camera.faults.refuse(REQUEST, MavResult.FAILED, times=1)
+        camera.faults.ignore(int(MavCmd.REQUEST_STORAGE_INFORMATION))
+        with pytest.raises(OperationTimeout, match="reported no storage"):
+            await vehicle.camera.load_storage()
+        assert len(await vehicle.camera.load_storage()) == 1
 
 
 async def test_format_storage_is_sent_once() -> None:
@@ -445,6 +470,23 @@ async def test_lost_stream_information_is_requested_by_number() -> None:
         await vehicle.camera.wait_found()
         camera.faults.lose(m.VideoStreamInformation, times=2)
         assert len(await vehicle.camera.load_streams()) == 3
+
+
+async def test_load_streams_requests_known_streams_again() -> None:
+    camera = SimulatedCamera(streams=URIS)
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.load_streams()
+        camera.running_streams.discard(1)  # another station has stopped it
+        camera.faults.lose(m.VideoStreamInformation, times=1)
+        assert [stream.is_running for stream in await vehicle.camera.load_streams()] == [False, True, True]
+
+
+async def test_select_missing_stream_stops_no_other() -> None:
+    camera = SimulatedCamera(streams=URIS)
+    async with on_board(camera) as vehicle:
+        with pytest.raises(CommandRejected):
+            await vehicle.camera.select_stream(4)
+        assert camera.running_streams == {1, 2, 3}
 
 
 async def test_thermal_range_is_reported_and_source_selected() -> None:

@@ -14,7 +14,14 @@ from flight_harness import open_flight, open_px4
 
 import aerokit
 from aerokit import messages as m
-from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
+from aerokit.errors import (
+    AerokitError,
+    CommandRejected,
+    CommandTimeout,
+    ConnectionClosed,
+    NotSupported,
+    OperationTimeout,
+)
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4, simulated_link
@@ -204,6 +211,37 @@ async def test_refused_newer_order_leaves_stop_to_older_one() -> None:
         assert len(commands) == 1
 
 
+async def test_accepted_recording_without_report_is_not_stopped_by_older_block() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.set_mode("video")
+        commands = commands_to(camera, STOP_VIDEO)
+        async with vehicle.camera.video():
+            camera.captures.stop_recording()
+            camera.captures.record = lambda status_interval_s: None  # type: ignore[method-assign]
+            with pytest.raises(OperationTimeout):
+                await vehicle.camera.start_video(timeout=2.0)
+        assert commands == []
+
+
+async def test_refused_repetition_of_executed_order_is_no_refusal() -> None:
+    async with on_board(SimulatedCamera()) as vehicle:
+        await vehicle.camera.wait_found()
+        link = vehicle.camera._link
+        answers: list[AerokitError] = [CommandTimeout("lost"), CommandRejected("busy", command=START_VIDEO, result=1)]
+        effects = [False, True]  # The camera needs a moment until it reports that it records.
+
+        async def send() -> None:
+            raise answers.pop(0)
+
+        async def had_effect() -> bool:
+            return effects.pop(0)
+
+        await link.order_once(link.begin_order("video"), send, had_effect)
+        assert answers == []
+        assert effects == []
+
+
 async def test_two_objects_of_a_camera_share_orders() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
@@ -240,6 +278,38 @@ async def test_vehicle_block_end_stops_camera_operations(kind: str) -> None:
         await anyio.sleep(30)
         assert camera.image_count == taken
         assert len(commands) == 1
+
+
+async def test_block_end_raises_if_vehicle_block_ends_before_the_answer() -> None:
+    camera = SimulatedCamera()
+    results: list[AerokitError] = []
+    copter = SimulatedCopter(boot_time_s=0.0, components=(camera,))
+    async with simulated_link(copter) as link, anyio.create_task_group() as tasks, aerokit.connect(link) as vehicle:
+        await anyio.sleep(1.5)
+        await vehicle.camera.set_mode("video")
+
+        async def record() -> None:
+            try:
+                async with vehicle.camera.video():
+                    camera.faults.ignore(STOP_VIDEO)
+            except AerokitError as error:
+                results.append(error)
+
+        tasks.start_soon(record)
+        await anyio.sleep(1.0)
+    assert [type(error) for error in results] == [ConnectionClosed]
+
+
+async def test_unconfirmed_stop_of_cancelled_block_logs_warning(caplog: pytest.LogCaptureFixture) -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.set_mode("video")
+        with pytest.raises(KeyError):
+            async with vehicle.camera.video():
+                camera.faults.ignore(STOP_VIDEO)
+                raise KeyError
+        await anyio.sleep(15)
+        assert "camera 100 may not have stopped" in caplog.text
 
 
 async def test_late_ack_of_start_does_not_confirm_lost_stop() -> None:

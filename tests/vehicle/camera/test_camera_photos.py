@@ -223,6 +223,46 @@ async def test_series_requests_missing_captures() -> None:
         assert captures.missed == 0
 
 
+async def test_busy_camera_is_asked_again_for_a_capture() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        camera.faults.lose(m.CameraImageCaptured, times=1)
+        await vehicle.component(100).command(START, 0, 0, 1, 1)
+        await anyio.sleep(2)
+        camera.faults.refuse(int(MavCmd.REQUEST_MESSAGE), MavResult.TEMPORARILY_REJECTED, times=2)
+        capture = await vehicle.camera._log.fetch(0)
+        assert capture is not None
+
+
+async def test_series_with_corrupt_start_misses_nothing() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        camera.faults.lose(m.CameraCaptureStatus, times=1000)
+        async with vehicle.camera.photo_interval(1.0) as captures:
+            camera.send(m.CameraImageCaptured(0, 0, 1, 0, 0, 0, 0, (1, 0, 0, 0), 5000, 1, ""))
+            await anyio.sleep(2.5)
+            assert [(await anext(captures)).index for _ in range(6)] == list(range(6))
+        assert captures.missed == 0
+
+
+async def test_requested_capture_is_dropped_if_series_starts_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        async with vehicle.camera.photo_interval(60.0) as captures:
+            first = await anext(captures)
+
+            async def fetch(_: int) -> object:
+                captures._next_index = 7  # as `_collect` does when the camera has restarted
+                return first
+
+            monkeypatch.setattr(captures._log, "fetch", fetch)
+            await captures._fetch_missing()
+        assert captures._waiting == {}
+        assert captures._next_index == 7
+
+
 async def test_series_block_end_stops_the_series() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
@@ -274,7 +314,7 @@ async def test_series_ended_by_camera_is_rejected() -> None:
 async def test_silent_camera_ends_the_series_wait() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:
-        with pytest.raises(OperationTimeout, match="takes pictures, but reports no more of them"):
+        with pytest.raises(OperationTimeout, match="reports no more pictures"):
             async with vehicle.camera.photo_interval(0.5) as captures:
                 async for capture in captures:
                     camera.faults.silent = capture.index == 2
@@ -303,6 +343,18 @@ async def test_load_captures_requests_earlier_pictures() -> None:
             await anyio.sleep(1.0)
         assert vehicle.camera.captures() == []
         assert [capture.index for capture in await vehicle.camera.load_captures()] == [0, 1, 2]
+
+
+async def test_load_captures_returns_those_that_camera_still_has() -> None:
+    camera = SimulatedCamera()
+    camera.max_images = 4
+    async with on_board(camera, settle_s=0.5) as vehicle:
+        camera.faults.lose(m.CameraImageCaptured, times=9)
+        for _ in range(9):
+            camera.captures.take()
+            await anyio.sleep(1.0)
+        assert [capture.index for capture in await vehicle.camera.load_captures()] == [5, 6, 7, 8]
+        assert vehicle.camera.capture.value.index == 8
 
 
 # ---------------------------------------------------------------------- cameras attached to the autopilot
@@ -374,6 +426,18 @@ async def test_camera_trigger_uses_the_vehicle_position() -> None:
         assert capture.place is not None
         assert capture.place.distance_to(vehicle.position.value) < 1
         assert capture.yaw_deg == pytest.approx(vehicle.attitude.value.yaw_deg % 360, abs=1)
+
+
+async def test_camera_trigger_without_recent_position_has_no_place() -> None:
+    simulated = px4()
+    simulated.parameters["TRIG_MODE"] = 1.0
+    simulated.camera_trigger.sends_image_captured = False
+    async with on_board(vehicle=simulated, settle_s=6.0) as vehicle:
+        for message_type in (m.GlobalPositionInt, m.Attitude, m.AttitudeQuaternion):
+            simulated.faults.lost_messages[message_type.ID] = 10_000
+        await anyio.sleep(3)
+        capture = await vehicle.camera.take_photo()
+        assert (capture.place, capture.yaw_deg) == (None, None)
 
 
 async def test_vehicle_without_camera_rejects_take_photo() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -212,6 +213,26 @@ async def test_block_exit_waits_briefly_for_unanswered_hold() -> None:
             await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
         left_at = anyio.current_time()
     assert 1.0 < anyio.current_time() - left_at < 3.0
+
+
+async def test_block_left_by_two_cancellations_warns(caplog: pytest.LogCaptureFixture) -> None:
+    is_flying = asyncio.Event()
+
+    async def fly() -> None:
+        async with in_the_air() as flight:
+            flight.copter.faults.ignore(MavCmd.DO_SET_MODE)
+            is_flying.set()
+            await flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=500))
+
+    task = asyncio.create_task(fly())
+    await is_flying.wait()
+    await anyio.sleep(2.0)
+    for _ in range(2):  # The second cancellation arrives while the exit of the block waits for the hold.
+        task.cancel()
+        await anyio.sleep(0.5)
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert "vehicle 1 was left: in GUIDED, still armed, " in caplog.text
 
 
 async def test_old_height_is_described_with_its_age() -> None:

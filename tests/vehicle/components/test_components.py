@@ -252,6 +252,20 @@ async def test_damaged_metadata_is_file_format_error(content: bytes) -> None:
             await component.metadata()
 
 
+async def test_metadata_with_damaged_list_is_file_format_error() -> None:
+    async with px4_with({GENERAL: packed({"metadataTypes": {}})}) as component:
+        with pytest.raises(FileFormatError, match="it has no list of files"):
+            await component.metadata("parameter")
+
+
+@pytest.mark.parametrize("uri", ["", "ftp://etc/parameters.json", "mftp://[;comp=0]etc/parameters.json"])
+async def test_metadata_at_invalid_address_is_not_supported(uri: str) -> None:
+    general = {"metadataTypes": [{"type": 1, "uri": uri}]}
+    async with px4_with({GENERAL: packed(general)}) as component:
+        with pytest.raises(NotSupported, match="uri = "):
+            await component.metadata("parameter")
+
+
 async def test_component_without_metadata_is_not_supported() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:

@@ -172,6 +172,20 @@ async def test_shell_output_of_other_station_is_ignored() -> None:
         assert text == "echo 1\n1\npxh> "
 
 
+async def test_shell_read_ends_despite_messages_of_others() -> None:
+    async with on_px4() as flight, flight.vehicle.shell() as shell, anyio.create_task_group() as tasks:
+
+        async def talk() -> None:
+            while True:
+                flight.px4.send(m.SerialControl(10, 1, 0, 0, 3, b"no!".ljust(70, b"\0"), 254, 190))
+                await anyio.sleep(0.5)
+
+        tasks.start_soon(talk)
+        with anyio.fail_after(5), pytest.raises(OperationTimeout):
+            await shell.read(timeout=2)
+        tasks.cancel_scope.cancel()
+
+
 async def test_shell_without_answer_times_out_and_is_closed() -> None:
     async with on_px4() as flight:
         flight.px4.handlers[m.SerialControl.ID] = lambda *_: None
@@ -220,6 +234,24 @@ async def test_log_stream_without_ack_of_start_is_stopped() -> None:
             await streamed(flight, 1.0)
         await anyio.sleep(0.5)
         assert params(flight, C.LOGGING_STOP) != []
+
+
+@pytest.mark.parametrize("target", [254, 255])
+async def test_log_stream_without_usable_data_times_out(target: int) -> None:
+    async with on_px4() as flight, anyio.create_task_group() as tasks:
+        flight.px4.faults.lost_messages.update({m.LoggingData.ID: 10_000, m.LoggingDataAcked.ID: 10_000})
+
+        async def send() -> None:
+            for sequence in range(1000):  # The message with the header was lost.
+                data = m.LoggingData(target, 190, sequence, 3, 0, b"abc".ljust(249, b"\0"))
+                flight.wire.deliver(FrameEncoder(1, 1).encode(data))
+                await anyio.sleep(0.5)
+
+        async with flight.vehicle.logs.stream(idle_timeout_s=3.0) as stream:
+            tasks.start_soon(send)
+            with anyio.fail_after(10), pytest.raises(OperationTimeout):
+                await anext(stream)
+        tasks.cancel_scope.cancel()
 
 
 def message(sequence: int, data: bytes, first: int = 0) -> m.LoggingData:

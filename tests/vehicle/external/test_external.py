@@ -490,6 +490,19 @@ async def test_px4_without_gps_flies_by_odometry() -> None:
         tasks.cancel_scope.cancel()
 
 
+async def test_old_report_of_the_ground_excuses_no_constant_position() -> None:
+    simulated = px4(EKF2_GPS_CTRL=0.0)
+    async with open_px4(simulated) as flight, anyio.create_task_group() as tasks:
+        async with flight.vehicle.external.odometry() as stream:
+            tasks.start_soon(feed, stream, simulated.motion)
+            await anyio.sleep(5.0)
+            assert use_of(stream) == "used"
+            simulated.faults.lost_messages[m.ExtendedSysState.ID] = 1000
+            await anyio.sleep(6.0)
+            assert use_of(stream) == "not used"
+        tasks.cancel_scope.cancel()
+
+
 async def test_use_beside_gps_is_unknown() -> None:
     async with open_flight(copter()) as flight, flight.vehicle.external.odometry() as stream:
         await flight.vehicle.wait_ready()

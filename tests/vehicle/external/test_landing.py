@@ -13,6 +13,7 @@ from flight_harness import Flight, open_flight, open_px4
 from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
+    ConnectionClosed,
     HeartbeatTimeout,
     InvalidArgument,
     NotSupported,
@@ -149,6 +150,44 @@ async def test_exception_of_source_is_raised() -> None:
         assert flight.vehicle.mode_name == "LAND"
         with pytest.raises(InvalidArgument, match="target = 5"):
             await flight.vehicle.land_on(lambda: 5)  # type: ignore[arg-type,return-value]
+
+
+async def test_source_with_invalid_target_is_closed() -> None:
+    is_closed = False
+
+    async def frames() -> AsyncIterator[TargetMeasurement | None]:
+        nonlocal is_closed
+        try:
+            yield 5  # type: ignore[misc]
+        finally:
+            is_closed = True
+
+    async with open_flight(copter()) as flight:
+        await flight.take_off()
+        with pytest.raises(InvalidArgument, match="target = 5") as raised:
+            await flight.vehicle.land_on(frames())
+        assert is_closed
+        del raised  # Until here, its traceback has kept the generator alive.
+
+
+async def test_source_is_not_read_after_failed_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    reads = 0
+
+    def see() -> None:
+        nonlocal reads
+        reads += 1
+
+    def fail(*_: object, **__: object) -> None:
+        raise ConnectionClosed("the connection has ended")
+
+    async with open_flight(copter()) as flight:
+        await flight.take_off()
+        with monkeypatch.context() as patch:
+            patch.setattr(flight.vehicle._session, "streaming", fail)
+            with pytest.raises(ConnectionClosed):
+                await flight.vehicle.land_on(see)
+        await anyio.sleep(1.0)
+        assert reads == 0
 
 
 async def test_disarming_in_the_air_is_no_precision_landing() -> None:

@@ -143,6 +143,19 @@ async def test_error_waits_at_most_3_s_for_close(grounded: Flight, idle_timeout_
     assert now() - closings[0] == pytest.approx(waited_s, abs=0.01)
 
 
+async def test_link_lost_while_closing_does_not_replace_error_of_reading(grounded: Flight) -> None:
+    def loses_link(request: FtpMessage) -> Iterator[FtpMessage]:
+        if request.opcode == MavFtpOpcode.TERMINATESESSION:
+            grounded.wire.lose()
+        else:
+            yield opened(request) or nak(request, MavFtpErr.FILEPROTECTED)
+
+    serve(grounded, loses_link)
+    with pytest.raises(FileError) as raised:
+        await grounded.vehicle.files.read("/any")
+    assert raised.value.code == MavFtpErr.FILEPROTECTED
+
+
 @pytest.mark.parametrize("data", [b"Fa\t1\0", b""])
 async def test_endless_listing_is_an_error(grounded: Flight, data: bytes) -> None:
     serve(grounded, lambda request: iter([ack(request, data)]))

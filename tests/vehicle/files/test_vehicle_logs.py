@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -15,7 +16,7 @@ from flight_harness import open_flight, open_px4
 
 import aerokit
 from aerokit import messages as m
-from aerokit.errors import FileError, FileTimeout, InvalidArgument
+from aerokit.errors import ConnectionClosed, FileError, FileTimeout, InvalidArgument
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.testing import FaultModel, FaultyLink, run_virtual
@@ -189,6 +190,7 @@ async def test_log_ended_since_listing_is_read_in_flight(ardupilot: Bench) -> No
     ardupilot.server.write_on(MORE, 1_789_996_000)
     content = ardupilot.content(-1)
     ardupilot.simulated.storage.files.put("/APM/LOGS/00000003.BIN", b"the next one")
+    ardupilot.simulated.storage.files.put("/APM/LOGS/LASTLOG.TXT", b"3\r\n")
     await ardupilot.vehicle.wait_ready()
     await ardupilot.vehicle.arm()
     assert await ardupilot.logs.read(entry) == content
@@ -266,6 +268,49 @@ async def test_erase_without_effect_times_out(ardupilot: Bench) -> None:
         await ardupilot.logs.erase(idle_timeout_s=3.0)
 
 
+async def test_erase_waits_for_board_that_does_not_answer_meanwhile(ardupilot: Bench) -> None:
+    faults = ardupilot.simulated.faults
+
+    def erase(*_: object) -> None:
+        ardupilot.server.logs.clear()
+        faults.frozen = True
+        asyncio.get_running_loop().call_later(20.0, setattr, faults, "frozen", False)
+
+    ardupilot.simulated.on(m.LogErase, erase)
+    await ardupilot.logs.erase()
+    assert await ardupilot.logs.list() == ()
+
+
+async def test_timeout_error_of_disk_is_raised_unchanged(ardupilot: Bench) -> None:
+    by_log = ardupilot.logs._channel.operation("read", None)
+    by_ftp = ardupilot.vehicle.files._channel.operation("read", timeout=None, idle_timeout_s=1.0)
+    for operation in (by_log, by_ftp):
+        with pytest.raises(TimeoutError, match="the disk does not answer") as raised:
+            async with operation:
+                raise TimeoutError("the disk does not answer")
+        assert type(raised.value) is TimeoutError
+
+
+@pytest.mark.parametrize("is_cancelled", [True, False])
+@pytest.mark.parametrize("method", ["log", "ftp"])
+async def test_waiting_read_ends_with_vehicle_block(method: Any, is_cancelled: bool) -> None:
+    async with (
+        simulated_link(SimulatedCopter(boot_time_s=0.0)) as link,
+        aerokit.open_connection(link) as connection,
+    ):
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            entry = (await vehicle.logs.list())[0]
+            tasks = [asyncio.create_task(vehicle.logs.read(entry, method=method)) for _ in range(2)]
+            await anyio.sleep(0.02)
+            if is_cancelled:
+                tasks[0].cancel()
+                await asyncio.sleep(0)  # The file or the transfer is now being closed in the background.
+        with anyio.fail_after(30):
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        assert isinstance(results[1], ConnectionClosed)
+
+
 @pytest.mark.exhaustive
 async def test_cancellation_at_any_time_ends_the_transfer(bench: Bench) -> None:
     entry = (await bench.logs.list())[0]
@@ -303,6 +348,22 @@ async def test_log_path_identifies_files() -> None:
     assert found == "/fs/microsd/log/2026-11-21/b.ulg"
     assert await log_path(files, directories, LogEntry(0, 20, None), 1.0) is None
     assert await log_path(files, directories, LogEntry(2, 20, None), 1.0) is None
+
+
+@pytest.mark.parametrize(("last", "found"), [(b"3\r\n", "/logs/00000003.BIN"), (b"1\r\n", None)])
+async def test_log_path_is_unknown_after_numbers_have_wrapped(last: bytes, found: str | None) -> None:
+    class Listing:
+        """Files of ArduPilot. The file with the highest number is the newest one only if ``last`` is its number."""
+
+        async def list(self, path: str, *, idle_timeout_s: float) -> tuple[FileEntry, ...]:
+            return tuple(FileEntry(f"{number:08}.BIN", 20, False) for number in (1, 2, 3))
+
+        async def read(self, path: str, *, idle_timeout_s: float) -> bytes:
+            assert path == "/logs/LASTLOG.TXT"
+            return last
+
+    files: Any = Listing()
+    assert await log_path(files, ("/logs",), LogEntry(3, 10, None), 1.0) == found
 
 
 def names_in(directory: Path) -> list[str]:

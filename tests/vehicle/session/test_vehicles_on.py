@@ -9,7 +9,7 @@ import pytest
 
 import aerokit
 from aerokit.connection.opening import open_connection
-from aerokit.errors import BusyError, ConnectionClosed
+from aerokit.errors import BusyError, ConnectionClosed, NotSupported
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.connect import vehicles_on
 from aerokit.vehicle.vehicle import overview
@@ -59,6 +59,21 @@ async def test_vehicles_on_skips_connected_vehicle() -> None:
         await anyio.sleep(5)
         assert list(vehicles) == [2]
         await own.mode.wait_until(lambda mode: True, timeout=5)
+
+
+@pytest.mark.parametrize("error", [NotSupported("no camera"), ZeroDivisionError()])
+async def test_vehicles_on_logs_error_of_callback(error: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    def on_found(vehicle: aerokit.Vehicle) -> None:
+        raise error
+
+    async with (
+        simulated_link(SimulatedCopter()) as link,
+        open_connection(link) as connection,
+        vehicles_on(connection, on_found=on_found) as vehicles,
+    ):
+        await anyio.sleep(5)
+        await vehicles[1].mode.wait_until(lambda mode: True, timeout=5)
+        assert "on_found failed for vehicle 1" in caplog.text
 
 
 async def test_vehicles_on_closed_connection_raises() -> None:

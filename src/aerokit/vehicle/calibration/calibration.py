@@ -8,6 +8,8 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
+import anyio
+
 from aerokit._internal.arguments import checks_arguments
 from aerokit.vehicle.calibration import procedures
 from aerokit.vehicle.calibration.run import CalibrationRun
@@ -52,6 +54,9 @@ class Calibration(AsyncIterator["CalibrationStep"]):
         # The event loop of the iteration; None before the first step.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_over = False
+        # Held while a task waits for the next step, and the scope in which it waits.
+        self._lock = asyncio.Lock()
+        self._waiting: anyio.CancelScope | None = None
 
     def __aiter__(self) -> Calibration:
         return self
@@ -61,23 +66,30 @@ class Calibration(AsyncIterator["CalibrationStep"]):
             raise StopAsyncIteration
         self._loop = asyncio.get_running_loop()  # `__del__` needs it, and may run on another thread.
         try:
-            return await self._steps.__anext__()
+            async with self._lock:
+                with anyio.CancelScope() as self._waiting:
+                    return await self._steps.__anext__()
         except BaseException:  # No step follows. `abandon` does nothing if the calibration has ended on the vehicle.
             self._is_over = True
             self._run.abandon()
             raise
+        raise StopAsyncIteration  # `cancel` has ended the wait for the step.
 
     async def cancel(self) -> None:
         """Cancel the calibration, and return when the vehicle has confirmed the end.
 
-        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps.
+        Sends nothing if the calibration has not started or has ended. In any case, the iterator gives no more steps: a
+        loop that waits for the next step in another task ends.
 
         Raises:
             NotSupported: the vehicle cannot cancel this calibration.
             OperationTimeout: the vehicle did not confirm the end.
         """
         self._is_over = True
-        await self._steps.aclose()
+        if self._waiting is not None:
+            self._waiting.cancel()
+        async with self._lock:
+            await self._steps.aclose()
         if self._run.is_running:
             self._run.abandon()
             await self._run.wait_cancelled()

@@ -51,7 +51,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    # When the vehicle last reported that it calibrates. Until its first report, the value is infinite, so that
+    # When CALIBRATING was last seen as the latest state. Until the first report, the value is infinite, so that
     # `has_ended_silently` returns False.
     calibrating_at = math.inf
     with ExitStack() as cleanup:
@@ -190,7 +190,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             percents[message.compass_id] = message.completion_pct
         has_changed = True
 
-    def has_new_report() -> bool:
+    def has_news() -> bool:
         return has_changed
 
     def is_complete() -> bool:
@@ -207,7 +207,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         instruction = "turn the vehicle slowly in all directions, about each of its axes"
         yield run.new_step(0.0, instruction)
         while not is_complete():
-            await run.wait(has_new_report)
+            await run.wait(has_news, timeout_text="no compass reported progress")
             has_changed = False
             progress = min(percents.values(), default=0) / 100
             yield run.new_step(progress, instruction)
@@ -289,12 +289,17 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     highs: dict[int, int] = {}
     with ExitStack() as cleanup:
         cleanup.enter_context(run.session.streaming("rc_channels"))
-        previous_update = channels.updated_at
-        await run.wait(
-            lambda: channels.updated_at > previous_update,
-            CHANNELS_TIMEOUT_S,
-            "no RC_CHANNELS was received: is a receiver connected?",
-        )
+
+        async def wait_channels() -> None:
+            """Wait for a new message, because the positions of the sticks in the last one may be old."""
+            previous_update = channels.updated_at
+            await run.wait(
+                lambda: channels.updated_at > previous_update,
+                CHANNELS_TIMEOUT_S,
+                "no RC_CHANNELS was received: is a receiver connected?",
+            )
+
+        await wait_channels()
         if not _pulses(channels.latest):
             raise run.failure("the receiver reports no channels; switch the transmitter on; nothing was sent")
         await run.begin(CANCEL_ALL)
@@ -313,6 +318,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         yield run.new_step(
             0.5, "centre the sticks, with the throttle at its lowest, then continue", needs_confirmation=True
         )
+        await wait_channels()
         trims = _pulses(channels.latest)
     moved = [number for number in lows if highs[number] - lows[number] >= MIN_TRAVEL_US]
     if len(moved) < MIN_CHANNELS:

@@ -68,6 +68,8 @@ class CalibrationRun:
         self._sent_cancel: SentCommand | None = None
         self._has_rebooted = False
         self._is_abandoned = False
+        # True from the first cancel command on, until the vehicle has confirmed the cancellation.
+        self._is_unconfirmed = False
         self._ended = asyncio.Event()  # set once the calibration has ended on the vehicle
 
     # ------------------------------------------------------------------------------- start and end
@@ -91,7 +93,8 @@ class CalibrationRun:
         self.check_ready()
         # The run of a deleted iterator is abandoned only in the next iteration of the event loop, so wait for that.
         await anyio.lowlevel.checkpoint()
-        for run in tuple(self._runs):
+        while self._runs:  # Another call may have begun a calibration during the wait.
+            run = self._runs[0]
             if not run._is_abandoned:
                 raise BusyError(f"{self.call_name}: {run.call_name} is in progress; nothing was sent")
             await run.wait_cancelled()
@@ -126,7 +129,7 @@ class CalibrationRun:
         if not self._ended.is_set():
             self._ended.set()
             self._cancel_order_stack.close()  # The cancel command, if one was sent, need not be repeated.
-            if self.is_running:
+            if self in self._runs:
                 self._runs.remove(self)
                 self.context.on_finish.remove(self.abandon)
                 self.session.on_reboot.remove(self._on_reboot)
@@ -158,6 +161,7 @@ class CalibrationRun:
         self._sent_cancel = self._cancel_order_stack.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel_command)
+        self._is_unconfirmed = True
         self.session.background.start(self._confirm_cancel, "aerokit calibration")
 
     async def wait_cancelled(self) -> None:
@@ -171,7 +175,7 @@ class CalibrationRun:
             await self._ended.wait()
         if self._cannot_cancel_reason:
             raise NotSupported(f"{self.call_name}: {self._cannot_cancel_reason}")
-        if not self._ended.is_set():
+        if self._is_unconfirmed:
             raise OperationTimeout(
                 f"{self.call_name}: the vehicle did not confirm the cancellation; {self.session.describe_link()}"
             )
@@ -179,26 +183,34 @@ class CalibrationRun:
     def _send_cancel(self, command: float, *params: float) -> None:
         # All callers check first that the vehicle is not silent. A repetition of the command has no further effect.
         self._cancel_sent_at = self.session.connection.now()
+        self.session.commands.forget_result(int(command))
         self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
         """Send the cancel command if it was not sent yet; repeat it until the vehicle confirms the cancellation."""
         assert self._cancel_command is not None
+        command = self._cancel_command[0]
+        must_send = self._cancel_sent_at is None  # `abandon` has sent the first command, unless the vehicle was silent.
         try:
             for _ in range(MAX_CANCEL_ATTEMPTS):
-                if self._cancel_sent_at is not None:
-                    with anyio.move_on_after(CANCEL_INTERVAL_S):
-                        while not self._is_cancelled(self._cancel_command[0]):  # noqa: ASYNC110
-                            await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
-                        return  # The vehicle has confirmed in time.
-                # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
-                await self.session.wait_for_heartbeat(self._cancel_sent_at)
-                is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
-                if self._has_rebooted or is_taken_over:
-                    # A reboot has ended the calibration. After a takeover, the command might disturb the other party.
-                    return
-                if self.context.arbiter.is_state_recent:
+                if must_send:
+                    # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
+                    await self.session.wait_for_heartbeat(self._cancel_sent_at)
+                    is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
+                    if self._has_rebooted or is_taken_over:
+                        # A reboot has ended the calibration. After a takeover, the command might disturb the other
+                        # party.
+                        self._is_unconfirmed = not self._has_rebooted
+                        return
+                    if not self.context.arbiter.is_state_recent:
+                        continue
                     self._send_cancel(*self._cancel_command)
+                must_send = True
+                with anyio.move_on_after(CANCEL_INTERVAL_S):
+                    while not self._is_cancelled(command):  # noqa: ASYNC110
+                        await anyio.sleep(CONFIRM_POLL_INTERVAL_S)
+                    self._is_unconfirmed = False
+                    return
             logger.warning("%s: the vehicle did not confirm the cancellation", self.call_name)
         except (ConnectionClosed, LinkLost):  # The vehicle can no longer be reached.
             pass
@@ -208,8 +220,8 @@ class CalibrationRun:
     def _is_cancelled(self, cancel_command: float) -> bool:
         """Return True if the vehicle has confirmed the cancellation.
 
-        COMMAND_ACK confirms DO_CANCEL_MAG_CAL. HEARTBEAT confirms PREFLIGHT_CALIBRATION, because PX4 acknowledges it
-        twice with different results.
+        COMMAND_ACK confirms DO_CANCEL_MAG_CAL, and ArduPilot's end of the radio calibration. HEARTBEAT confirms
+        PREFLIGHT_CALIBRATION on PX4, because PX4 acknowledges it twice with different results.
         """
         if self._has_rebooted:
             return True
@@ -217,6 +229,9 @@ class CalibrationRun:
         # PREFLIGHT_CALIBRATION with zeros cancels every calibration of PX4, and ArduPilot's radio calibration.
         if cancel_command != MavCmd.PREFLIGHT_CALIBRATION:
             return self.session.commands.accepted_at(int(cancel_command)) >= self._cancel_sent_at
+        if self.session.autopilot.calibration_protocol != "texts":
+            # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp), so any answer confirms it.
+            return self.session.commands.last_result(int(cancel_command)) is not None
         status = self.session.telemetry.system_status
         return status.updated_at > self._cancel_sent_at and status.latest != MavState.CALIBRATING
 

@@ -73,7 +73,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         information: CameraInformation | None = None
         with anyio.move_on_after(timeout) as scope:
             information = await self._link.identify()
-        if information is None:  # Without a time-out, an autopilot has no information about a camera attached to it.
+        if information is None:  # If no time-out has expired, the autopilot has sent no information about its camera.
             limit = f" within {timeout:g} s" if scope.cancelled_caught else ""
             raise self._link.timeout_error(f"did not identify itself{limit}")
         return information
@@ -125,8 +125,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         """Request missing captures, and return all captures in the camera's log.
 
         These include captures from before this program started. At most the newest 20,000 are returned. A camera
-        attached to the autopilot has only the newest capture. Requests stop after three successive captures that the
-        camera does not send.
+        attached to the autopilot has only the newest capture. The newest are requested first, and requests stop after
+        three successive captures that the camera does not send.
 
         Args:
             timeout: seconds to wait for all captures; :meth:`captures` returns those that arrived in time.
@@ -145,7 +145,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
             consecutive_missing = 0
             # The autopilot stores only its newest capture.
             max_stored = 1 if self._link.is_autopilot_attached else MAX_CAPTURES
-            for index in range(max(0, count - max_stored), count):
+            for index in reversed(range(max(0, count - max_stored), count)):  # A camera deletes the oldest first.
                 capture = await self._log.fetch(index)
                 consecutive_missing = consecutive_missing + 1 if capture is None else 0
                 if consecutive_missing == MAX_CONSECUTIVE_MISSING:

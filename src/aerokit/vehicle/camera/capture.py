@@ -34,10 +34,13 @@ __all__ = ["Capture", "captures_csv", "geotag_file", "geotagged", "write_capture
 Quaternion = tuple[float, float, float, float]
 
 # Time stamps below this (the year 1990) are not UTC, but the time since the vehicle was started.
-SECONDS_IN_1990 = 631_152_000
+UNIX_TIME_OF_1990_S = 631_152_000
 
 # End of the year 9999, the last year that datetime can represent.
 MAX_UTC_S = 253_402_300_799
+
+# A position or an attitude older than this many seconds is not that of a picture taken now.
+MAX_POSE_AGE_S = 2.0
 
 # CAMERA_FEEDBACK counts pictures in 16 bits.
 FEEDBACK_INDEX_RANGE = 1 << 16
@@ -98,7 +101,7 @@ def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> C
     return Capture(
         camera=camera,
         index=(message.img_idx - 1) % FEEDBACK_INDEX_RANGE,
-        success=True,
+        success=True,  # ArduPilot always sends the flag CAMERA_FEEDBACK_PHOTO (AP_Camera_Backend.cpp).
         received_at=received_at,
         taken_at=_utc(message.time_usec),
         place=place_of(message.lat, message.lng, message.alt_msl, message.alt_rel),
@@ -112,7 +115,8 @@ def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> C
 
 def from_trigger(message: CameraTrigger, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
     """Decode PX4's CAMERA_TRIGGER. The message has no position, so the vehicle's position and attitude are used."""
-    position, attitude = telemetry.position.latest, telemetry.attitude.latest
+    position = telemetry.position.latest if telemetry.position.age <= MAX_POSE_AGE_S else None
+    attitude = telemetry.attitude.latest if telemetry.attitude.age <= MAX_POSE_AGE_S else None
     roll: float | None = None
     pitch: float | None = None
     yaw: float | None = None
@@ -143,7 +147,7 @@ def from_trigger(message: CameraTrigger, camera: int, received_at: float, teleme
 
 def _utc(microseconds: int) -> float | None:
     seconds = microseconds / 1e6
-    return seconds if SECONDS_IN_1990 <= seconds < MAX_UTC_S else None
+    return seconds if UNIX_TIME_OF_1990_S <= seconds < MAX_UTC_S else None
 
 
 def _angles(roll: float, pitch: float, yaw: float) -> tuple[float | None, float | None, float | None]:
@@ -300,7 +304,7 @@ def _segments(jpeg: bytes) -> Iterator[bytes]:
         length = int.from_bytes(jpeg[start + 2 : start + 4], "big")
         segment = jpeg[start : start + 2 + length]
         if segment[:1] != b"\xff" or length < 2 or len(segment) < 2 + length:
-            raise FileFormatError("the JPEG is incomplete: it ends before the image data")
+            raise FileFormatError(f"the JPEG is incomplete or malformed: no segment begins at byte {start}")
         yield segment
         start += len(segment)
 

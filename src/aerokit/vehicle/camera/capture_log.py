@@ -11,9 +11,10 @@ import anyio
 from aerokit.errors import CommandRejected
 from aerokit.events import ImageCaptured
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavResult
 from aerokit.vehicle.camera.capture import (
     FEEDBACK_INDEX_RANGE,
-    SECONDS_IN_1990,
+    UNIX_TIME_OF_1990_S,
     Capture,
     from_feedback,
     from_image,
@@ -58,7 +59,7 @@ class _Entry:
             self.boot_us = message.time_boot_ms * 1000
         else:
             stamp: int = getattr(message, "time_usec", 0)  # UTC, or the time since boot if the sender has no UTC
-            is_utc = stamp >= SECONDS_IN_1990 * 1_000_000
+            is_utc = stamp >= UNIX_TIME_OF_1990_S * 1_000_000
             self.utc_us = stamp if is_utc else 0
             self.boot_us = 0 if is_utc else stamp
 
@@ -92,20 +93,22 @@ class CaptureLog:
     def __init__(self, link: CameraLink) -> None:
         self._link = link
         self._by_index: dict[int, _Entry] = {}
-        # Indices of the captures that are being requested.
-        self._requested: set[int] = set()
+        # Indices of the captures that are being requested; an index that two calls request occurs twice.
+        self._requested: list[int] = []
         self._highest: _Entry | None = None  # the entry with the highest plausible index
         self._outlier: _Entry | None = None  # the last entry, if its index is too far above `_highest`
         self._failed: _Entry | None = None  # the last failed picture
         # Number of pictures according to CAMERA_CAPTURE_STATUS and to indices, and the time since boot at which the
-        # camera reported it. `_is_count_used` is False until the camera has reported a number above 0.
+        # camera reported it. `_has_nonzero_count` is False until the camera has reported a number above 0.
         self._count = 0
         self._count_boot_ms = 0
-        self._is_count_used = False
+        self._has_nonzero_count = False
         # Time of the event loop at the last reset. Captures from before the reset do not belong to this log.
         self.reset_at: float = -math.inf
         # True if the camera sends CAMERA_IMAGE_CAPTURED; CAMERA_TRIGGER is then ignored.
         self._has_images = False
+        # Called with every capture that is new or more complete. The state value has only the latest picture.
+        self.on_capture: list[Callable[[Capture], None]] = []
         self.cell: StateCell[Capture] = link.new_cell(
             "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"
         )
@@ -125,7 +128,7 @@ class CaptureLog:
         """Request a missed capture. Returns None if the camera has deleted it or does not answer."""
         if not self.has(index) and self._link.is_trigger:
             return None  # PX4's trigger cannot send a capture again.
-        self._requested.add(index)  # The answer may have a low index, which must not count as a reset.
+        self._requested.append(index)  # The answer may have a low index, which must not count as a reset.
         try:
             for _ in range(FETCH_ATTEMPTS):
                 if self.has(index):
@@ -134,7 +137,7 @@ class CaptureLog:
                 if is_deleted:
                     break
         finally:
-            self._requested.discard(index)
+            self._requested.remove(index)
         entry = self._by_index.get(index)
         return None if entry is None else entry.capture
 
@@ -155,8 +158,11 @@ class CaptureLog:
                 where=lambda message: message.cam_idx + 1 == self._link.number,
                 timeout=REQUEST_TIMEOUT_S,
             )
-        except CommandRejected:
-            return True
+        except CommandRejected as error:
+            if error.result != MavResult.TEMPORARILY_REJECTED:
+                return True
+            await anyio.sleep(REQUEST_TIMEOUT_S)  # The camera is busy, so a later request may succeed.
+            return False
         # `img_idx` counts pictures from 1, `index` from 0.
         return newest is not None and (newest.img_idx - 1) % FEEDBACK_INDEX_RANGE != index
 
@@ -199,7 +205,7 @@ class CaptureLog:
         if count < self._count:  # The camera counts from 0 again.
             self._reset()
         self._count = count
-        self._is_count_used = self._is_count_used or count > 0
+        self._has_nonzero_count = self._has_nonzero_count or count > 0
 
     def _reset(self) -> None:
         self._by_index.clear()
@@ -243,20 +249,21 @@ class CaptureLog:
                 return
         self._store(entry)
         self._update_highest(entry)
-        if isinstance(message, m.CameraImageCaptured):
+        if isinstance(message, m.CameraImageCaptured) and entry is self._highest:
             # A CAMERA_CAPTURE_STATUS that was sent before this picture does not count it, so it is ignored.
             self._count_boot_ms = message.time_boot_ms
         # Indices begin at 0, so `index` pictures were taken before this one; the camera may count this one later. An
         # index far above the count shows that the camera does not count as the standard says. The count is then left
         # unchanged.
-        if self._is_count_used and capture.index <= self._count + MAX_COUNT_LEAD:
+        if self._has_nonzero_count and capture.index <= self._count + MAX_COUNT_LEAD:
             self._count = max(self._count, capture.index)
         self._publish(message, capture, is_new=is_new)
 
     def _update_highest(self, entry: _Entry) -> None:
         """Record the entry with the highest index.
 
-        An index far above the highest one may be corrupt, so it counts only when the next picture confirms it.
+        An index far above the highest one may be corrupt, so it counts only when the next picture, or a second message
+        about the same picture, confirms it.
         """
         index, highest, outlier = entry.capture.index, self._highest, self._outlier
         self._outlier = None
@@ -283,14 +290,16 @@ class CaptureLog:
         self._publish(message, entry.capture, is_new=True)
 
     def _store(self, entry: _Entry) -> None:
-        # Remove an older entry first, so that the dictionary has the newest entry last and the oldest can be dropped.
-        self._by_index.pop(entry.capture.index, None)
         self._by_index[entry.capture.index] = entry
         if len(self._by_index) > MAX_CAPTURES:
-            del self._by_index[next(iter(self._by_index))]
+            del self._by_index[min(self._by_index)]
 
     def _publish(self, message: Message, capture: Capture, *, is_new: bool) -> None:
-        self._link.set_cell(self.cell, capture, message)
+        for callback in tuple(self.on_capture):
+            callback(capture)
+        is_older = self._highest is not None and capture.index < self._highest.capture.index
+        if not is_older or capture.success is False:  # An older capture was requested, or arrived late.
+            self._link.set_cell(self.cell, capture, message)
         if is_new:
             self._link.publish(
                 ImageCaptured, capture.camera, capture.index, capture.success, capture.place, capture.file_url
@@ -300,19 +309,18 @@ class CaptureLog:
 class CaptureQueue:
     """Queue of the captures that arrive during a ``with`` block."""
 
-    def __init__(self, cell: StateCell[Capture]) -> None:
-        self._cell = cell
+    def __init__(self, log: CaptureLog) -> None:
+        self._log = log
         self._queue: deque[Capture] = deque(maxlen=MAX_CAPTURES)
         self._event = anyio.Event()
-        self._detach: Callable[[], None] | None = None
 
     def __enter__(self) -> CaptureQueue:
-        self._detach = self._cell.observe(self._add, every_arrival=True)
+        self._log.on_capture.append(self._add)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        if self._detach is not None:
-            self._detach()
+        if self._add in self._log.on_capture:
+            self._log.on_capture.remove(self._add)
 
     def pop(self) -> Capture | None:
         """Return the oldest capture in the queue and remove it; None if the queue is empty."""
@@ -322,11 +330,11 @@ class CaptureQueue:
         """Wait for a capture; return False if none arrives in time."""
         with anyio.move_on_after(seconds):
             while not self._queue:
-                self._cell._raise_if_closed()
+                self._log.cell._raise_if_closed()
                 self._event = anyio.Event()
                 await self._event.wait()
         return bool(self._queue)
 
-    def _add(self, _: Capture | None, capture: Capture) -> None:
+    def _add(self, capture: Capture) -> None:
         self._queue.append(capture)
         self._event.set()

@@ -329,15 +329,24 @@ class StorageMixin(CameraMixin):
         raise self._link.timeout_error(f"accepted the mode {mode}, but {outcome} after {timeout:g} s")
 
     async def load_storage(self) -> tuple[CameraStorage, ...]:
-        """Request information about the storage media (STORAGE_INFORMATION), and return it.
+        """Request information about the storage media (STORAGE_INFORMATION), and return what the camera reports.
 
         Raises:
             OperationTimeout: the camera reported no storage, or no camera was found.
         """
         await self._link.identify()
-        if await self._link.request(m.StorageInformation, 0) is None:
+        self._media.clear()  # Media that were reported earlier may have changed.
+        first = await self._link.request(m.StorageInformation, 0)  # 0 requests all media, one message for each.
+        if first is None:
             raise self._link.timeout_error("reported no storage")
+        for number in range(1, first.storage_count + 1):
+            if number not in self._media:
+                await self._request_medium(number)
         return self.storage.value
+
+    async def _request_medium(self, number: int) -> None:
+        """Request information about one medium, and wait for it."""
+        await self._link.request(m.StorageInformation, number, where=lambda message: message.storage_id == number)
 
     async def format_storage(
         self,

@@ -176,14 +176,17 @@ class CameraLink(CameraOrders):
         try:
             await self.requests.request(m.CameraInformation, self.device_id, where=self._is_from_this_camera)
         except CommandRejected:
-            # Information that was received earlier stays valid, so the refusal is then no error.
+            # Information that was received earlier stays valid: after a silence, it is usually the same camera.
             if must_identify and not self.information.is_known:
                 raise
         if must_identify and not self.information.is_known:
             raise self.timeout_error("did not identify itself")
 
     async def require_capability(self, action: str, *capabilities: str) -> None:
-        """Raise NotSupported if the camera reports its capabilities and has none of ``capabilities``."""
+        """Raise NotSupported if the camera reports its capabilities and has none of ``capabilities``.
+
+        A trigger output reports none; it has only "capture_image".
+        """
         information = await self.identify()
         if self.is_trigger and "capture_image" not in capabilities:
             raise NotSupported(
@@ -200,7 +203,7 @@ class CameraLink(CameraOrders):
         where: Callable[[MessageT], bool] | None = None,
         timeout: float = 3.0,
     ) -> MessageT | None:
-        """Request one message; return None if it does not arrive or the camera does not support it."""
+        """Request one message; return None if it does not arrive or the camera refuses it."""
 
         def is_answer(message: MessageT) -> bool:
             return self._is_from_this_camera(message) and (where is None or where(message))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
 
-from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, OperationTimeout
+from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, ConnectionClosed, OperationTimeout
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.mavlink.message import Message
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from aerokit.vehicle.session.session import VehicleSession
 
 MessageT = TypeVar("MessageT", bound=Message)
+logger: logging.Logger = logging.getLogger("aerokit")
 
 # Camera device ids of cameras that are attached to the autopilot and have no component id of their own.
 AUTOPILOT_CAMERA_IDS = range(1, 7)
@@ -107,7 +109,8 @@ class CameraOrders:
     def new_order(self, subject: str) -> Iterator[Order]:
         """Begin an order, which becomes final at the end of the block.
 
-        If the block raises, the order is withdrawn, and the previous order becomes valid again.
+        If the block raises, the order is withdrawn, and the previous order becomes valid again: an order that was
+        refused or not answered does not count (docs/reliability.md).
         """
         order = self.begin_order(subject)
         try:
@@ -158,6 +161,11 @@ class CameraOrders:
             try:
                 await send()
                 return
+            except CommandRejected:
+                # A repetition may be refused because the camera is executing an earlier transmission.
+                if attempt == 1 or not await had_effect():
+                    raise
+                return
             except CommandTimeout as error:
                 is_executed = await had_effect() if order.is_newest else None
                 if not order.is_newest:  # A newer order may have been given while the camera was asked.
@@ -174,9 +182,10 @@ class CameraOrders:
         self._session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
 
     async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
-        """At the end of a block, send its stop command at once, and retry it in the background until acknowledged.
+        """At the end of a block, send its stop command at once, and retry it in the background as :meth:`command` does.
 
-        Does nothing if a newer order was given. With ``is_awaited``, raises as :meth:`command`.
+        Does nothing if a newer order was given. With ``is_awaited``, raises as :meth:`command`; otherwise a failure is
+        logged as a warning.
         """
         if not order.is_newest or self._session.is_closed:
             return
@@ -193,6 +202,11 @@ class CameraOrders:
                 # If a newer order has been given meanwhile, this order is obsolete and its failure is no error.
                 if order.is_newest:
                     errors.append(error)
+                    if not is_awaited:
+                        logger.warning("camera %s may not have stopped: %s", self.number, error)
+            except BaseException:
+                errors.append(ConnectionClosed("the async with block of this vehicle was left"))
+                raise
             finally:
                 answered.set()
 
@@ -314,7 +328,8 @@ class MessageRequests:
         except CommandRejected as error:
             # If both requests were refused, the refusal of the standard request is raised.
             raise refusal or error from None
-        self._legacy_types.add(message_type)
+        if answer is not None:
+            self._legacy_types.add(message_type)
         return answer
 
     async def _request_legacy(

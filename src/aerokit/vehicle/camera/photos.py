@@ -76,12 +76,13 @@ class Shutter:
             series = self.link.latest_order("series")
             before = await self.request_status_reliably()
             known_indices = {capture.index for capture in self.log.captures()}
-            # The error while the last order is not acknowledged; this one, if ``timeout`` ends the first order.
+            # The error to raise at the time-out; None once the last order is acknowledged. It is set here, because the
+            # time may expire while the first order waits for its acknowledgement.
             error: CommandTimeout | None = CommandTimeout(
                 f"{self.link.describe()} did not acknowledge the order for a picture within {timeout:g} s;"
                 " it may have taken one"
             )
-            with CaptureQueue(self.log.cell) as new_captures, anyio.move_on_after(timeout):
+            with CaptureQueue(self.log) as new_captures, anyio.move_on_after(timeout):
                 attempts = 1
                 error = await self.order_photo(before)
                 while True:
@@ -218,7 +219,7 @@ class PhotoInterval:
         self._count = count  # number of ordered pictures; 0 for a series without an end
         self._link = shutter.link
         self._log = shutter.log
-        self._new_captures = CaptureQueue(self._log.cell)
+        self._new_captures = CaptureQueue(self._log)
         # Index of the capture to deliver next.
         self._next_index: int | None = None
         # `reset_at` of the log when `_next_index` was determined. After a newer reset, the camera counts from 0 again,
@@ -254,7 +255,7 @@ class PhotoInterval:
         try:
             await self._begin(operation)
         except BaseException as error:
-            self._new_captures.__exit__()
+            self._new_captures.__exit__()  # It does nothing if `_begin` has not entered the queue yet.
             must_stop = operation.record_failed_start(error)
             if must_stop:
                 # Raise the error without delay: the stop command is sent at once, and retried in the background.
@@ -349,6 +350,7 @@ class PhotoInterval:
             if self._next_index is None or self._contradicts_guess(capture.index):
                 self._is_start_guessed = self._next_index is None  # A corrected start is not corrected again.
                 self._next_index = capture.index
+                self._waiting.clear()  # It may have the capture with the corrupt index.
                 # One less than the index of this capture, so that the comparison at the end of the loop accepts it.
                 self._newest_index = capture.index - 1
             if not self._is_plausible(capture.index):
@@ -359,7 +361,7 @@ class PhotoInterval:
             elif capture.index >= self._next_index:
                 self._waiting[capture.index] = capture
                 if capture.index > self._newest_index:
-                    if self._delivered:  # The start cannot be corrected once a capture was delivered.
+                    if self._delivered:  # A higher index than that of a delivered capture confirms the start.
                         self._is_start_guessed = False
                     self._set_newest(capture.index)
 
@@ -389,24 +391,27 @@ class PhotoInterval:
 
         After too many unanswered requests, all captures up to the next received one count as missed.
         """
-        assert self._next_index is not None
+        index = self._next_index
+        assert index is not None
         capture = None
         can_fetch = not self._link.is_trigger and self._unanswered < MAX_UNANSWERED
         if can_fetch:
-            capture = await self._log.fetch(self._next_index)
+            capture = await self._log.fetch(index)
         self._collect()
+        if self._next_index != index:  # The captures that have arrived meanwhile show another start of the series.
+            return
         if capture is not None:
             self._unanswered = 0
             if capture.success is False:  # `_collect` has added it to `_failed`.
-                self._next_index += 1
+                self._next_index = index + 1
             else:
-                self._waiting[self._next_index] = capture
-        elif self._next_index not in self._waiting:
+                self._waiting[index] = capture
+        elif index not in self._waiting:
             self._unanswered += 1
-            following_index = self._next_index + 1
+            following_index = index + 1
             if not can_fetch and self._waiting:  # Skip to the next capture that was received.
                 following_index = min(self._waiting)
-            self._missed += following_index - self._next_index
+            self._missed += following_index - index
             self._next_index = following_index
 
     async def _check_silence(self, silent_checks: int) -> None:
@@ -422,4 +427,5 @@ class PhotoInterval:
                 f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
             )
         elif silent_checks >= MAX_SILENT_CHECKS:
-            raise self._link.timeout_error("takes pictures, but reports no more of them")
+            known = "takes pictures, but " if status is not None else ""
+            raise self._link.timeout_error(f"{known}reports no more pictures")

@@ -80,15 +80,15 @@ class VideoMixin(CameraMixin):
         check_range("status_hz", status_hz, 0, 10)
         await self._link.require_capability("start_video", "capture_video")
         with self._link.new_order("video") as order:
-            await self._start(order, status_hz, timeout)
+            await self._order_start(order, status_hz)
+        await self._wait_recording(timeout, expected=True)
 
-    async def _start(self, order: Order, status_hz: float, timeout: float) -> None:
-        """Start recording, and wait until the camera reports that it records."""
+    async def _order_start(self, order: Order, status_hz: float) -> None:
+        """Send the order to start recording, and wait until the camera has accepted it."""
         command = (START, self._link.video_stream, status_hz, self._link.device_id)
         await self._link.order_once(
             order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
         )
-        await self._wait_recording(timeout, expected=True)
 
     async def stop_video(self, *, timeout: float = 5.0) -> None:
         """Stop recording (MAV_CMD_VIDEO_STOP_CAPTURE); returns when the camera reports that it has stopped.
@@ -103,7 +103,7 @@ class VideoMixin(CameraMixin):
         command, *params = self._stop_command()
         with self._link.new_order("video") as order:
             await self._link.command(int(command), *params, order=order)
-            await self._wait_recording(timeout, expected=False)
+        await self._wait_recording(timeout, expected=False)
 
     def video(self, *, status_hz: float = 1.0) -> CameraBlock:
         """Record for the duration of an ``async with`` block.
@@ -114,11 +114,16 @@ class VideoMixin(CameraMixin):
             InvalidArgument: ``status_hz`` is not 0 to 10. Nothing was sent.
         """
         check_range("status_hz", status_hz, 0, 10)
+
+        async def start(order: Order) -> None:
+            await self._order_start(order, status_hz)
+            await self._wait_recording(START_TIMEOUT_S, expected=True)
+
         return CameraBlock(
             self._link,
             "video",
             check=lambda: self._link.require_capability("video", "capture_video"),
-            start=lambda order: self._start(order, status_hz, START_TIMEOUT_S),
+            start=start,
             stop_command=self._stop_command,
         )
 
@@ -144,8 +149,8 @@ class VideoMixin(CameraMixin):
                 await self.status.wait_until(lambda status: status.is_recording is expected)
             return
         # The time-out has expired.
-        outcome = "does not record" if expected else "still records"
-        raise self._link.timeout_error(f"accepted the order, but {outcome} after {timeout:g} s")
+        outcome = "records" if expected else "has stopped"
+        raise self._link.timeout_error(f"accepted the order, but did not report within {timeout:g} s that it {outcome}")
 
     async def load_streams(self) -> tuple[CameraStream, ...]:
         """Request information about all video streams (VIDEO_STREAM_INFORMATION), one by one if necessary.
@@ -155,6 +160,7 @@ class VideoMixin(CameraMixin):
             OperationTimeout: the information about some streams did not arrive, or no camera was found.
         """
         await self._link.require_capability("load_streams", "has_video_stream")
+        self._streams.clear()  # Streams that were reported earlier may have changed.
         first = await self._link.request(m.VideoStreamInformation, 0)  # 0 requests all streams.
         if first is None:  # Some cameras answer only requests for a single stream.
             first = await self._link.request(m.VideoStreamInformation, 1)
@@ -199,9 +205,11 @@ class VideoMixin(CameraMixin):
             stream: number of the stream, 1 to 255.
         """
         check_range("stream", stream, 1, 255)
-        for camera_stream in await self.load_streams():
-            if camera_stream.number != stream and camera_stream.is_running:
-                await self.stop_streaming(camera_stream.number)
+        streams = await self.load_streams()
+        if any(camera_stream.number == stream for camera_stream in streams):  # Otherwise the camera refuses the start.
+            for camera_stream in streams:
+                if camera_stream.number != stream and camera_stream.is_running:
+                    await self.stop_streaming(camera_stream.number)
         await self.start_streaming(stream)
 
     async def _send_stream_command(self, action: str, command: int, stream: int) -> None:
@@ -224,7 +232,9 @@ class VideoMixin(CameraMixin):
             OperationTimeout: no camera was found.
         """
         await self._link.identify()
-        command = (MavCmd.SET_CAMERA_SOURCE, self._link.number or 0, SOURCES[primary], SOURCES[secondary])
+        assert self._link.number is not None  # `identify` has found the camera.
+        # This command has the component id in param1, not the device id.
+        command = (MavCmd.SET_CAMERA_SOURCE, self._link.number, SOURCES[primary], SOURCES[secondary])
         with self._link.new_order("source") as order:
             await self._link.command(*command, order=order)
 

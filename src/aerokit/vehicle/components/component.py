@@ -178,16 +178,17 @@ class Component(ReadOnly):
             timeout: seconds to wait for the address of the file.
 
         Raises:
-            NotSupported: the component has no such file, or names a file that is not stored on the vehicle.
+            NotSupported: the component has no such file, does not answer the request for its address, or names a file
+                that is not stored on the vehicle.
             FileFormatError: the file is damaged.
             FileError, FileTimeout: the file cannot be read.
         """
         general = await _read_json(self, await _general_uri(self, timeout))
         if kind == "general":
             return general
-        entries = general.get("metadataTypes")
-        if not isinstance(entries, list):  # The file is damaged, or lists nothing.
-            entries = []
+        entries = general.get("metadataTypes", [])
+        if not isinstance(entries, list):
+            raise FileFormatError(f"the metadata of component {self.component_id} is damaged: it has no list of files")
         for entry in entries:
             if not isinstance(entry, dict) or entry.get("type") != METADATA_TYPES[kind]:
                 continue
@@ -354,7 +355,10 @@ async def _read_json(component: Component, uri: str) -> dict[str, Any]:
     """Read a metadata file by MAVFTP, decompress it if necessary, and return its JSON object."""
     if uri.lower().startswith(WEB_SCHEMES):
         raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
-    data = decompress(await component.fetch(uri), uri)
+    try:
+        data = decompress(await component.fetch(uri), uri)
+    except InvalidArgument as error:  # The component has reported the address.
+        raise NotSupported(f"component {component.component_id}: {error}") from None
     try:
         content = json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:

@@ -128,7 +128,7 @@ class Settings:
                 and ``https://`` are fetched from the web. The default is the address in CAMERA_INFORMATION.
             locale: as for :meth:`load`.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total; at most one minute from the web.
+            timeout: seconds in total. A download from the web ends after one minute in any case.
 
         Raises:
             NotSupported: the camera names no definition file.
@@ -234,7 +234,8 @@ class Settings:
             InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
                 setting is read-only or excluded now. Nothing was set.
             ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
-            ParameterTimeout: the component did not confirm the value, but may have set it.
+            ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that it may
+                change could not be read again.
         """
         check_name(name)
         with self._transfers.limit(timeout):
@@ -264,7 +265,7 @@ class Settings:
         """
         definition, name = self._definition, setting_definition.name
         assert definition is not None
-        # Before anything is sent, refuse a value that is never allowed.
+        # Before anything is sent, refuse a value that the known values of other settings exclude already.
         definition.checked(name, value, self._values())
         to_read = [
             setting for setting in definition.dependencies(name) if self._must_be_read(definition.settings[setting])

@@ -116,7 +116,7 @@ class DeviceActions(VehicleBase):
         """Send a status text of your program to the vehicle and to other stations (STATUSTEXT); returns at once.
 
         There is no acknowledgement. ArduPilot writes the text to its flight log. A text of more than 50 bytes is sent
-        in chunks. To reach ground stations but not the vehicle, send a ``Statustext`` by ``connection.send``.
+        in chunks.
 
         Args:
             text: 1 to 1000 bytes in UTF-8.

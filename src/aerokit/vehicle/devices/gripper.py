@@ -60,7 +60,8 @@ class Gripper(ReadOnly):
 
         def has_moved(text: str, since_acknowledgement_s: float) -> bool:
             has_begun = text == BEGIN_TEXTS[action]
-            # For an electro-permanent gripper, ArduPilot reports no end, so wait as long as its movement takes.
+            # For an electro-permanent gripper, ArduPilot reports no end, so wait as long as its movement takes. A
+            # servo gripper usually reports its end sooner.
             return text == END_TEXTS[action] or (has_begun and since_acknowledgement_s >= EPM_WAIT_S)
 
         await order.send_until_text(context, self._number, topic=topic, is_done=has_moved, timeout=GRIP_TIMEOUT_S)

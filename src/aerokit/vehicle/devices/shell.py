@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from aerokit._internal.arguments import check_range, checks_arguments
@@ -118,8 +119,10 @@ class Shell(ReadOnly):
         """
         if timeout is not None:
             check_range("timeout", timeout, 0, 1e6)
-        while True:
-            message = await self._output.get(timeout)
+        now = self._session.connection.now
+        deadline = math.inf if timeout is None else now() + timeout
+        while True:  # Messages that are not for us do not extend the time.
+            message = await self._output.get(None if timeout is None else max(0.0, deadline - now()))
             is_for_us = message.target_system in (0, self._session.connection.source_system)
             if is_for_us and message.device == SerialControlDev.DEV_SHELL and message.flags & _REPLY:
                 return bytes(message.data[: message.count]).decode(errors="replace")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterable, Awaitable, Callable
+from collections.abc import AsyncGenerator, AsyncIterable, Awaitable, Callable
 from inspect import isawaitable
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -88,8 +88,8 @@ async def land_on(
     local_states = ("attitude", "local_position") if session.autopilot.external.target_is_local else ()
     async with external.landing_target(rate_hz=rate_hz) as stream:
         landing = TargetLanding(context, stream)
-        reader = asyncio.get_running_loop().create_task(landing.read(target, 1 / rate_hz))
         with session.streaming(*local_states, hz=rate_hz), session.streaming("position", "landed_state"):
+            reader = asyncio.get_running_loop().create_task(landing.read(target, 1 / rate_hz))
             try:
                 await landing.acquire(reader, acquire_timeout)
                 takeover_check.raise_if_changed("land_on")
@@ -102,7 +102,7 @@ async def land_on(
                 # The shield makes even a cancelled call wait until the program's source has ended.
                 with anyio.CancelScope(shield=True):
                     await asyncio.wait([reader])
-        return landing.report(is_used=stream.sent > sent_before, texts=session.texts_since(order.given_at))
+        return landing.report(was_target_sent=stream.sent > sent_before, texts=session.texts_since(order.given_at))
 
 
 class TargetLanding:
@@ -137,6 +137,9 @@ class TargetLanding:
                 await anyio.sleep(period_s)
         except Exception as error:
             self._source_error = error
+        finally:
+            if isinstance(source, AsyncGenerator):  # It may still have a camera open.
+                await source.aclose()
 
     async def acquire(self, reader: asyncio.Task[None], timeout: float) -> None:
         """Wait until the target is visible for the first time, before the landing is ordered."""
@@ -177,10 +180,10 @@ class TargetLanding:
             max_silence_s=max_silence_s,
         )
 
-    def report(self, *, is_used: bool, texts: tuple[str, ...]) -> LandingReport:
+    def report(self, *, was_target_sent: bool, texts: tuple[str, ...]) -> LandingReport:
         """Return the report, once the landing has ended."""
         unseen_s = self._now() - self._seen_at
-        return LandingReport(self._last, unseen_s, tuple(self._losses), self._climbed_m, is_used, texts)
+        return LandingReport(self._last, unseen_s, tuple(self._losses), self._climbed_m, was_target_sent, texts)
 
     def _now(self) -> float:
         return self._session.connection.now()

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeAlias, TypeVar
 
 from aerokit._internal.arguments import check_kind, check_range, checks_arguments
 from aerokit.errors import NotSupported, OperationRejected, SetpointStreamStopped
-from aerokit.mavlink.enums import MavLandedState
 from aerokit.mavlink.messages import Timesync
 from aerokit.vehicle.commanding.streams import MAX_RATE_HZ, known_values
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -155,7 +155,7 @@ class MeasurementStream(Generic[MeasurementT]):
             return "unknown"
         has_position = health.has_relative_position or health.has_absolute_position
         # PX4 also sets CONSTANT_POSITION while the vehicle stands still on the ground.
-        is_resting = self._session.telemetry.landed_state.latest == MavLandedState.ON_GROUND
+        is_resting = is_reported_on_ground(self._session.telemetry)
         is_flag_expected = is_resting and self._session.autopilot.external.constant_position_at_rest
         assumes_constant = health.flags & CONSTANT_POSITION and not is_flag_expected
         if assumes_constant or not has_position:

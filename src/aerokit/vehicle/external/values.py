@@ -126,7 +126,10 @@ class ObstacleSectors(Snapshot):
 
 
 class ObstaclePoints(Snapshot):
-    """Positions of obstacles in metres forward, right and down of the vehicle (OBSTACLE_DISTANCE_3D)."""
+    """Positions of obstacles in metres forward, right and down of the vehicle (OBSTACLE_DISTANCE_3D).
+
+    Each point is one message. Without points nothing is sent, and the vehicle keeps the obstacles that it knows.
+    """
 
     points_m: tuple[Vector, ...]
     min_m: float
@@ -179,7 +182,8 @@ class FlowMeasurement(Snapshot):
 
     ``x_rad`` and ``y_rad`` are the angles about the body's forward and right axes by which the ground moved in the
     picture within ``interval_s``. ``gyro_rad`` are the angles by which the camera itself turned about all three axes.
-    ``quality`` is from 0 to 255.
+    ``quality`` is from 0 to 255. Send every measurement without gaps, because ArduPilot takes the time between two
+    messages as ``interval_s``.
     """
 
     x_rad: float

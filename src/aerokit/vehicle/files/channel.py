@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import anyio
@@ -15,7 +15,7 @@ from aerokit.protocols.ftp import FtpClient, FtpRequest, FtpSessionLost, path_by
 from aerokit.protocols.logs import LogDownload, LogList, LogStop
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
     from aerokit.mavlink.messages import LogEntry
     from aerokit.protocols.blocks import Reassembly
@@ -41,6 +41,20 @@ class RemoteFile(NamedTuple):
     size: int
 
 
+@contextmanager
+def _limit(
+    description: str, timeout: float | None, missing: Callable[[], tuple[tuple[int, int], ...]]
+) -> Iterator[None]:
+    """Raise FileTimeout, with the ranges that ``missing()`` returns, if a block takes more than ``timeout`` seconds.
+
+    A TimeoutError of the block, such as one of the disk, is not changed.
+    """
+    with anyio.move_on_after(timeout) as scope:
+        yield
+    if scope.cancelled_caught:
+        raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
+
+
 class FileChannel:
     """Sends MAVFTP requests to one vehicle, one at a time. Files are closed in the background."""
 
@@ -57,8 +71,8 @@ class FileChannel:
             first_sequence=int(transfers.began_at * 1000.0),
         )
         self._lock = asyncio.Lock()
-        # Sessions that are being closed in the background, by their ids.
-        self._closing: dict[int, _Closing] = {}
+        # Sessions that are being closed in the background, by their ids: the request, and the task that repeats it.
+        self._closing: dict[int, tuple[FtpRequest, asyncio.Task[None]]] = {}
 
     @asynccontextmanager
     async def operation(
@@ -73,16 +87,11 @@ class FileChannel:
 
         Raises FileTimeout after ``timeout`` seconds; the error has the ranges that ``missing()`` returns.
         """
-        try:
-            with anyio.fail_after(timeout):
-                async with self._lock:
-                    for session in tuple(self._closing):
-                        await self._finish_closing(session, idle_timeout_s)
-                    yield
-        except OperationTimeout:  # This TimeoutError was raised inside the operation, not by `fail_after`.
-            raise
-        except TimeoutError:
-            raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
+        with _limit(description, timeout, missing):
+            async with self._lock:
+                for session in tuple(self._closing):
+                    await self._finish_closing(session, idle_timeout_s)
+                yield
 
     async def request(
         self,
@@ -126,7 +135,9 @@ class FileChannel:
                 self._close_soon(file.session, path)
                 raise
             except Exception:
-                with suppress(FileTimeout):  # The error of the transfer must reach the caller, not an error of closing.
+                with suppress(
+                    AerokitError
+                ):  # The error of the transfer must reach the caller, not an error of closing.
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:  # A cancelled call must not wait.
@@ -151,7 +162,8 @@ class FileChannel:
             except FileError as error:
                 if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
                     # The file was requested more than once, and the reply to an earlier request may have been lost.
-                    # That request may then have opened the session that is now in use.
+                    # That request may then have opened the session that is now in use. On PX4, which has only one
+                    # session, it may also be another station's, whose transfer then opens its file again.
                     may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)
@@ -203,33 +215,22 @@ class FileChannel:
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
         with suppress(AerokitError):  # The connection may be closed.
             self.transfers.connection.send(request.message)
-            closing = _Closing(request)
-            self._closing[session] = closing
-            self.transfers.background.start(lambda: closing.confirm(self.transfers), "aerokit close file")
+            task = self.transfers.background.start(lambda: self._confirm(request), "aerokit close file")
+            if task is not None:
+                self._closing[session] = (request, task)
+
+    async def _confirm(self, request: FtpRequest) -> None:
+        """Wait for the reply, and repeat the request until then."""
+        with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
+            await self.transfers.run(request)
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
         """Wait for the confirmation of a session that :meth:`_close_soon` is closing."""
-        closing = self._closing[session]
-        await closing.ended.wait()
-        if not closing.request.is_answered:
-            await self._close(session, closing.request.path, idle_timeout_s)
+        request, task = self._closing[session]
+        await asyncio.wait((task,))
+        if not request.is_answered:
+            await self._close(session, request.path, idle_timeout_s)
         self._closing.pop(session, None)
-
-
-class _Closing:
-    """A session that is being closed in the background."""
-
-    def __init__(self, request: FtpRequest) -> None:
-        self.request = request
-        self.ended = asyncio.Event()
-
-    async def confirm(self, transfers: Transfers) -> None:
-        """Wait for the reply, and repeat the request until then. `ended` is set in any case."""
-        try:
-            with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
-                await transfers.run(self.request)
-        finally:
-            self.ended.set()
 
 
 class LogChannel:
@@ -238,8 +239,8 @@ class LogChannel:
     def __init__(self, transfers: Transfers) -> None:
         self._transfers = transfers
         self._lock = asyncio.Lock()
-        # Set when the end of the last failed operation is confirmed; None if no operation has failed.
-        self._end_confirmed: asyncio.Event | None = None
+        # The task that waits until the end of the last failed operation is confirmed; None if no operation has failed.
+        self._ending: asyncio.Task[None] | None = None
 
     async def list(
         self, idle_timeout_s: float, only_id: int | None, *, max_unanswered: int | None
@@ -293,36 +294,29 @@ class LogChannel:
 
         Raises FileTimeout after ``timeout`` seconds; the error has the ranges that ``missing()`` returns.
         """
-        try:
-            with anyio.fail_after(timeout):
-                async with self._lock:
-                    if self._end_confirmed is not None:
-                        await self._end_confirmed.wait()
-                    try:
-                        yield
-                    except BaseException:
-                        self._end()
-                        raise
-        except OperationTimeout:  # This TimeoutError was raised inside the operation, not by `fail_after`.
-            raise
-        except TimeoutError:
-            raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
+        with _limit(description, timeout, missing):
+            async with self._lock:
+                if self._ending is not None:
+                    await asyncio.wait((self._ending,))
+                try:
+                    yield
+                except BaseException:
+                    self._end()
+                    raise
 
     def _end(self) -> None:
-        """Send LOG_REQUEST_END. The next operation waits until a background task has received the confirmation."""
+        """Send LOG_REQUEST_END. The next operation waits until a background task has received the confirmation.
+
+        It also continues when this task has given up.
+        """
         transfers = self._transfers
         # LOG_REQUEST_END is sent at once. The background task sends it only to repeat it.
         exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)
-        confirmed = asyncio.Event()
 
         async def confirm() -> None:
-            try:
-                with suppress(AerokitError):
-                    await transfers.run(exchange)
-            finally:
-                confirmed.set()
+            with suppress(AerokitError):
+                await transfers.run(exchange)
 
         with suppress(AerokitError):  # The connection may be closed.
             transfers.connection.send(exchange.message)
-            self._end_confirmed = confirmed
-            transfers.background.start(confirm, "aerokit end of logs")
+            self._ending = transfers.background.start(confirm, "aerokit end of logs")

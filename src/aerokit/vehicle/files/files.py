@@ -50,7 +50,8 @@ class Files:
     Paths are the vehicle's: ``/APM/LOGS`` and ``@PARAM/param.pck`` on ArduPilot, ``/fs/microsd/log`` on PX4.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). You can cancel any call; the file is then closed on the vehicle.
+    total; None for no limit). For a resumed download, ``timeout`` limits each step: reading, comparing the CRC-32, and
+    reading again. You can cancel any call; the file is then closed on the vehicle.
 
     Every method but ``is_supported`` raises:
         InvalidArgument: a path is empty, contains NUL, cannot be encoded, or has more than 238 bytes. Nothing was sent.

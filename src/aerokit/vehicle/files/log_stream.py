@@ -48,8 +48,8 @@ class UlogAssembler:
         self._is_aligned = False
         # The received part of a ULog message that is not complete yet.
         self._buffer = bytearray()
-        # Time of the last message that was used, to compute the duration of a gap.
-        self._received_at = 0.0
+        self.received_at: float = 0.0
+        """Time of the last message that was used."""
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
         """Add a message of the stream; return the next data of the file, up to the last complete ULog message."""
@@ -74,9 +74,9 @@ class UlogAssembler:
                 return b""  # This is the rest of a ULog message whose beginning was lost.
             data = data[message.first_message_offset :]
             self._is_aligned = True
-            gap_ms = round(1000 * (now - self._received_at))
+            gap_ms = round(1000 * (now - self.received_at))
             prefix = DROPOUT + min(0xFFFF, gap_ms).to_bytes(2, "little")  # The field has 16 bits.
-        self._received_at = now
+        self.received_at = now
         self._buffer += data
         return prefix + self._pop_complete()
 
@@ -169,8 +169,10 @@ class LogStream(ReadOnly):
             OperationTimeout: nothing was received for ``idle_timeout_s`` seconds.
         """
         connection = self._context.session.connection
-        while True:
-            message = await self._messages.get(self._idle_timeout_s)
+        started_at = connection.now()
+        while True:  # Messages that are not used do not extend the time.
+            idle_since = max(started_at, self._assembler.received_at)
+            message = await self._messages.get(max(0.0, idle_since + self._idle_timeout_s - connection.now()))
             is_for_us = message.target_system in (0, connection.source_system)
             if is_for_us and (data := self._assembler.add(message, connection.now())):
                 return data

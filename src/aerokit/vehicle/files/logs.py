@@ -90,7 +90,8 @@ class Logs:
     """Lists, downloads and erases flight logs. Operations run one at a time, in the order of their calls.
 
     All methods take ``idle_timeout_s`` (fail after this many seconds without progress) and ``timeout`` (seconds in
-    total; None for no limit). You can cancel any call; the vehicle then stops sending.
+    total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
+    it. You can cancel any call; the vehicle then stops sending.
 
     ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
     By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
@@ -140,7 +141,7 @@ class Logs:
             method: ``"ftp"``, ``"log"`` (the LOG_* messages), or ``"auto"``: the faster of the two for this autopilot,
                 or the slower if the faster is not available. MAVFTP requires that the log's file can be identified.
             idle_timeout_s: fail after this many seconds without progress.
-            timeout: seconds in total.
+            timeout: seconds for each step: finding the log, and reading it.
             on_progress: called with the bytes so far and in total.
 
         Raises:
@@ -217,7 +218,8 @@ class Logs:
                 self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
                 await anyio.sleep(ERASE_RETRY_INTERVAL_S)
                 count_before = len(remaining)
-                remaining &= {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
+                # Some boards do not answer while they erase.
+                remaining &= {(entry.time_utc, entry.size) for entry in await self._entries(idle_timeout_s)}
                 now = self._transfers.connection.now()
                 if len(remaining) < count_before:
                     progress_at = now
@@ -287,7 +289,8 @@ class Logs:
 
         With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
         If only an id is given, the whole list is requested: if there is no log with this id, a request for it alone
-        would make ArduPilot list nonexistent logs endlessly.
+        would make ArduPilot list nonexistent logs endlessly. A log that was listed rarely disappears; LOG_REQUEST_END
+        then ends the listing.
         """
         log_id = log if isinstance(log, int) else log.id
         only_id = None if isinstance(log, int) else log.id
@@ -387,6 +390,8 @@ async def log_path(
             if match is not None:
                 numbered[int(match[1])] = entry
         if numbered:
+            if await _have_numbers_wrapped(files, directory, max(numbered), idle_timeout_s):
+                return None
             return _numbered_path(directory, numbered, log, may_have_grown)
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             logs = await _read_list_file(files, directory, idle_timeout_s)
@@ -428,6 +433,19 @@ async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -
     if len(logs) < len(matches):  # A file with other lines is not PX4's list.
         return ()
     return tuple(logs)
+
+
+async def _have_numbers_wrapped(files: Files, directory: str, highest: int, idle_timeout_s: float) -> bool:
+    """Return True if ArduPilot has begun to number its files from 1 again, so that log 1 is not the lowest number.
+
+    LASTLOG.TXT contains the number of the newest log. ``highest`` is the highest number of a file.
+    """
+    try:
+        text = await files.read(f"{directory}/LASTLOG.TXT", idle_timeout_s=idle_timeout_s)
+    except FileError:
+        return False
+    match = re.match(rb"\d+", text)
+    return match is not None and int(match[0]) < highest
 
 
 def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry, may_have_grown: bool) -> str | None:

@@ -41,7 +41,8 @@ class GimbalRegistry:
     def __init__(self, context: VehicleContext) -> None:
         self._context, self._session = context, context.session
         self.devices: dict[tuple[int, int], GimbalDevice] = {}
-        # Stands for the first gimbal until one is discovered. Its state values always mirror those of the first gimbal.
+        # Stands for the first gimbal until one is discovered. From then on, its state values follow those of the first
+        # gimbal. MOUNT_STATUS, which has no gimbal id, sets only these values.
         self.placeholder: GimbalDevice = GimbalDevice(context, 0, 0)
         self.placeholder.topic = ROI
         # Requests of this program's `gimbal.control()` blocks that have not ended.
