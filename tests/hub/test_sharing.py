@@ -212,7 +212,7 @@ def test_vehicle_receives_station_frames_once() -> None:
     on_stage(play)
 
 
-def test_vehicle_with_the_system_id_of_the_program_gets_station_frames() -> None:
+def test_vehicle_with_our_system_id_gets_station_frames() -> None:
     async def play(on: Stage) -> None:
         on.vehicle.frames.clear()
         on.station.send(STATION, ORDER, ParamRequestList(1, 0), ParamRequestList(1, 191))

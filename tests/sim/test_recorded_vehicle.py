@@ -15,7 +15,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavMissionResult, MavParamError, MavResult
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavParamError, MavResult
 from aerokit.mavlink.framer import Framer
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import TlogWriter, read_tlog
@@ -144,6 +144,43 @@ def test_commands_get_recorded_answers_and_delays() -> None:
     assert results == [MavResult.FAILED, MavResult.ACCEPTED, MavResult.ACCEPTED, MavResult.DENIED]
 
 
+def test_only_requests_to_the_autopilot_and_its_answers_count() -> None:
+    to_other_system = m.CommandLong(8, 1, 400, 0, 0.0, 0, 0, 0, 0, 0, 0)
+    to_camera = m.CommandLong(7, 100, 400, 0, 0.0, 0, 0, 0, 0, 0, 0)
+    client = Client(
+        vehicle_of(
+            (1.0, command(*ARM), (7, 191)),  # a companion computer
+            (1.1, to_other_system, GROUND),
+            (1.2, to_camera, GROUND),
+            (1.3, ack(400, MavResult.DENIED), (7, 100)),
+            (1.4, ack(400, MavResult.ACCEPTED), (7, 1)),
+        )
+    )
+    client.run(5.0)
+    assert not client.all(m.CommandLong)
+    assert not client.all(m.CommandAck)
+    client.command(*ARM)
+    client.run(1.0)
+    assert [answer.result for answer in client.all(m.CommandAck)] == [MavResult.ACCEPTED]
+
+
+def test_answers_to_other_params_are_counted_apart() -> None:
+    client = Client(
+        vehicle_of(
+            (1.0, command(*ARM), GROUND),
+            (1.1, ack(400, MavResult.FAILED), (7, 1)),
+            (2.0, command(400, 0.0), GROUND),
+            (2.1, ack(400, MavResult.DENIED), (7, 1)),
+        )
+    )
+    client.command(*ARM)
+    client.run(0.5)
+    client.clear()
+    client.command(400, 2.0)
+    client.run(0.5)
+    assert client.last(m.CommandAck).result == MavResult.FAILED
+
+
 def test_unrecorded_command_is_unsupported() -> None:
     assert Client(vehicle_of()).command(MavCmd.NAV_TAKEOFF) == MavResult.UNSUPPORTED
 
@@ -245,6 +282,21 @@ def uploaded_then(result: int) -> Client:
             (1.3, m.MissionAck(*GROUND, result, 0), (7, 1)),
         )
     )
+
+
+def test_recorded_local_item_is_in_metres() -> None:
+    local = item(0).to_dict() | {"frame": MavFrame.LOCAL_NED, "x": 2_000_000, "y": -50_000}
+    client = Client(
+        vehicle_of(
+            (1.0, m.MissionCount(7, 1, 1, 0), GROUND),
+            (1.2, m.MissionItemInt(**local), GROUND),
+            (1.3, m.MissionAck(*GROUND, 0, 0), (7, 1)),
+        )
+    )
+    client.send(m.MissionRequestList(7, 1, 0))
+    client.send(m.MissionRequest(7, 1, 0, 0))
+    given = client.last(m.MissionItem)
+    assert (given.x, given.y) == (200.0, -5.0)
 
 
 def test_recorded_plan_is_downloaded() -> None:

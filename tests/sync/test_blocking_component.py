@@ -14,7 +14,7 @@ import aerokit.sync
 from aerokit.errors import CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType
-from aerokit.onboard import AutopilotDriver, CameraDriver, CommandRequest, Photo, Range
+from aerokit.onboard import AutopilotDriver, CameraDriver, CommandRequest, OnboardComponent, Photo, Range
 
 
 @contextmanager
@@ -119,3 +119,16 @@ def test_second_component_shares_the_connection() -> None:
         assert (first.component_id, second.component_id, connection.is_open) == (100, 101, True)
         first.set_state(5)
         assert first.state == 5
+
+
+def test_component_that_fails_to_open_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(self: object) -> None:
+        raise KeyboardInterrupt
+
+    with aerokit.sync.open_connection("udpin:127.0.0.1:0") as connection:
+        with monkeypatch.context() as patch:
+            patch.setattr(OnboardComponent, "_use_threads", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                aerokit.sync.component(connection=connection, component_id=100)
+        with aerokit.sync.component(connection=connection, component_id=100) as second:
+            assert second.component_id == 100

@@ -15,7 +15,8 @@ from aerokit.mavlink import FrameEncoder, messages
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing import FaultModel, FaultyLink, run_virtual
 from aerokit.testing.fault_model import Air, FaultyPath, split_frames
-from aerokit.transport import UdpConnect, UdpListen, memory_link_pair
+from aerokit.transport import Peer, UdpConnect, UdpListen, memory_link_pair
+from aerokit.transport.link import BaseLink
 
 shares = st.floats(0.0, 1.0)
 seconds = st.floats(0.0, 3.0)
@@ -385,6 +386,59 @@ def test_half_duplex_shares_the_channel() -> None:
         far.write(bytes(100))
         await left.until_data(bytes(100))
         assert times == pytest.approx([1.0, 2.0])
+        near.close()
+        far.close()
+
+    run_virtual(main())
+
+
+class EchoLink(BaseLink):
+    """Delivers each write to its own receiver within the call."""
+
+    def __init__(self) -> None:
+        super().__init__("echo")
+
+    async def _connect(self) -> None: ...
+
+    def _release(self) -> None: ...
+
+    def write(self, data: bytes, peer: Peer = None) -> None:
+        self._deliver(data, peer)
+
+
+def test_frame_sent_by_delivery_does_not_hasten_others() -> None:
+    async def main() -> None:
+        near, echo, times = FaultyLink(EchoLink(), outgoing=FaultModel(delay_s=1.0)), Recorder(), dict[bytes, float]()
+
+        def answer_first_frames(data: bytes, peer: Peer) -> None:
+            times[data] = asyncio.get_running_loop().time()
+            if data in (b"a", b"b"):
+                near.write(data.upper())
+
+        echo.at_each_piece = answer_first_frames
+        await near.open(echo)
+        near.write(b"a")
+        near.write(b"b")
+        await asyncio.sleep(0.5)
+        near.write(b"c")
+        await asyncio.sleep(3.0)
+        assert times == pytest.approx({b"a": 1.0, b"b": 1.0, b"c": 1.5, b"A": 2.0, b"B": 2.0})
+        near.close()
+
+    run_virtual(main())
+
+
+def test_new_peer_is_stalled_if_others_filled_system() -> None:
+    async def main() -> None:
+        inner, far = memory_link_pair()
+        near = FaultyLink(inner)
+        await near.open(Recorder())
+        await far.open(Recorder())
+        near.stall(system_bytes=10)
+        near.write(bytes(10), "one")
+        near.write(bytes(5), "two")
+        near.discard_unsent()
+        assert near.unsent_bytes == 10
         near.close()
         far.close()
 

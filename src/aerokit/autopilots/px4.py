@@ -185,7 +185,8 @@ class Px4(Autopilot):
             # even CLIMB_SPEED (navigator_main.cpp).
             self.speed_types: frozenset[int] = frozenset((SpeedType.AIRSPEED, SpeedType.GROUNDSPEED))
         if vehicle_type == MavType.FIXED_WING:
-            self.arrival_radius_m: float = 120.0  # A plane circles with NAV_LOITER_RAD, 80 m by default.
+            # A plane circles its target with NAV_LOITER_RAD (80 m by default), so it never comes closer.
+            self.arrival_radius_m: float = 120.0
 
     def mode(self, custom_mode: int, base_mode: int, extra: Mapping[int, str] = NO_MODES) -> Mode:
         """Return the mode with these numbers. The registered name of an external mode replaces EXTERNAL1 etc."""

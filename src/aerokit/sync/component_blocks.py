@@ -77,7 +77,11 @@ def opened_component(
     try:
         async_connection = None if connection is None else connection.aio
         context: OpenContext[Any] = loop.open_context(open_async(address, connection=async_connection, **options))
-        loop.call(context.value._use_threads)
+        try:
+            loop.call(context.value._use_threads)
+        except BaseException:
+            context.close()
+            raise
     except BaseException:
         if owns_loop:
             loop.close()

@@ -106,11 +106,11 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
 
 
 def _lines(arguments: Iterable[str], indent: str) -> str:
-    """Return the arguments, one per line. An argument that is too long is wrapped before its ``| None``."""
+    """Return the arguments, one per line. An argument that is too long is wrapped before its ``| None``, if any."""
     lines = ""
     for argument in arguments:
-        if len(indent) + len(argument) + 1 > WIDTH:
-            head, none, tail = argument.rpartition(" | None")
+        head, none, tail = argument.rpartition(" | None")
+        if none and len(indent) + len(argument) + 1 > WIDTH:
             argument = f"{head}\n{indent}{none.lstrip()}{tail}"
         lines += f"{indent}{argument},\n"
     return lines

@@ -79,7 +79,8 @@ class LoopThread:
     def run(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Await ``function(*args, **kwargs)`` on the loop; return its result or raise its exception.
 
-        Ctrl-C cancels the function, waits for its clean-up and raises KeyboardInterrupt.
+        Ctrl-C cancels the function, waits at most `INTERRUPTED_CALL_TIMEOUT_S` for its clean-up, and raises
+        KeyboardInterrupt.
 
         Raises:
             BusyError: called on the loop's own thread, which would be a deadlock.

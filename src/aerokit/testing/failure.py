@@ -93,10 +93,11 @@ def _write_recordings(flights: Sequence[Flight | ServedFlight], test: str, direc
         path = _path(test, directory, ".tlog" if is_first else f"-{number + 1}.tlog")
         try:
             path.write_bytes(recording.to_bytes())
-            lines.append(f"recording in {path}")
-            lines += [_write_report(path, flight, shares_recording=len(group) > 1) for flight in group]
         except Exception as error:  # For example, the recording is empty or the disk is full.
-            lines.append(f"no recording or report: {error}")
+            lines.append(f"no recording: {error}")
+            continue
+        lines.append(f"recording in {path}")
+        lines += [_write_report(path, flight, shares_recording=len(group) > 1) for flight in group]
     return lines
 
 
@@ -110,4 +111,6 @@ def _write_report(path: Path, flight: Flight | ServedFlight, *, shares_recording
         write_report(path, target, system_id=system_id, force=True)
     except ModuleNotFoundError:  # The packages of the extra "report" are not installed.
         return "no report: pip install 'aerokit-mavlink[report]'"
+    except Exception as error:  # The reports on the other vehicles must still be written.
+        return f"no report: {error}"
     return f"report in {target}"

@@ -57,7 +57,7 @@ class FaultModel(Snapshot):
         for begin, end in self.outages:
             if not begin <= end:
                 raise InvalidArgument(
-                    f"outages: ({begin!r}, {end!r}) is not allowed: an outage must begin before its end"
+                    f"outages: ({begin!r}, {end!r}) is not allowed: an outage must not end before it begins"
                 )
 
 

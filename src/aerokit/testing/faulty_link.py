@@ -103,8 +103,7 @@ class StalledQueue:
             dropped=self._on_drop,
             stalled=partial(self._on_peer_stalled, peer),
         )
-        accepts_no_bytes = self._system_limit == 0
-        if self._is_stalled and accepts_no_bytes:
+        if self._is_full:
             outbox.pause()
         return outbox
 
@@ -113,10 +112,14 @@ class StalledQueue:
             self._carry(data, peer)
             return
         self._accepted.append((data, peer))
-        accepted_bytes = sum(len(piece) for piece, _ in self._accepted)
-        if accepted_bytes >= self._system_limit:  # The operating system accepts no more bytes.
+        if self._is_full:
             for outbox in self._outboxes.values():
                 outbox.pause()
+
+    @property
+    def _is_full(self) -> bool:
+        """True if the simulated operating system accepts no more bytes."""
+        return self._is_stalled and sum(len(data) for data, _ in self._accepted) >= self._system_limit
 
     def _accepted_bytes_of(self, peer: Peer) -> int:
         return sum(len(data) for data, receiver in self._accepted if receiver == peer)
@@ -195,8 +198,8 @@ class FaultyLink(Link):
         """Stop sending until :meth:`drain`, like TCP over an interrupted network.
 
         The simulated operating system accepts ``system_bytes``, which arrive after :meth:`drain`. Further bytes are
-        queued. They are dropped after a second in the queue, or at once by :meth:`discard_unsent`. The link must be
-        open.
+        queued. They are dropped after a second in the queue, or at once by :meth:`discard_unsent`. A second call
+        without :meth:`drain` drops the bytes of the first one. The link must be open.
         """
         if self._stalled_queue is not None:
             self._stalled_queue.close()
@@ -260,7 +263,10 @@ class FaultyLink(Link):
         return self.link.has_peer(peer)
 
     def close(self) -> None:
-        """See `Link.close`. Frames in transit are still delivered, for up to `LINGER_S` seconds."""
+        """See `Link.close`. Outgoing frames in transit are still delivered, for up to `LINGER_S` seconds.
+
+        Incoming frames in transit, and outgoing frames that wait for the end of a stall, are dropped.
+        """
         if self._is_closed:
             return
         self._is_closed = True
@@ -410,7 +416,6 @@ class _DeliveryQueue:
 
     def _run(self) -> None:
         """Run the actions that are due, and set the timer for the others."""
-        self._timer = None
         first_due, _, _ = self._waiting[0]
         now = max(self.loop.time(), first_due)  # A timer may fire slightly early.
         try:
@@ -421,5 +426,9 @@ class _DeliveryQueue:
                 heappop(self._waiting)
                 action()
         finally:  # The other actions must run even if one raises an exception, which the loop then reports.
+            # An action may have called `put`, which may have set a timer for an action that has run since.
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
             if self._waiting:
                 self._schedule()

@@ -278,7 +278,7 @@ class _Labels:
         self._label_places: list[tuple[float, float]] = []  # places of the labels so far
 
     def modes(self, track: Drawable, places: Sequence[tuple[float, float]], colour: str) -> list[_Shape]:
-        """Return a dot and a label with the mode name for each point of the track at which a mode starts."""
+        """Return a dot for each point of the track at which a mode starts, and a label with its name if it has room."""
         shapes: list[_Shape] = []
         previous_mode = None
         for point, (x, y) in zip(track, places, strict=True):

@@ -14,6 +14,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavFtpErr, MavMissionResult, MavParamError, MavResult
 from aerokit.mavlink.message import Message
 from aerokit.missions import MissionItem
+from aerokit.missions.item import LOCAL_FRAMES
 from aerokit.parameters.encoding import UNKNOWN_INDEX
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.protocols.servers.ftp_packets import FtpPacket
@@ -186,7 +187,8 @@ class RecordedMissions(MissionServer):
 
 def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, wants_float: bool) -> AnyItem:
     """Convert a recorded item to the message that the client requests: MISSION_ITEM or MISSION_ITEM_INT."""
-    scale = 1.0 if item.frame == MavFrame.MISSION else 1e7  # In MAV_FRAME_MISSION, x and y are not in degrees.
+    # Degrees for global frames, metres for local ones. In MAV_FRAME_MISSION, x and y are neither.
+    scale = 1.0 if item.frame == MavFrame.MISSION else 1e4 if item.frame in LOCAL_FRAMES else 1e7
     was_float = isinstance(item, m.MissionItem)
     converted = item_from(item)  # with x and y as recorded
     if wants_float:
@@ -243,7 +245,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
         # Number of answers sent from each list of recorded answers, by `id()` of the first answer in the list.
-        self._answered_counts: dict[int, int] = {}
+        self._answered_counts: dict[tuple[int, ...], int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""
         self.missions: RecordedMissions = RecordedMissions(self)
@@ -341,8 +343,8 @@ class RecordedVehicle(SimulatedVehicle):
             candidates = answers
         if not candidates:
             return None
-        # Count the answers from each list of candidates. The first candidate identifies the list.
-        list_id = id(candidates[0])
+        # Count the answers from each list of candidates. Lists may have candidates in common.
+        list_id = tuple(map(id, candidates))
         count = self._answered_counts.get(list_id, 0)
         self._answered_counts[list_id] = count + 1
         return candidates[min(count, len(candidates) - 1)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
@@ -102,17 +102,18 @@ class RecordedFlight:
         previous_unix_s = None
         for unix_s, frame in frames:
             is_of_vehicle = frame.system_id == self.system_id
+            is_of_autopilot = is_of_vehicle and frame.component_id == self.component_id
             if previous_unix_s is not None:
                 now += min(max(unix_s - previous_unix_s, 0.0), MAX_GAP_S)
             elif not is_of_vehicle:
                 continue  # Messages before the first message of the vehicle are skipped.
             previous_unix_s = unix_s
-            if not is_of_vehicle:
-                if frame.message_id in _REQUEST_IDS:
-                    self._read_request(STANDARD.decode(frame), now)
+            if frame.message_id in _REQUEST_IDS and not is_of_autopilot:
+                self._read_request(STANDARD.decode(frame), now)
             elif frame.message_id in _ANSWER_IDS:
-                self._read_answer(STANDARD.decode(frame), now)
-            else:
+                if is_of_autopilot:
+                    self._read_answer(STANDARD.decode(frame), now)
+            elif is_of_vehicle:
                 self.stream.append((now, frame))
         self.duration_s = now
         self._discard_unanswered()
@@ -124,8 +125,11 @@ class RecordedFlight:
         }
         self.answers = {command: answers for command, answers in acknowledged.items() if answers}
 
-    def _read_request(self, message: Message, now: float) -> None:
-        """Record a request of a client, which later answers of the vehicle refer to."""
+    def _read_request(self, message: Any, now: float) -> None:
+        """Record a request to the autopilot, which its later answers refer to."""
+        # Id 0 means all systems or all components.
+        if message.target_system not in (0, self.system_id) or message.target_component not in (0, self.component_id):
+            return
         if isinstance(message, _COMMANDS):
             is_repetition = isinstance(message, m.CommandLong) and message.confirmation > 0
             answers = self.answers.setdefault(message.command, [])

@@ -35,7 +35,7 @@ class ServedFlight:
         recording: FlightRecording | None = None,
     ) -> None:
         self.address: str = server.addresses[0].replace("tcpin:", "tcp:")
-        """Address to connect to, such as "tcp:127.0.0.1:5760"."""
+        """Address of the vehicle; for "tcpin:" the one to connect to, such as "tcp:127.0.0.1:5760"."""
         self.simulated: Any = vehicle
         """The simulated vehicle, which runs on another thread. Only read its attributes; use ``faults`` for changes."""
         self.track: Track = scheduler.tracks[0]
