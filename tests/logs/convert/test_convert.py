@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import shutil
 import struct
+import sys
 from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,8 +21,9 @@ from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.logs.convert import convert
+from aerokit.logs.convert.mcap import McapWriter
 from aerokit.logs.convert.tables import CsvTable
-from aerokit.logs.flights.records import TableColumn
+from aerokit.logs.flights.records import TableColumn, TlogReader
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -281,6 +284,22 @@ def test_existing_target_needs_force_and_failure_leaves_nothing(
     assert (folder / "mine.txt").read_text() == "mine"
     assert (folder / "ATTITUDE.csv").exists()
     assert sorted(each.name for each in tmp_path.iterdir()) == sorted([log.name, "all", "out.csv"])
+
+
+def test_flushed_files_are_writable(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows, os.fsync raises EBADF for a file that is open for reading only."""
+    flushed: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: flushed.append(os.write(descriptor, b"")))
+    convert(log, tmp_path / "out.csv")
+    assert flushed == [0]
+
+
+def test_missing_mcap_package_leaves_no_open_file(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    target = tmp_path / "out.mcap"
+    with pytest.raises(ModuleNotFoundError):
+        McapWriter(target, TlogReader(log))
+    assert not target.exists()
 
 
 def test_damaged_log_is_converted_as_far_as_readable(
