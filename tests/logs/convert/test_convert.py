@@ -207,6 +207,24 @@ def test_integer_parameters_of_px4_are_written_as_numbers(tmp_path: Path) -> Non
     assert [float(row["param_value"]) for row in read_table(tmp_path / "all" / "PARAM_SET.csv")] == [2.0]
 
 
+def test_parameters_of_other_components_stay_as_sent(tmp_path: Path) -> None:
+    """A camera of the vehicle has its own encoding, and does not change that of the autopilot."""
+    bits_of_2 = struct.unpack("<f", struct.pack("<i", 2))[0]
+    c_cast, unknown = 1 << 17, (0, 0, 0, 0, b"", b"", b"", 0, 0, 0)
+    autopilot, camera = FrameEncoder(1, 1), FrameEncoder(1, 100)
+    with TlogWriter(tmp_path / "log.tlog") as writer:
+        for encoder, message in (
+            (autopilot, m.Heartbeat(2, 12, 0, 0, 4, 3)),
+            (camera, m.AutopilotVersion(c_cast, *unknown)),
+            (camera, m.ParamValue("CAM_MODE", 2.0, 6, 1, 0)),
+            (autopilot, m.ParamValue("NAV_RCL_ACT", bits_of_2, 6, 2, 0)),
+        ):
+            writer.write(encoder.encode(message), 1.7e9)
+    convert(tmp_path / "log.tlog", tmp_path / "all")
+    values = [float(row["param_value"]) for row in read_table(tmp_path / "all" / "PARAM_VALUE.csv")]
+    assert values == [2.0, 2.0]
+
+
 @pytest.mark.parametrize("unix_s", [0.0, 1.0000005, 1764115200.9999998, 1764115200.25, -1.25])
 def test_csv_times_have_rounded_microseconds(unix_s: float, tmp_path: Path) -> None:
     table = CsvTable(tmp_path / "times.csv", [])
