@@ -241,7 +241,7 @@ def test_disarming_texts_are_evidence_arming_texts_are_not(text: str, kind: str 
 
 
 def test_gap_of_velocities_after_fast_descent_is_no_fall() -> None:
-    """What happened in the gap is unknown: the vehicle may have landed slowly."""
+    """The log does not show how the descent ended: the vehicle may have landed slowly."""
     flight = descending(lambda height_m: 4.5)
     kept = FlightLog(flight.path)
     for row, time_s in enumerate(flight.velocity.times):

@@ -204,11 +204,11 @@ def test_progress_of_controller_log_begins_at_zero(suffix: str, tmp_path: Path) 
 def test_mission_items_without_position_are_skipped(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip({".gpx": "gpxpy", ".kml": "simplekml"}[suffix])
     messages = [(1, place()), *((1, item(i, 255, x)) for i, x in enumerate((math.nan, 95.0, 47.5)))]
-    log = write_tlog(tmp_path / "log.tlog", [*messages, (1, item(3, 255, z=math.inf))])
-    convert(log, tmp_path / f"out{suffix}")
+    messages += [(1, item(3, 255, z=math.inf)), (1, item_int(4, 255, MavCmd.DO_DIGICAM_CONTROL))]
+    convert(write_tlog(tmp_path / "log.tlog", messages), tmp_path / f"out{suffix}")
     text = (tmp_path / f"out{suffix}").read_text()
     assert "47.5" in text
-    assert not any(each in text for each in ("nan", "inf", "95.0"))
+    assert not any(each in text for each in ("nan", "inf", "95.0", "DIGICAM"))
 
 
 def test_nan_attitude_does_not_end_conversion(tmp_path: Path) -> None:
