@@ -76,6 +76,17 @@ def test_map_origin_is_first_position_at_home_height() -> None:
     )
 
 
+def test_map_origin_height_is_of_first_known_altitude() -> None:
+    frame = topics.MapFrame()
+    assert frame.east_north_up_m(Position(47.4, 8.5, altitude_relative_m=12.0)) == pytest.approx((0, 0, 12))
+    assert frame.east_north_up_m(PLACE) == pytest.approx((0, 0, 12))
+
+
+def test_location_fix_omits_unknown_velocity() -> None:
+    fix = topics.location_fix(0.0, 1, PLACE, velocity=Velocity(1.0, 2.0, math.nan))
+    assert "velocity" not in fix
+
+
 def test_location_fix_uses_units_of_viewer() -> None:
     fix = topics.location_fix(1_700_000_000.25, 7, PLACE, 90.0, Velocity(1.0, 2.0, 3.0))
     assert fix["timestamp"] == {"sec": 1_700_000_000, "nsec": 250_000_000}

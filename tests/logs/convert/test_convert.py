@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import shutil
 import struct
+import sys
 from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,8 +21,9 @@ from aerokit import messages as m
 from aerokit.apps.cli import main
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.logs.convert import convert
+from aerokit.logs.convert.mcap import McapWriter
 from aerokit.logs.convert.tables import CsvTable
-from aerokit.logs.flights.records import TableColumn
+from aerokit.logs.flights.records import TableColumn, TlogReader
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.frame import Frame
@@ -204,6 +207,24 @@ def test_integer_parameters_of_px4_are_written_as_numbers(tmp_path: Path) -> Non
     assert [float(row["param_value"]) for row in read_table(tmp_path / "all" / "PARAM_SET.csv")] == [2.0]
 
 
+def test_parameters_of_other_components_stay_as_sent(tmp_path: Path) -> None:
+    """A camera of the vehicle has its own encoding, and does not change that of the autopilot."""
+    bits_of_2 = struct.unpack("<f", struct.pack("<i", 2))[0]
+    c_cast, unknown = 1 << 17, (0, 0, 0, 0, b"", b"", b"", 0, 0, 0)
+    autopilot, camera = FrameEncoder(1, 1), FrameEncoder(1, 100)
+    with TlogWriter(tmp_path / "log.tlog") as writer:
+        for encoder, message in (
+            (autopilot, m.Heartbeat(2, 12, 0, 0, 4, 3)),
+            (camera, m.AutopilotVersion(c_cast, *unknown)),
+            (camera, m.ParamValue("CAM_MODE", 2.0, 6, 1, 0)),
+            (autopilot, m.ParamValue("NAV_RCL_ACT", bits_of_2, 6, 2, 0)),
+        ):
+            writer.write(encoder.encode(message), 1.7e9)
+    convert(tmp_path / "log.tlog", tmp_path / "all")
+    values = [float(row["param_value"]) for row in read_table(tmp_path / "all" / "PARAM_VALUE.csv")]
+    assert values == [2.0, 2.0]
+
+
 @pytest.mark.parametrize("unix_s", [0.0, 1.0000005, 1764115200.9999998, 1764115200.25, -1.25])
 def test_csv_times_have_rounded_microseconds(unix_s: float, tmp_path: Path) -> None:
     table = CsvTable(tmp_path / "times.csv", [])
@@ -281,6 +302,22 @@ def test_existing_target_needs_force_and_failure_leaves_nothing(
     assert (folder / "mine.txt").read_text() == "mine"
     assert (folder / "ATTITUDE.csv").exists()
     assert sorted(each.name for each in tmp_path.iterdir()) == sorted([log.name, "all", "out.csv"])
+
+
+def test_flushed_files_are_writable(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows, os.fsync raises EBADF for a file that is open for reading only."""
+    flushed: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: flushed.append(os.write(descriptor, b"")))
+    convert(log, tmp_path / "out.csv")
+    assert flushed == [0]
+
+
+def test_missing_mcap_package_leaves_no_open_file(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    target = tmp_path / "out.mcap"
+    with pytest.raises(ModuleNotFoundError):
+        McapWriter(target, TlogReader(log))
+    assert not target.exists()
 
 
 def test_damaged_log_is_converted_as_far_as_readable(

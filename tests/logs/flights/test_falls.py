@@ -238,3 +238,14 @@ def test_report_of_crash_begins_and_ends_with_fall(
 def test_disarming_texts_are_evidence_arming_texts_are_not(text: str, kind: str | None) -> None:
     evidence = evidence_in_texts([LoggedText(1.0, 2, text)])
     assert [item.kind for item in evidence] == ([] if kind is None else [kind])
+
+
+def test_gap_of_velocities_after_fast_descent_is_no_fall() -> None:
+    """The log does not show how the descent ended: the vehicle may have landed slowly."""
+    flight = descending(lambda height_m: 4.5)
+    kept = FlightLog(flight.path)
+    for row, time_s in enumerate(flight.velocity.times):
+        if not 14.0 < time_s < 30.0:
+            kept.velocity.add(time_s, 0.0, 0.0, flight.velocity["down_m_s"][row])
+    flight.velocity = kept.velocity
+    assert falls(flight) == []

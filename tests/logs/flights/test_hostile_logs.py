@@ -18,9 +18,10 @@ from aerokit.logs.convert.tables import CsvTable
 from aerokit.logs.flights import failsafes, read_flight
 from aerokit.logs.flights.flight import TimeSeries
 from aerokit.logs.flights.flight_controllers import BinReader
-from aerokit.logs.flights.records import TableColumn
+from aerokit.logs.flights.records import TableColumn, TlogReader
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.mavlink.message import Message
 from aerokit.mavlink.tlog import TlogWriter
 
@@ -203,11 +204,11 @@ def test_progress_of_controller_log_begins_at_zero(suffix: str, tmp_path: Path) 
 def test_mission_items_without_position_are_skipped(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip({".gpx": "gpxpy", ".kml": "simplekml"}[suffix])
     messages = [(1, place()), *((1, item(i, 255, x)) for i, x in enumerate((math.nan, 95.0, 47.5)))]
-    log = write_tlog(tmp_path / "log.tlog", [*messages, (1, item(3, 255, z=math.inf))])
-    convert(log, tmp_path / f"out{suffix}")
+    messages += [(1, item(3, 255, z=math.inf)), (1, item_int(4, 255, MavCmd.DO_DIGICAM_CONTROL))]
+    convert(write_tlog(tmp_path / "log.tlog", messages), tmp_path / f"out{suffix}")
     text = (tmp_path / f"out{suffix}").read_text()
     assert "47.5" in text
-    assert not any(each in text for each in ("nan", "inf", "95.0"))
+    assert not any(each in text for each in ("nan", "inf", "95.0", "DIGICAM"))
 
 
 def test_nan_attitude_does_not_end_conversion(tmp_path: Path) -> None:
@@ -231,6 +232,62 @@ def test_mission_is_latest_of_this_vehicle(tmp_path: Path) -> None:
     ]
     flight = read_flight(write_tlog(tmp_path / "log.tlog", [*before, *now, *other]))
     assert [(each.number, each.command) for each in flight.mission] == [(0, 17), (1, 17)]
+
+
+@pytest.mark.parametrize(
+    ("command", "frame", "has_position"),
+    [
+        (MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL_TERRAIN_ALT, True),
+        (MavCmd.NAV_WAYPOINT, MavFrame.LOCAL_NED, False),
+        (MavCmd.DO_DIGICAM_CONTROL, MavFrame.GLOBAL, False),
+    ],
+)
+def test_only_items_with_place_have_position(command: int, frame: int, has_position: bool, tmp_path: Path) -> None:
+    sent = m.MissionItemInt(1, 1, 0, frame, command, 0, 1, 0.0, 0.0, 0.0, 0.0, 100_000, 200_000, 5.0)
+    (read,) = read_flight(write_tlog(tmp_path / "log.tlog", [(255, sent)])).mission
+    assert math.isnan(read.latitude_deg) is not has_position
+    assert math.isnan(read.longitude_deg) is not has_position
+
+
+@pytest.mark.parametrize(
+    ("frame", "amsl_m", "relative_m"),
+    [
+        (MavFrame.GLOBAL_INT, 5.0, math.nan),
+        (MavFrame.GLOBAL_RELATIVE_ALT_INT, math.nan, 5.0),
+        (MavFrame.GLOBAL_TERRAIN_ALT_INT, math.nan, math.nan),
+    ],
+)
+def test_destination_height_depends_on_frame(frame: int, amsl_m: float, relative_m: float, tmp_path: Path) -> None:
+    target = m.PositionTargetGlobalInt(0, frame, 0xFF8, 470_000_000, 80_000_000, 5.0, 0, 0, 0, 0, 0, 0, 0, 0)
+    read = read_flight(write_tlog(tmp_path / "log.tlog", [(1, target)])).position_target
+    assert read["altitude_amsl_m"][0] == pytest.approx(amsl_m, nan_ok=True)
+    assert read["altitude_relative_m"][0] == pytest.approx(relative_m, nan_ok=True)
+
+
+def test_radio_status_has_ids_of_radio(tmp_path: Path) -> None:
+    flight = read_flight(write_tlog(tmp_path / "log.tlog", [(51, m.RadioStatus(200, 150, 100, 40, 50, 0, 0))]))
+    assert list(flight.radio["rssi"]) == [200]
+
+
+def test_loss_begins_with_first_frame(tmp_path: Path) -> None:
+    """Before, the vehicle may have been off."""
+    path, station, vehicle = tmp_path / "log.tlog", FrameEncoder(255, 190), FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for second in range(20):
+            writer.write(station.encode(m.Heartbeat(6, 8, 0, 0, 4, 3)), BEGIN + second)
+            if second >= 10:
+                writer.write(vehicle.encode(HEARTBEAT), BEGIN + second)
+    link = read_flight(path).link
+    assert list(link.times) == list(range(10, 20))
+    assert set(link["lost_percent"]) == {0.0}
+
+
+def test_status_texts_of_recording_are_written_once(tmp_path: Path) -> None:
+    """The texts are two seconds apart. The first one is cut off, and published together with the second one."""
+    texts = [m.Statustext(4, "x" * 50, 7, 0), HEARTBEAT, HEARTBEAT, m.Statustext(4, "two"), m.Statustext(4, "three")]
+    log = write_tlog(tmp_path / "log.tlog", [(1, message) for message in texts])
+    states = [state for record in TlogReader(log).entries(lambda _: None) for state in record.states]
+    assert [value.text for name, value in states if name == "status_text"] == [f"{'x' * 50}…", "two", "three"]
 
 
 def test_mode_command_to_other_vehicle_is_ignored(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from aerokit import messages as m
 from aerokit.logs.flights import FlightLog, failsafes, read_flight
-from aerokit.logs.flights.codes import failsafe_action
+from aerokit.logs.flights.codes import error_text, failsafe_action
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd
 from aerokit.mavlink.message import Message
@@ -56,7 +56,7 @@ def test_failsafe_mode_after_command_for_other_mode_is_reaction(tmp_path: Path) 
 def test_commanded_mode_is_no_reaction(tmp_path: Path, speed: float) -> None:
     flight = recorded(tmp_path / "log.tlog", SET_LAND, landing_s=12.0, speed=speed)
     (failsafe,) = failsafes(flight)
-    assert (flight.modes[-1].reason, failsafe.reaction) == ("ordered", "no mode change followed")
+    assert (flight.modes[-1].reason, failsafe.reaction) == ("ordered", "no reaction was logged")
 
 
 PX4_HOLD, PX4_MISSION, PX4_RTL, PX4_LAND = (4 << 16 | sub_mode << 24 for sub_mode in (3, 4, 5, 6))
@@ -135,7 +135,7 @@ def test_mode_change_after_disarming_is_no_reaction(tmp_path: Path) -> None:
         (41.5, m.Statustext(2, "Critical battery")),
     ])  # fmt: skip
     (failsafe,) = failsafes(flight)
-    assert (failsafe.reaction, failsafe.acted) == ("no mode change followed", False)
+    assert (failsafe.reaction, failsafe.acted) == ("no reaction was logged", False)
 
 
 def test_estimator_failsafe_without_satellites_is_one_failsafe(tmp_path: Path) -> None:
@@ -172,3 +172,10 @@ def test_first_text_of_px4_is_joined(tmp_path: Path) -> None:
     for alive, texts in ((px4_heartbeat(PX4_HOLD), [begin + end]), (heartbeat(AUTO), [begin.rstrip(), end])):
         flight = written(tmp_path / "log.tlog", [*((float(second), alive) for second in range(4)), *chunks])
         assert [text.text for text in flight.texts] == texts
+
+
+@pytest.mark.parametrize(
+    ("code", "text"), [(3, "fence: above the maximum altitude and outside the circle"), (64, "fence")]
+)
+def test_fence_error_names_known_fences(code: int, text: str) -> None:
+    assert error_text(9, code, "fence") == text

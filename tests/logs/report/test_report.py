@@ -209,7 +209,7 @@ def test_missing_data_is_stated(tmp_path: Path) -> None:
             writer.write(encoder.encode(m.Heartbeat(2, 3, 81, 0, 3, 3)), 1_700_000_000 + i)
     assert main(["report", str(path), "-o", str(target)]) == 0
     page = Page(target)
-    assert "Never armed" in page.text
+    assert "No arming was logged in 4 s." in page.text
     for missing in (
         *(
             "The log contains no positions.",
@@ -396,7 +396,7 @@ def test_summary_of_unarmed_log_mentions_no_flight(tmp_path: Path) -> None:
     target = tmp_path / "ground.html"
     target.write_text(report_html(flight), encoding="utf-8")
     page = Page(target)
-    assert "Never armed: 4 s on the ground." in page.text
+    assert "No arming was logged in 4 s." in page.text
     assert "\nIn STABILIZE (4 s)." in page.text
     assert "Flown in" not in page.text
     assert "No mission: the only item is home" in page.text
@@ -447,3 +447,26 @@ def test_modes_of_less_than_half_a_second_are_not_listed() -> None:
     flight.modes = [ModeChange(0.0, "STABILIZE"), ModeChange(10.3, "AUTO"), ModeChange(40.0, "RTL")]
     sentences = "\n".join(summary(flight, statistics_of(flight)))
     assert "Flown in AUTO (30 s), RTL (10 s)." in sentences
+
+
+def test_way_between_armed_spans_is_not_flown() -> None:
+    flight = FlightLog(Path("x.tlog"), ends_at=60.0, armed=[(0.0, 10.0), (30.0, 40.0)], home=Position(47.0, 8.0))
+    places = {0.0: 47.0, 10.0: 47.0, 20.0: math.nan, 30.0: math.nan, 35.0: 47.01, 40.0: 47.01}
+    for time_s, latitude in places.items():
+        flight.track.add(time_s, latitude, 8.0, math.nan, math.nan)
+    assert statistics_of(flight).distance_m == 0.0
+
+
+def test_context_of_failsafe_omits_unknown_satellite_values() -> None:
+    flight = FlightLog(Path("x.tlog"), ends_at=60.0, armed=[(0.0, 60.0)])
+    flight.receiver(0).add(19.0, 3.0, math.nan, math.nan, math.nan)
+    flight.failsafe_evidence = [FailsafeEvidence(20.0, "gps", "text: GPS Glitch")]
+    (failsafe,) = failsafes(flight)
+    assert "receiver 1: fix type 3" in failsafe.context
+
+
+def test_reported_action_without_mode_change_is_reaction() -> None:
+    flight = FlightLog(Path("x.tlog"), ends_at=60.0, armed=[(0.0, 60.0)])
+    flight.failsafe_evidence = [FailsafeEvidence(20.0, "battery", "text: Failsafe activated", is_action=True)]
+    (failsafe,) = failsafes(flight)
+    assert (failsafe.acted, failsafe.reaction) == (True, "the autopilot reported an action")

@@ -67,7 +67,7 @@ def test_silence_at_the_end_is_in_summary(silent: FlightLog) -> None:
     assert "on, until the log ends; it was last 20.0 m above home in GUIDED." in text.splitlines()[0]
     assert "If the vehicle also lost the ground station, it reacts as configured: FS_GCS_ENABLE = 5 (lands)" in text
     assert "20.0 m above home in GUIDED, " in text
-    assert "s before: the rest of the flight, and with it a landing or a crash, was not recorded" in text
+    assert "s before the end: the rest of the flight, and with it a landing or a crash, was not recorded" in text
 
 
 def test_loss_curve_of_silence_reaches_end_of_log(silent: FlightLog) -> None:
@@ -153,6 +153,17 @@ def test_failsafe_without_reaction_names_parameters_to_read() -> None:
     flight.parameters["BATT_FS_LOW_ACT"] = 0.0
     assert "The log does not contain" not in summary_of(flight)
     assert failsafe_section(flight).explanation.endswith("and the parameters that configure it.")
+
+
+def test_old_height_says_nothing_about_end_of_log(tmp_path: Path) -> None:
+    """The vehicle was on the ground a minute before the end, and the log has no later position."""
+    path, encoder = tmp_path / "log.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        place = m.GlobalPositionInt(0, 470_000_000, 80_000_000, 500_000, 0, 0, 0, 50, 0)
+        writer.write(encoder.encode(place), 1.7e9)
+        for second in range(60):
+            writer.write(encoder.encode(m.Heartbeat(2, 3, 209, 4, 4, 3)), 1.7e9 + second)
+    assert "vehicle is armed in GUIDED: the rest of the flight" in " ".join(read_flight(path).notes)
 
 
 @pytest.mark.exhaustive

@@ -73,7 +73,7 @@ class Conversion(Snapshot):
     begins_at: float
     """UTC of the first record, in seconds since 1970."""
     ends_at: float
-    """UTC of the last record, in seconds since 1970."""
+    """Latest UTC of a record, in seconds since 1970. It is not the last record's if the clock was set back."""
     notes: tuple[str, ...]
     """Problems of the log, and data that is missing because of them."""
 
@@ -144,7 +144,7 @@ def _writer_for(target: Path, table_format: str) -> Callable[[Path, LogReader], 
 
 
 def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
-    """Write all records of a log. Return their number, their first and last time, and the writer's ``written``."""
+    """Write all records of a log. Return their number, the first and the latest time, and the writer's ``written``."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):
@@ -172,8 +172,9 @@ def _move(complete: Path, target: Path) -> int:
     """Flush the complete files to disk and move them to their final names. Return their total size."""
     files = sorted(complete.iterdir()) if complete.is_dir() else [complete]
     for file in files:
-        with file.open("rb") as opened:
-            os.fsync(opened.fileno())  # otherwise a power failure could leave an empty file under the final name
+        # Without fsync, a power failure could leave an empty file under the final name. Windows needs a writable file.
+        with file.open("r+b") as opened:
+            os.fsync(opened.fileno())
     size = sum(file.stat().st_size for file in files)
     if not complete.is_dir():
         complete.replace(target)

@@ -23,8 +23,9 @@ class McapWriter:
 
     def __init__(self, path: Path, log: LogReader) -> None:
         self._log = log
+        writer_class = import_module("mcap.writer").Writer  # raises ModuleNotFoundError before the file is open
         self._file = path.open("wb")
-        self._writer = import_module("mcap.writer").Writer(self._file)
+        self._writer = writer_class(self._file)
         self._writer.start(profile="", library="aerokit")
         self._channels: dict[str, int] = {}
         self._schemas: dict[bytes, int] = {}

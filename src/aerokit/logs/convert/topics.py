@@ -100,31 +100,24 @@ class MapFrame:
     """Converts positions to metres east, north and up of an origin."""
 
     def __init__(self) -> None:
-        self._origin: tuple[float, float, float] | None = None
+        self._origin: tuple[float, float] | None = None  # latitude and longitude
+        self._origin_amsl_m: float | None = None
 
     def east_north_up_m(self, position: Position) -> tuple[float, float, float]:
         """Convert a position to metres east, north and up of the origin.
 
-        The first position becomes the origin. The origin's altitude is that of home, if known.
+        The first position becomes the origin. The origin's altitude is that of home, derived from the first position
+        with an altitude above sea level; if home is unknown then, it is the altitude of that position. A position
+        without an altitude above sea level is as far up as it is above home.
         """
-        altitude, relative = position.altitude_amsl_m, position.altitude_relative_m
+        altitude, relative_m = position.altitude_amsl_m, position.altitude_relative_m or 0.0
         if self._origin is None:
-            self._origin = (
-                position.latitude_deg,
-                position.longitude_deg,
-                (altitude or 0.0) - (relative or 0.0),
-            )
-        latitude, longitude, origin_amsl_m = self._origin
-        north, east = geo.north_east_m(latitude, longitude, position.latitude_deg, position.longitude_deg)
-        return east, north, height_above(origin_amsl_m, altitude, relative)
-
-
-def height_above(origin_m: float, altitude_amsl_m: float | None, relative_m: float | None) -> float:
-    """Return the height above the origin in metres.
-
-    The height is derived from the altitude above sea level or, if that is unknown, from the altitude above home.
-    """
-    return (relative_m or 0.0) if altitude_amsl_m is None else altitude_amsl_m - origin_m
+            self._origin = position.latitude_deg, position.longitude_deg
+        if self._origin_amsl_m is None and altitude is not None:
+            self._origin_amsl_m = altitude - relative_m
+        up = relative_m if altitude is None or self._origin_amsl_m is None else altitude - self._origin_amsl_m
+        north, east = geo.north_east_m(*self._origin, position.latitude_deg, position.longitude_deg)
+        return east, north, up
 
 
 def vehicle_topic(system_id: int, name: str) -> str:
@@ -223,7 +216,7 @@ def location_fix(
     }
     if heading_deg is not None:
         fix["heading"] = math.radians(heading_deg)
-    if velocity is not None:
+    if velocity is not None and all(map(math.isfinite, (velocity.ground_speed_m_s, velocity.down_m_s))):
         fix["velocity"] = _vector(velocity.east_m_s, velocity.north_m_s, -velocity.down_m_s)
     return fix
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.logs.flights.flight import Waypoint
 from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
-from aerokit.missions.item import GLOBAL_FRAMES, canonical_frame
+from aerokit.missions.item import GLOBAL_FRAMES, canonical_frame, has_place
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,7 +75,9 @@ class _TrackWriter:
     def _add_item(self, record: LogRecord) -> None:
         """Add a mission item that has a position to the track of the vehicle that received or sent it."""
         item: Any = record.message
-        if item is None or item.mission_type != MavMissionType.MISSION or item.frame not in GLOBAL_FRAMES:
+        if item is None or item.mission_type != MavMissionType.MISSION:
+            return
+        if item.frame not in GLOBAL_FRAMES or not has_place(item.command):
             return
         if item.target_system in self._tracks:  # sent to the vehicle
             system_id = item.target_system

@@ -136,8 +136,9 @@ def error_text(subsystem: int, code: int, text: str) -> str:
     if subsystem == _ESTIMATOR_SWITCH:
         return f"{text}: number {code}"
     if subsystem == _FENCE:
-        return f"{text}: {' and '.join(words for bit, words in _FENCE_TYPES.items() if code & bit)}"
-    detail = _ERROR_DETAILS.get((subsystem, code))
+        detail: str | None = " and ".join(words for bit, words in _FENCE_TYPES.items() if code & bit)
+    else:
+        detail = _ERROR_DETAILS.get((subsystem, code))
     return f"{text}: {detail}" if detail else text
 
 

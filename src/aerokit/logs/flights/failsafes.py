@@ -145,14 +145,17 @@ def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
 
 
 def failsafes(flight: FlightLog) -> list[Failsafe]:
-    """Return the failsafes and problems that began while the vehicle was armed, the oldest first."""
+    """Return the failsafes and problems of the time in which the vehicle was armed, the oldest first.
+
+    Evidence also counts if it is from shortly before arming or shortly after disarming.
+    """
     groups: list[list[FailsafeEvidence]] = []
     recent_groups: list[list[FailsafeEvidence]] = []
     for evidence in flight.failsafe_evidence:
-        was_armed = any(
+        is_near_armed = any(
             begin - _BEFORE_ARMING_S <= evidence.time_s <= end + _AFTER_DISARMING_S for begin, end in flight.armed
         )
-        if not was_armed:
+        if not is_near_armed:
             continue
         recent_groups = [
             group for group in recent_groups if evidence.time_s - group[-1].time_s <= _DELAYED_REACTION_GAP_S
@@ -172,14 +175,15 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
 
 def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
     """Return True if evidence belongs to the same failsafe as an earlier group of evidence."""
-    kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
-    if "general" in (kind, evidence.kind):
-        # PX4 announces "entering Hold for 5 seconds" before its reaction.
-        is_reaction_delayed = kind == "gps" or "entering Hold" in group[-1].text
+    group_kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
+    if "general" in (group_kind, evidence.kind):
+        # Without satellites, autopilots continue with dead reckoning before they react. PX4 announces "entering Hold
+        # for 5 seconds" before its reaction.
+        is_reaction_delayed = group_kind == "gps" or "entering Hold" in group[-1].text
         return gap_s <= (_DELAYED_REACTION_GAP_S if is_reaction_delayed else _GENERAL_GAP_S)
-    if (kind, evidence.kind) == ("gps", "estimator"):  # The estimator fails because the satellites are missing.
+    if (group_kind, evidence.kind) == ("gps", "estimator"):  # The estimator fails because the satellites are missing.
         return gap_s <= _DELAYED_REACTION_GAP_S
-    return kind == evidence.kind and gap_s <= _SAME_KIND_GAP_S
+    return group_kind == evidence.kind and gap_s <= _SAME_KIND_GAP_S
 
 
 def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
@@ -199,7 +203,7 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
         parameters = _missing_parameters(flight, kind)
     facts += parameters
     facts += _texts_before(flight, time_s)
-    reaction = reaction or "no mode change followed"
+    reaction = reaction or ("the autopilot reported an action" if acted else "no reaction was logged")
     return Failsafe(time_s, kind, acted, evidence=tuple(group), reaction=reaction, context=tuple(facts))
 
 
@@ -310,10 +314,13 @@ def _gps_context(flight: FlightLog, time_s: float) -> list[str]:
         satellites, fix_type = gps.at("satellites", time_s), gps.at("fix_type", time_s)
         if math.isnan(satellites) and math.isnan(fix_type):
             continue
-        text = f"receiver {number + 1}: {satellites:.0f} satellites, fix type {fix_type:.0f}"
-        hdop = gps.at("hdop", time_s)
-        if not math.isnan(hdop):
-            text += f", HDOP {hdop:.1f}"
+        values = (
+            (satellites, "{:.0f} satellites"),
+            (fix_type, "fix type {:.0f}"),
+            (gps.at("hdop", time_s), "HDOP {:.1f}"),
+        )
+        known = [template.format(value) for value, template in values if not math.isnan(value)]
+        text = f"receiver {number + 1}: {', '.join(known)}"
         earlier_satellites = gps.at("satellites", time_s - _BEFORE_S)
         if not math.isnan(earlier_satellites):
             text += f"; {earlier_satellites:.0f} satellites {_BEFORE_S:.0f} s before"

@@ -20,7 +20,8 @@ _MIN_HEIGHT_M = 2.0
 # With a higher sink rate, an impact is a fall, not a hard landing. Free fall reaches this speed after two metres.
 _FALL_SINK_M_S = 6.0
 # An impact on the ground stops a vehicle within this time. Motors need longer to stop a fast descent.
-_IMPACT_S = 0.6
+# After a longer interval than _MAX_INTERVAL_S between two velocities, nothing is known about the end of the descent.
+_IMPACT_S, _MAX_INTERVAL_S = 0.6, 3.5
 _SAME_HEIGHT_M = 1.5
 _DISARM_TIMEOUT_S = 30.0
 # Disarming and status texts may explain a descent if they are at most _REASON_BEFORE_S before its start. Status texts
@@ -57,11 +58,11 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    A descent counts if the vehicle sank 2 m or more at more than 3 m/s, was stopped within 0.6 s, and one of these is
-    true:
+    A descent counts if the vehicle sank 2 m or more at more than 3 m/s, was stopped within 0.6 s (or 1.5 intervals of
+    the logged velocities), and one of these is true:
 
-    - The vehicle stayed at that height until it was disarmed.
-    - The vehicle stayed armed at that height for 30 s, less than 3 m above home.
+    - No height in the log shows that the vehicle left that height before it was disarmed.
+    - The same is true for 30 s, or until the log ends, and the vehicle was less than 3 m above home.
     - The autopilot reported a crash.
 
     A descent near the ground also counts if the log ends during the descent.
@@ -92,7 +93,8 @@ def _descents(flight: FlightLog) -> Iterator[tuple[float, float, float, bool]]:
             sink_m_s = max(sink_m_s, down_m_s) if is_recent else down_m_s
             last_fast_s = time_s
         elif down_m_s < _STOPPED_M_S:
-            max_stop_s = max(_IMPACT_S, 1.5 * (time_s - previous_s))  # longer if the log has few values
+            # The stop may take longer if the log has few velocities.
+            max_stop_s = max(_IMPACT_S, 1.5 * min(time_s - previous_s, _MAX_INTERVAL_S))
             was_fast = last_fast_s > begin_s
             if was_fast and time_s - last_fast_s <= max_stop_s:
                 yield begin_s, time_s, sink_m_s, True
@@ -129,7 +131,10 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle keeps this height until it is disarmed or, near the height of home, for 30 s."""
+    """Return True if the vehicle keeps this height until it is disarmed or, near home's height, for 30 s.
+
+    The log may end before. It is also True if the log has no heights of this time.
+    """
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log

@@ -107,11 +107,11 @@ def _column_kind(value: object) -> str:
     return "int" if isinstance(value, int) else "str"  # bytes and arrays are also converted to "str"
 
 
-def _position(latitude: float, longitude: float, amsl_m: float, relative_m: float | None) -> Position | None:
+def _position(latitude: float, longitude: float, amsl_m: float | None, relative_m: float | None) -> Position | None:
     """Create a position; None for impossible values, which estimators report before they work or if they fail."""
     try:
         check_place(latitude, longitude)
-        position = Position(latitude, longitude, float(amsl_m), relative_m)
+        position = Position(latitude, longitude, amsl_m, relative_m)
     except ValueError:
         return None
     return None if latitude == longitude == 0 else position
@@ -237,12 +237,13 @@ class UlogReader(_RowReader):
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield the rows of all topics and the logged texts, ordered by time, except those with an implausible time."""
-        try:
-            # pyulog prints to stdout, which may be for JSON.
-            with self.path.open("rb") as file, redirect_stdout(sys.stderr):
-                log = import_module("pyulog").ULog(file)
-        except Exception as error:  # pyulog raises arbitrary errors for other files
-            raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
+        pyulog = import_module("pyulog")
+        # pyulog prints to stdout, which may be for JSON.
+        with self.path.open("rb") as file, redirect_stdout(sys.stderr):
+            try:
+                log = pyulog.ULog(file)
+            except Exception as error:  # pyulog raises arbitrary errors for other files
+                raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
         if log.file_corruption:
             self.notes.append("the log is damaged: the readable part was converted")
         if not log.data_list:
@@ -306,13 +307,15 @@ class _Px4States:
             self._home_amsl_m = row["alt"]
         elif table == "vehicle_global_position" and row.get("lat_lon_valid", 1):
             home = self._home_amsl_m
-            relative = None if home is None else row["alt"] - home
-            return _optional_state("position", _position(row["lat"], row["lon"], row["alt"], relative))
+            amsl_m = row["alt"] if row.get("alt_valid", 1) else None
+            relative_m = None if home is None or amsl_m is None else amsl_m - home
+            return _optional_state("position", _position(row["lat"], row["lon"], amsl_m, relative_m))
         elif table == "vehicle_attitude":
             quaternion = (row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"])
             return (("attitude", Attitude.from_quaternion(*quaternion, (None, None, None))),)
-        elif table == "vehicle_local_position" and row.get("v_xy_valid", 1):
-            return (("velocity", Velocity(row["vx"], row["vy"], row["vz"])),)
+        elif table == "vehicle_local_position":
+            north, east = (row["vx"], row["vy"]) if row.get("v_xy_valid", 1) else (math.nan, math.nan)
+            return (("velocity", Velocity(north, east, row["vz"] if row.get("v_z_valid", 1) else math.nan)),)
         elif table == "vehicle_status":
             return (("armed", row["arming_state"] == 2),)  # ARMING_STATE_ARMED
         elif table == "battery_status":

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots.ardupilot import ardupilot_for
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, clean_text, error_text
-from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane, Waypoint
+from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane, TimeSeries, Waypoint
 from aerokit.logs.flights.flight_controllers import close_bin, opened_bin
 from aerokit.mavlink.enums import GpsFixType, MavType
+from aerokit.missions.item import has_place
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +38,7 @@ _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
 # A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
+_SAME_SETPOINT_S = 0.005  # PSCN and PSCE rows with times that differ by at most this are one set-point
 _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the rows
 
 
@@ -243,14 +245,15 @@ class _Reader:
 
     def _read_mission(self) -> None:
         items: dict[int, Waypoint] = {}
-        for row in self._tables.rows("CMD", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
-            _, number, command, latitude, longitude, altitude, frame = row
-            if not latitude and not longitude:
+        total = 0  # the number of items of the newest mission, because earlier ones may have had more
+        for row in self._tables.rows("CMD", "CTot", "CNum", "CId", "Lat", "Lng", "Alt", "Frame"):
+            _, total, number, command, latitude, longitude, altitude, frame = row
+            if not has_place(command) or not (latitude or longitude):
                 latitude, longitude = NAN, NAN  # the item has no position
             items[number] = Waypoint(
                 number, command, latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude, frame=frame
             )
-        self._flight.mission = [items[number] for number in sorted(items)]
+        self._flight.mission = [items[number] for number in sorted(items) if number < total]
 
     def _read_home(self) -> None:
         for row in self._tables.rows("ORGN", "Type", "Lat", "Lng", "Alt"):
@@ -265,9 +268,14 @@ class _Reader:
                 track.add(time, latitude, longitude, amsl, relative)
         if len(track):
             return
-        # If the estimator has no positions, use those of the GPS receiver that have a 3D fix.
-        for time, status, latitude, longitude, amsl in self._tables.rows("GPS", "Status", "Lat", "Lng", "Alt"):
-            if status >= GpsFixType.TYPE_3D_FIX:
+        # If the estimator has no positions, use those of the first GPS receiver that has a 3D fix.
+        number_column = ("I",) if self._tables.has("GPS", "I") else ()
+        used_receiver = None
+        for time, status, latitude, longitude, amsl, *receiver in self._tables.rows(
+            "GPS", "Status", "Lat", "Lng", "Alt", *number_column
+        ):
+            if status >= GpsFixType.TYPE_3D_FIX and used_receiver in (None, receiver):
+                used_receiver = receiver
                 track.add(time, latitude, longitude, amsl, NAN)
 
     def _read_velocity(self) -> None:
@@ -284,16 +292,21 @@ class _Reader:
         self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
 
     def _read_targets(self) -> None:
-        """Read the set-points of position and velocity. The log has them relative to the estimator's origin."""
+        """Read the set-points of position and velocity. The log has positions relative to the estimator's origin."""
         origin = self._origin()
-        north_rows = list(self._tables.rows("PSCN", "TPN", "TVN"))
-        east_rows = list(self._tables.rows("PSCE", "TPE", "TVE"))
-        if origin is not None:
-            plane = TangentPlane(*origin)
-            for (time, north_m, north_m_s), (_, east_m, east_m_s) in zip(north_rows, east_rows):  # noqa: B905 - one may be cut off at the end
+        plane = None if origin is None else TangentPlane(*origin)
+        east = TimeSeries("m", "m_s")
+        for row in self._tables.rows("PSCE", "TPE", "TVE"):
+            east.add(*row)
+        for time, north_m, north_m_s in self._tables.rows("PSCN", "TPN", "TVN"):
+            # The rows of one set-point are logged together. One of them may be lost.
+            east_m, east_m_s = (
+                east.at(name, time + _SAME_SETPOINT_S, not_older_s=2 * _SAME_SETPOINT_S) for name in east
+            )
+            if plane is not None and not math.isnan(east_m):
                 latitude, longitude = plane.degrees(north_m, east_m)
                 self._flight.position_target.add(time, latitude, longitude, NAN, NAN)  # _add_heights() adds altitudes
-                self._flight.velocity_target.add(time, north_m_s, east_m_s, NAN)
+            self._flight.velocity_target.add(time, north_m_s, east_m_s, NAN)
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
     def _add_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:

@@ -19,6 +19,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavBatteryChargeState, MavFrame, MavState, MavType
 from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
 from aerokit.mavlink.tlog import read_tlog
+from aerokit.missions.item import canonical_frame
 from aerokit.parameters.encoding import value_of
 from aerokit.vehicle.state.equipment import current
 from aerokit.vehicle.state.movement import Attitude
@@ -110,6 +111,9 @@ class _Reader:
             m.MissionItem: self._mission.on_item,
             m.MissionCount: self._mission.on_count,
             m.FileTransferProtocol: self._mission.on_file_transfer,
+            # Telemetry radios insert these with ids of their own.
+            m.RadioStatus: self._on_radio,
+            m.Radio: self._on_radio,
         }
         self._handlers_of_other_senders = {
             _message_id_bytes(kind): call for kind, call in {**commands, **handlers}.items()
@@ -197,9 +201,9 @@ class _Reader:
         setpoints, destinations = self._flight.position_target, self._destinations
         if setpoints.has("latitude_deg"):
             return
-        has_heights = setpoints.has()  # without latitudes, set-points have only heights
-        rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints), strict=True))
-        columns = (destinations[name] for name in destinations)
+        has_heights = setpoints.has()  # NAV_CONTROLLER_OUTPUT has heights without positions
+        rows = list(zip(setpoints.times, *(setpoints[name] for name in setpoints.names), strict=True))
+        columns = (destinations[name] for name in destinations.names)
         for time, latitude, longitude, amsl, relative in zip(destinations.times, *columns, strict=True):
             heights = (NAN, NAN) if has_heights else (amsl, relative)
             rows.append((time, latitude, longitude, *heights))
@@ -228,8 +232,6 @@ class _Reader:
             m.AttitudeTarget: self._on_attitude_target,
             m.PositionTargetGlobalInt: self._on_global_target,
             m.PositionTargetLocalNed: self._on_local_target,
-            m.RadioStatus: self._on_radio,
-            m.Radio: self._on_radio,
             m.ParamValue: self._on_parameter,
             m.AutopilotVersion: self._on_version,
             m.HomePosition: self._on_home,
@@ -349,13 +351,13 @@ class _Reader:
 
     def _on_global_target(self, time_s: float, message: m.PositionTargetGlobalInt) -> None:
         if message.type_mask & _NO_POSITION != _NO_POSITION and (message.lat_int or message.lon_int):
-            is_amsl = message.coordinate_frame in (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
+            frame = canonical_frame(message.coordinate_frame)  # an altitude above terrain stays unknown
             self._destinations.add(
                 time_s,
                 message.lat_int / _E7,
                 message.lon_int / _E7,
-                message.alt if is_amsl else NAN,
-                NAN if is_amsl else message.alt,
+                message.alt if frame == MavFrame.GLOBAL else NAN,
+                message.alt if frame == MavFrame.GLOBAL_RELATIVE_ALT else NAN,
             )
         self._add_velocity_target(time_s, message)
 

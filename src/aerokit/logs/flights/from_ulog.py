@@ -84,12 +84,12 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
         ModuleNotFoundError: pyulog is not installed.
     """
     pyulog = import_module("pyulog")
-    try:
-        # pyulog prints messages about damaged files to stdout, where the JSON of a command may go.
-        with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file, redirect_stdout(sys.stderr):
+    # pyulog prints messages about damaged files to stdout, where the JSON of a command may go.
+    with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file, redirect_stdout(sys.stderr):
+        try:
             log = pyulog.ULog(file, list(_TOPICS))
-    except Exception as error:  # pyulog raises arbitrary errors for other files
-        raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
+        except Exception as error:  # pyulog raises arbitrary errors for other files
+            raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
     if not log.data_list and not log.logged_messages:
         raise FileFormatError(f"{flight.path} contains no data of a flight")
     if log.file_corruption:
@@ -129,6 +129,13 @@ class _Topic:
             if field in self._data:
                 return self._data[field].astype("float64")
         return self._data["timestamp"] * NAN
+
+    def valid_array(self, field: str, flag: str) -> Any:
+        """Return a column with NaN where its flag is 0. Old versions of PX4 do not have all flags."""
+        values = self.array(field)
+        if flag in self:
+            values[self.array(flag) == 0] = NAN
+        return values
 
     def rows(self, *fields: str) -> Iterator[tuple[Any, ...]]:
         """Yield the time and the values of each row. Fields that the topic does not have are NaN."""
@@ -250,17 +257,15 @@ class _Reader:
                 flight.set_home(time_s, home_latitude, home_longitude, home_amsl)
         position = self._topic("vehicle_global_position")
         if position is not None:
-            latitude, longitude, amsl = position.array("lat"), position.array("lon"), position.array("alt")
-            if "lat_lon_valid" in position:
-                is_invalid = position.array("lat_lon_valid") == 0
-                latitude[is_invalid] = NAN
-                longitude[is_invalid] = NAN
+            latitude, longitude = (position.valid_array(field, "lat_lon_valid") for field in ("lat", "lon"))
+            amsl = position.valid_array("alt", "alt_valid")
             _extend(flight.track, position.times, latitude_deg=latitude, longitude_deg=longitude, altitude_amsl_m=amsl)
         else:
             self._read_receiver_track()
         local = self._topic("vehicle_local_position")
         if local is not None:
-            north, east, down = local.array("vx"), local.array("vy"), local.array("vz")
+            north, east = (local.valid_array(field, "v_xy_valid") for field in ("vx", "vy"))
+            down = local.valid_array("vz", "v_z_valid")
             _extend(flight.velocity, local.times, north_m_s=north, east_m_s=east, down_m_s=down)
         self._add_angles(flight.attitude, self._topic("vehicle_attitude"), "q")
         air = self._topic("airspeed_validated")

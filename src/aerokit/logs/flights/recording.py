@@ -62,6 +62,8 @@ class LinkCounter:
         the last call; the newest one has ``time_s`` and ``sequence``. ``expected`` is the sequence number that it would
         have without a loss; negative for the first frame.
         """
+        if expected < 0:
+            self._second = int(time_s)  # nothing is known to be lost before the first frame
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
             missing = 0

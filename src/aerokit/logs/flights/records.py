@@ -10,7 +10,7 @@ from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import FileFormatError
 from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.framer import Framer
-from aerokit.mavlink.messages import AutopilotVersion, Heartbeat, ParamSet, ParamValue
+from aerokit.mavlink.messages import AutopilotVersion, Heartbeat, ParamSet, ParamValue, Statustext
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.parameters.encoding import value_of
 from aerokit.vehicle.state.states import SOURCES
@@ -92,15 +92,17 @@ class TlogReader(LogReader):
         super().__init__(path)
         self._vehicles: dict[int, _VehicleStates] = {}
         self._framer = Framer()
-        # By system id: the autopilot, and its capabilities, which show how it encodes parameters.
-        self._autopilots: dict[int, Autopilot] = {}
-        self._capabilities: dict[int, int] = {}
+        # The autopilot of a system, with its component id, and the capabilities of each component, by system and
+        # component id. They show how an autopilot encodes parameters.
+        self._autopilots: dict[int, tuple[int, Autopilot]] = {}
+        self._capabilities: dict[tuple[int, int], int] = {}
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
         """Yield all messages of the standard dialect that have a valid checksum.
 
-        ``param_value`` of PARAM_VALUE and PARAM_SET is always the value of the parameter. PX4 sends an integer's bits
-        in this field, which are decoded.
+        ``param_value`` of PARAM_VALUE and PARAM_SET is the value of an autopilot's parameter. PX4 sends an integer's
+        bits in this field, which are decoded once a heartbeat of the autopilot was read. Values of other components
+        stay as they were sent, because their encoding is unknown.
         """
         framer, decode = self._framer, STANDARD.decode
         count = 0
@@ -114,28 +116,30 @@ class TlogReader(LogReader):
                     message = decode(frame)
                     system_id, component_id = frame.system_id, frame.component_id
                     if frame.message_id in _PARAMETER_IDS:
-                        message = self._decode_parameter(message, system_id)
+                        message = self._decode_parameter(message, system_id, component_id)
                     if self.needs_states:
                         states = self._states(system_id, component_id, unix_s, message)
                     yield LogRecord(unix_s, system_id, component_id, message.NAME, _NO_FIELDS, states, message)
             on_bytes(file.tell())
         self._check_and_note(count)
 
-    def _decode_parameter(self, message: Message, system_id: int) -> Message:
-        """Replace the value in PARAM_VALUE and PARAM_SET by the decoded value. Other messages stay the same.
+    def _decode_parameter(self, message: Message, system_id: int, component_id: int) -> Message:
+        """Replace an autopilot's value in PARAM_VALUE and PARAM_SET by the decoded value. Others stay the same.
 
         HEARTBEAT and AUTOPILOT_VERSION are evaluated, because they show how a vehicle encodes integer parameters.
         """
         if isinstance(message, Heartbeat):
             if system_id not in self._autopilots and is_autopilot(message):
-                self._autopilots[system_id] = autopilot_for(message)
+                self._autopilots[system_id] = component_id, autopilot_for(message)
         elif isinstance(message, AutopilotVersion):
-            self._capabilities[system_id] = message.capabilities
+            self._capabilities[system_id, component_id] = message.capabilities
         elif isinstance(message, (ParamValue, ParamSet)):
-            owner = message.target_system if isinstance(message, ParamSet) else system_id
-            autopilot = self._autopilots.get(owner)
-            if autopilot is not None:
-                value = value_of(message, autopilot.encodes_parameters_bytewise(self._capabilities.get(owner)))
+            if isinstance(message, ParamSet):
+                system_id, component_id = message.target_system, message.target_component
+            autopilot_id, autopilot = self._autopilots.get(system_id, (0, None))
+            if autopilot is not None and component_id in (0, autopilot_id):  # 0 means all components
+                capabilities = self._capabilities.get((system_id, autopilot_id))
+                value = value_of(message, autopilot.encodes_parameters_bytewise(capabilities))
                 return type(message)(**{**message.to_dict(), "param_value": float(value)})
         return message
 
@@ -190,9 +194,9 @@ class _VehicleStates:
         self.component_id = component_id
         self._now = 0.0
         self._telemetry = Telemetry(lambda: self._now, system_id=system_id, component_id=component_id)
-        # Maps the name of a message class to the names of the states that are decoded from it.
+        # Maps the name of a message class to the names of the states that are decoded from it, except "status_text".
         self._states_by_message: dict[str, tuple[str, ...]] = {
-            name: tuple(field.name for field, _ in rows) for name, rows in SOURCES.items()
+            name: tuple(field.name for field, _ in rows) for name, rows in SOURCES.items() if name != "Statustext"
         }
         self._expired_at = 0.0
 
@@ -201,14 +205,18 @@ class _VehicleStates:
         now = max(unix_s, self._now + 1e-6)  # always increases, although the clock may have been set back
         self._now = now
         telemetry = self._telemetry
+        may_have_texts = isinstance(message, Statustext)
         names = self._states_by_message.get(type(message).__name__, ())
-        if names:
+        if names or may_have_texts:
             if message.received_frame is not None:
                 message.received_frame.received_at = now  # becomes the time of the states
             telemetry.receive(message)
         if now - self._expired_at > 1.0:
             telemetry.expire(now)  # publishes status texts whose last parts are missing
             self._expired_at = now
-            names = (*names, "status_text")
+            may_have_texts = True
         cells = telemetry.cells
-        return tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)
+        states = tuple((name, cells[name].latest) for name in names if cells[name].updated_at == now)
+        if may_have_texts:  # One message may complete a text and end the wait for the rest of another.
+            states += tuple(("status_text", text) for text in telemetry.texts_since(now))
+        return states

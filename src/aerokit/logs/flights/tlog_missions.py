@@ -9,6 +9,7 @@ from aerokit.errors import RemoteProtocolError
 from aerokit.logs.flights.flight import Waypoint
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFtpOpcode, MavMissionType
+from aerokit.missions.item import GLOBAL_FRAMES, has_place
 from aerokit.missions.wire import HEADER, NO_CLEAR, PACKED_PATHS, read_header, to_wire, unpack_items
 from aerokit.protocols.ftp import FtpMessage
 
@@ -84,7 +85,8 @@ class RecordedMission:
 
     def _add(self, message: m.MissionItemInt | m.MissionItem) -> None:
         scale = _DEGREES_E7 if isinstance(message, m.MissionItemInt) else 1.0
-        has_position = bool(message.x or message.y)
+        # In other frames, x and y are no degrees. Commands without a place use them for parameters 5 and 6.
+        has_position = message.frame in GLOBAL_FRAMES and has_place(message.command) and (message.x or message.y)
         self._items[message.seq] = Waypoint(
             number=message.seq,
             command=message.command,

@@ -19,10 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Paragraphs:
-    """Paragraphs of text, or a list of texts."""
+    """Paragraphs of text."""
 
     lines: Sequence[str]
-    is_list: bool = False
 
 
 @dataclass(frozen=True)
@@ -195,8 +194,7 @@ def _part(part: Part) -> Iterator[str]:
             f' role="img" aria-label="{_escape(part.label)}"><noscript>{_escape(part.label)}</noscript></div>'
         )
     elif isinstance(part, Paragraphs):
-        tag = "li" if part.is_list else "p"
-        yield from (f"<{tag}>{_escape(line)}</{tag}>" for line in part.lines)
+        yield from (f"<p>{_escape(line)}</p>" for line in part.lines)
     elif isinstance(part, Collapsed):
         yield f'<details data-print="no"><summary>{_escape(part.title)}</summary>'
         for collapsed_part in part.parts:

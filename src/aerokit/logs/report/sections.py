@@ -79,7 +79,7 @@ def _modes(flight: FlightLog) -> Section:
         for begin, end in flight.armed
     ]
     times = Table(("armed", "disarmed", "duration"), armed, f"armed {len(armed)} times")
-    return Section("Modes", [mode_table(flight), times if armed else Paragraphs(["never armed"])])
+    return Section("Modes", [mode_table(flight), times if armed else Paragraphs(["No arming was logged."])])
 
 
 def mode_table(flight: FlightLog) -> Table:

@@ -27,7 +27,7 @@ def simplify(
         max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. Only
             the ends of gaps, the points of ``keep`` and about one point in a thousand are selected beyond it.
         tolerance: maximum distance of an omitted point from the line through the selected points.
-        keep: indices that are always selected.
+        keep: indices that are selected if their coordinates are known.
 
     Returns:
         The selected indices, including one index for each gap, and the largest distance of an omitted point from the

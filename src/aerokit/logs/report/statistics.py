@@ -158,7 +158,7 @@ class _ArmedSpans:
         return known
 
     def mean(self, columns: TimeSeries, name: str) -> float | None:
-        """Return the average over time. A value counts until the next row, the last value for a second."""
+        """Return the average of the rows in the spans. A value counts until the next row, the last one for a second."""
         times, values = columns.times, columns[name]
         total, weight = 0.0, 0.0
         for begin, end in self._spans:
@@ -186,12 +186,13 @@ def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> floa
     counted: tuple[float, float] | None = None  # the end of the last step that `length_m` includes
     previous_row = None
     for row in rows:
-        is_start_of_span = previous_row != row - 1
+        if previous_row != row - 1:  # A span begins. The way from the end of the previous span is unknown.
+            counted = None
         previous_row = row
         point = north_east[row]
         if math.isnan(math.hypot(*point)):
             continue
-        if counted is None or is_start_of_span:
+        if counted is None:
             counted = point
             continue
         step = math.dist(point, counted)
@@ -358,7 +359,7 @@ def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
 
 def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
     if statistics.armed_s is None:
-        return f"Never armed: {span(flight.duration_s)} on the ground."
+        return f"No arming was logged in {span(flight.duration_s)}."
     parts = [f"{span(statistics.armed_s)} armed{_until_impact(flight, statistics.armed_s)}"]
     if statistics.distance_m is not None:
         parts.append(f"{length(statistics.distance_m)} flown over ground")
@@ -424,9 +425,9 @@ def _failsafes_sentence(flight: FlightLog) -> str:
 
 
 def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
-    """Return the parameters that decide on the reaction to these kinds of failsafes, if the log has none of a kind.
+    """Return the parameters that decide on the reaction, for each kind of failsafe of which the log has no parameter.
 
-    For each such kind, these are the parameters that choose or enable the action or, without any, all.
+    These are the parameters of the kind whose names have ACT or ENABL, or all if no name has.
     """
     unknown: list[str] = []
     for kind in dict.fromkeys(kinds):
