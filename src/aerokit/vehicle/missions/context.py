@@ -11,9 +11,10 @@ import anyio
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import ConnectionClosed
 from aerokit.events import MissionCurrentChanged, MissionFinished, MissionItemReached
-from aerokit.mavlink.enums import MissionState
-from aerokit.mavlink.messages import MissionCurrent
+from aerokit.mavlink.enums import MavMissionResult, MissionState
+from aerokit.mavlink.messages import MissionAck, MissionCurrent
 from aerokit.position import position_with_altitude
+from aerokit.protocols.exchange import is_addressed_to
 from aerokit.vehicle.state.condition import MissionProgress
 
 if TYPE_CHECKING:
@@ -50,11 +51,12 @@ class PlanCache:
     def __init__(self) -> None:
         self.items: tuple[MissionItem, ...] | None = None
         self.updated_at: float = -math.inf
+        self.plan_id: int = 0  # the vehicle's id of these items; 0 if it reports none
         # True if the vehicle offers the plan as a file; None until tried.
         self.has_file: bool | None = None
 
-    def set(self, items: Sequence[MissionItem], now: float) -> None:
-        self.items, self.updated_at = tuple(items), now
+    def set(self, items: Sequence[MissionItem], now: float, plan_id: int = 0) -> None:
+        self.items, self.updated_at, self.plan_id = tuple(items), now, plan_id
 
     def forget(self, now: float) -> None:
         self.items, self.updated_at = None, now
@@ -79,7 +81,8 @@ class PlanContext:
         self._current: Frame | None = None  # the last MISSION_CURRENT, decoded when it is needed
         session = vehicle_context.session
         session.at_close(
-            session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id)
+            session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id),
+            session.connection.bus.attach(MissionAck, self._on_ack, system_id=session.system_id),
         )
         self.tracker: MissionTracker = MissionTracker(session)
 
@@ -128,6 +131,15 @@ class PlanContext:
     def _on_current(self, frame: Frame) -> None:
         if self.session.telemetry.accepts(frame):
             self._current = frame
+
+    def _on_ack(self, ack: MissionAck) -> None:
+        """Forget a plan when the vehicle accepts one of another station. This is received only on a shared link."""
+        frame, connection = ack.received_frame, self.session.connection
+        is_from_autopilot = frame is not None and frame.component_id == self.session.component_id
+        is_ours = is_addressed_to(ack, connection.source_system, connection.source_component)
+        is_accepted = ack.type == MavMissionResult.ACCEPTED and ack.mission_type < len(self.caches)
+        if is_from_autopilot and is_accepted and not is_ours:
+            self.caches[ack.mission_type].forget(self.now())
 
 
 class MissionTracker:
