@@ -111,6 +111,7 @@ _ORDER: dict[str, Any] = {
         "order": {"type": "string"},
         "arguments": {"type": "object"},
         "given_unix_s": {"type": "number"},
+        "ended_unix_s": {"type": ["number", "null"], "description": "time of `done` or `failed`"},
         "state": {"enum": ["running", "done", "failed"]},
         "result": {},
         "problem": {"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]},

@@ -365,12 +365,15 @@ export class OrderPanel {
     this.drawn = true;
     const shown = [...this.records.values()].reverse();
     this.node.replaceChildren(...shown.map((each) => element("div", { class: "text" },
-      element("time", {}, clock(each.given_unix_s)),
+      element("time", {}, ...times(each).map((text) => element("div", {}, text))),
       element("span", {}, `vehicle ${each.system_id}: `, element("span", { class: shownState(each) }, ...unbroken(this.outcome(each))),
         each.problem && !each.replaced_by ? element("div", { class: "detail" }, inWords(each.problem)) : null))));
     if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders yet"));
   }
 }
+
+// When an order was given and when it reached its end, which may be the same second.
+const times = (record) => [...new Set([record.given_unix_s, record.ended_unix_s].filter(Boolean).map(clock))].map((text, index) => (index ? `– ${text}` : text));
 
 // An order that the next one replaced has not failed.
 export const shownState = (record) => (record.replaced_by ? "replaced" : record.state);
