@@ -24,7 +24,9 @@ from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import MavCmd
-from aerokit.mavlink.messages import AvailableModes
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.messages import AvailableModes, ParamValue
+from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import (
     Fence,
     FenceCircle,
@@ -389,6 +391,18 @@ async def test_failsafe_is_named_from_parameters(
         for name, value in values.items():
             await vehicle.parameters.set(name, value)
         assert ground_station_failsafe(vehicle)["action"] == action
+
+
+async def test_recording_has_parameters_that_were_read(tmp_path: Path) -> None:
+    """A report reads PARAM_VALUE, so MAVFTP is not used during a recording."""
+    path = tmp_path / "flight.tlog"
+    async with open_stage() as stage:
+        stage.flight.vehicle.connection.record(path)
+        answer = await stage.client.get("/api/vehicles/1/parameters", headers=BEARER)
+        assert len(answer.json()["parameters"]) == len(stage.flight.copter.parameters)
+    frames = Framer().receive(b"".join(raw for _, raw in read_tlog(path)), 0.0)
+    recorded = {ParamValue.decode_body(frame.body).param_id for frame in frames if frame.message_id == ParamValue.ID}
+    assert recorded >= set(stage.flight.copter.parameters)
 
 
 async def test_parameters_have_metadata(tmp_path: Path) -> None:

@@ -426,8 +426,10 @@ class HttpApi:
     async def _parameters(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
         is_refresh = self._is_refresh(request)
+        # A report reads the parameters of a recording from PARAM_VALUE, not from MAVFTP.
+        is_recorded = vehicle.connection._observers.recording is not None
         async with self._lock(vehicle):
-            table = await vehicle.parameters.download(refresh=is_refresh)
+            table = await vehicle.parameters.download(method="list" if is_recorded else "auto", refresh=is_refresh)
         metadata = self._metadata_of(vehicle)
         return json_response({"parameters": [_parameter(table[name], metadata) for name in sorted(table)]})
 
