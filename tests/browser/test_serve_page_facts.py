@@ -236,6 +236,8 @@ SHOWS_ITEMS = """(wanted) => {
     return JSON.stringify(items.sort()) === JSON.stringify(wanted);
 }"""
 
+PLACE_OF_ITEM = "() => document.querySelector('#map .item').getBoundingClientRect().y"
+
 
 def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
     with page_of(browser) as (copter, page):
@@ -251,8 +253,13 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         page.locator("dialog .detail", has_text="It keeps its rally points, because the file has none.").wait_for()
         page.wait_for_function(SHOWS_ITEMS, arg=["1", "2"])
         picture(page, "preview")
-        cancel(page)
+        place_before = page.evaluate(PLACE_OF_ITEM)
+        page.click("#zoom-in")
+        page.wait_for_function(f"before => ({PLACE_OF_ITEM})() !== before", arg=place_before)
+        assert page.locator("#orders").evaluate("orders => orders.inert")
+        page.keyboard.press("Escape")
         page.locator("dialog[open]").wait_for(state="detached")
+        assert not page.locator("#orders").evaluate("orders => orders.inert")
         page.wait_for_function(SHOWS_ITEMS, arg=[])
         far = here.offset(east_m=25_000)
         plan = Plan(Mission([waypoint(far.latitude_deg, far.longitude_deg, altitude_relative_m=15)]))
