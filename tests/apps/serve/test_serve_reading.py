@@ -23,9 +23,10 @@ from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavMissionResult
 from aerokit.mavlink.framer import Framer
-from aerokit.mavlink.messages import AvailableModes, ParamValue
+from aerokit.mavlink.messages import AvailableModes, MissionAck, ParamValue
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import (
     Fence,
@@ -83,6 +84,23 @@ async def test_mission_with_changed_count_is_downloaded_again() -> None:
         await mission.upload(Mission([take_off(altitude_relative_m=10), return_to_launch()]))
         await anyio.sleep(3)
         assert await names() == ["NAV_TAKEOFF", "NAV_RETURN_TO_LAUNCH"]
+
+
+async def test_mission_of_same_length_is_downloaded_again() -> None:
+    """Another program has uploaded it, whose answer from the vehicle arrives on a shared link."""
+    async with open_stage() as stage:
+        mission, copter = stage.flight.vehicle.mission, stage.flight.copter
+
+        async def names() -> list[str]:
+            answer = await stage.client.get("/api/vehicles/1/mission", headers=BEARER)
+            return [each["name"] for each in answer.json()["items"]]
+
+        await mission.upload(Mission([take_off(altitude_relative_m=10)]))
+        assert await names() == ["NAV_TAKEOFF"]
+        copter.missions.replace(0, Mission([return_to_launch()]).to_items(home_is_item_0=True))
+        assert await names() == ["NAV_TAKEOFF"]
+        stage.flight.wire.deliver(FrameEncoder(1, 1).encode(MissionAck(254, 190, MavMissionResult.ACCEPTED)))
+        assert await names() == ["NAV_RETURN_TO_LAUNCH"]
 
 
 @pytest.mark.parametrize("is_open", [True, False])

@@ -52,14 +52,17 @@ class PlanCache:
         self.items: tuple[MissionItem, ...] | None = None
         self.updated_at: float = -math.inf
         self.plan_id: int = 0  # the vehicle's id of these items; 0 if it reports none
+        self.changes: int = 0  # number of calls of `set` and `forget`
         # True if the vehicle offers the plan as a file; None until tried.
         self.has_file: bool | None = None
 
     def set(self, items: Sequence[MissionItem], now: float, plan_id: int = 0) -> None:
         self.items, self.updated_at, self.plan_id = tuple(items), now, plan_id
+        self.changes += 1
 
     def forget(self, now: float) -> None:
-        self.items, self.updated_at = None, now
+        self.items, self.updated_at, self.plan_id = None, now, 0
+        self.changes += 1
 
 
 class PlanContext:
@@ -111,6 +114,15 @@ class PlanContext:
         current = MissionCurrent.decode_body(frame.body)
         ids_by_mission_type = (current.mission_id, current.fence_id, current.rally_points_id)
         return ids_by_mission_type[mission_type]
+
+    def version(self, mission_type: int) -> tuple[int, int]:
+        """Return a value that changes with the vehicle's plan, as far as this program receives the change.
+
+        It consists of the number of transfers, also of other stations on a shared link, and of the plan's id (PX4
+        only).
+        """
+        cache = self.caches[mission_type]
+        return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
         """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""

@@ -371,8 +371,8 @@ class MissionControl(VehiclePlan["Mission"]):
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
         cache = self._context.caches[MavMissionType.MISSION]
         items = (cache.items or ())[self._context.offset_of(MavMissionType.MISSION) :]
-        reported_id = self._context.plan_id(MavMissionType.MISSION, cache.updated_at)
-        has_other_id = bool(cache.plan_id and reported_id) and reported_id != cache.plan_id
+        _, plan_id = self._version
+        has_other_id = cache.plan_id != 0 and plan_id != cache.plan_id
         if has_other_id or self._tracker.count.latest not in (None, len(items)):
             items = ()  # Another ground station has replaced the mission, so its items are unknown.
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
