@@ -17,7 +17,7 @@ from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.exchange import IDLE_TIMEOUT_S, RoundTrip, is_addressed_to
-from aerokit.vehicle.parameters.store import ParameterStore
+from aerokit.vehicle.parameters.store import IN_FLIGHT_S, ParameterStore
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -344,6 +344,10 @@ class ParameterAccess:
             # A late answer with the previous value must not replace the new one in the store.
             if name in old_values and answer.value != old_values[name]:
                 self.store.mark_replaced(name, old_values[name])
+            stored = self.store.get(name)
+            if stored is not None and not same_value(stored.value, answer.value):
+                # Another value arrived after the answer, while other parameters were written. It may be a late one.
+                self._read_later(name, transfers.connection.now() + IN_FLIGHT_S)
         return answers
 
     def _forget_written(self, names: Iterable[str]) -> None:
