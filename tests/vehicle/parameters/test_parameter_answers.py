@@ -114,7 +114,7 @@ async def test_echo_of_previous_write_confirms_nothing(grounded: Flight) -> None
     assert copter.parameters["LAND_SPEED"] == 61
 
 
-async def test_late_value_during_writes_of_others_does_not_stay_in_table(grounded: Flight) -> None:
+async def test_late_value_during_other_writes_does_not_stay(grounded: Flight) -> None:
     """The late answer to a read arrives after the confirmation, but before those of the other parameters."""
     copter, parameters = grounded.copter, grounded.vehicle.parameters
     await parameters.get("LAND_SPEED")

@@ -11,7 +11,7 @@ import anyio
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import ConnectionClosed
 from aerokit.events import MissionCurrentChanged, MissionFinished, MissionItemReached
-from aerokit.mavlink.enums import MavMissionResult, MissionState
+from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MissionState
 from aerokit.mavlink.messages import MissionAck, MissionCurrent
 from aerokit.position import position_with_altitude
 from aerokit.protocols.exchange import is_addressed_to
@@ -149,9 +149,11 @@ class PlanContext:
         frame, connection = ack.received_frame, self.session.connection
         is_from_autopilot = frame is not None and frame.component_id == self.session.component_id
         is_ours = is_addressed_to(ack, connection.source_system, connection.source_component)
-        is_accepted = ack.type == MavMissionResult.ACCEPTED and ack.mission_type < len(self.caches)
-        if is_from_autopilot and is_accepted and not is_ours:
-            self.caches[ack.mission_type].forget(self.now())
+        if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:
+            return
+        for mission_type, cache in enumerate(self.caches):
+            if ack.mission_type in (mission_type, MavMissionType.ALL):
+                cache.forget(self.now())
 
 
 class MissionTracker:
