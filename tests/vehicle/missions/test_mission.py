@@ -113,12 +113,13 @@ async def test_mission_with_another_id_is_flown_to_landing() -> None:
         assert flight.vehicle.landed_state.value == MavLandedState.ON_GROUND
 
 
-async def test_mission_accepted_from_another_station_is_finished_in_air() -> None:
-    """On a shared link, ArduPilot's answer to the other station shows that the mission was replaced."""
+@pytest.mark.parametrize("station", [(254, 190), (255, 190)])
+async def test_mission_accepted_from_another_station_is_finished_in_air(station: tuple[int, int]) -> None:
+    """On a shared link, ArduPilot's answer to the other station, which may have our ids, shows a new mission."""
     async with armed(open_flight, return_to_launch()) as flight:
         replacement = short_mission(flight, waypoint(*near_home(18), altitude_relative_m=4))
         flight.copter.missions.replace(MavMissionType.MISSION, replacement.to_items(home_is_item_0=True))
-        flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(254, 190, MavMissionResult.ACCEPTED)))
+        flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(*station, MavMissionResult.ACCEPTED)))
         await flight.vehicle.mission.start()
         await flight.vehicle.mission.wait_finished(timeout=600)
         assert flight.vehicle.landed_state.value == MavLandedState.IN_AIR

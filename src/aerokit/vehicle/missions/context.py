@@ -145,10 +145,15 @@ class PlanContext:
             self._current = frame
 
     def _on_ack(self, ack: MissionAck) -> None:
-        """Forget a plan when the vehicle accepts one of another station. This is received only on a shared link."""
+        """Forget a plan when the vehicle accepts one of another station. This is received only on a shared link.
+
+        Another station may have the same ids as this program (255 and 190 by default), so an answer outside of a
+        transfer is not for this program either.
+        """
         frame, connection = ack.received_frame, self.session.connection
         is_from_autopilot = frame is not None and frame.component_id == self.session.component_id
-        is_ours = is_addressed_to(ack, connection.source_system, connection.source_component)
+        is_addressed = is_addressed_to(ack, connection.source_system, connection.source_component)
+        is_ours = is_addressed and self.lock.locked()
         if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:
             return
         for mission_type, cache in enumerate(self.caches):
