@@ -199,8 +199,9 @@ def test_fly_of_invalid_file_fails(content: str, code: int, text: str, capsys: p
 
 def test_fly_contradicting_options_exit_with_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*FLY, "--sim", "--connect", "tcp:127.0.0.1:1"]) == 2
-    assert main([*FLY, "--vehicle", "plane"]) == 2
-    assert "--vehicle needs --sim" in capsys.readouterr().err
+    for option, value in (("--vehicle", "plane"), ("--speedup", "5")):
+        assert main([*FLY, option, value]) == 2
+        assert f"{option} needs --sim" in capsys.readouterr().err
 
 
 # -------------------------------------------------------------------------------------- Ctrl-C

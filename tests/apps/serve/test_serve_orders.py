@@ -311,6 +311,7 @@ async def test_disconnected_client_does_not_cancel_command() -> None:
         assert stage.flight.vehicle.position.value.distance_to(there) < 3
         record = await stage.client.get("/api/orders/gone-away", headers=BEARER)
         assert record.json()["state"] == "done"
+        assert 3 < record.json()["ended_unix_s"] - record.json()["given_unix_s"] < 33
 
 
 async def test_newer_command_overrules_older_one() -> None:

@@ -23,8 +23,11 @@ from aerokit.apps.serve.failsafe import ground_station_failsafe
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavCmd
-from aerokit.mavlink.messages import AvailableModes
+from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavMissionResult
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.messages import AvailableModes, MissionAck, ParamValue
+from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import (
     Fence,
     FenceCircle,
@@ -81,6 +84,23 @@ async def test_mission_with_changed_count_is_downloaded_again() -> None:
         await mission.upload(Mission([take_off(altitude_relative_m=10), return_to_launch()]))
         await anyio.sleep(3)
         assert await names() == ["NAV_TAKEOFF", "NAV_RETURN_TO_LAUNCH"]
+
+
+async def test_mission_of_same_length_is_downloaded_again() -> None:
+    """Another program has uploaded it, whose answer from the vehicle arrives on a shared link."""
+    async with open_stage() as stage:
+        mission, copter = stage.flight.vehicle.mission, stage.flight.copter
+
+        async def names() -> list[str]:
+            answer = await stage.client.get("/api/vehicles/1/mission", headers=BEARER)
+            return [each["name"] for each in answer.json()["items"]]
+
+        await mission.upload(Mission([take_off(altitude_relative_m=10)]))
+        assert await names() == ["NAV_TAKEOFF"]
+        copter.missions.replace(0, Mission([return_to_launch()]).to_items(home_is_item_0=True))
+        assert await names() == ["NAV_TAKEOFF"]
+        stage.flight.wire.deliver(FrameEncoder(1, 1).encode(MissionAck(254, 190, MavMissionResult.ACCEPTED)))
+        assert await names() == ["NAV_RETURN_TO_LAUNCH"]
 
 
 @pytest.mark.parametrize("is_open", [True, False])
@@ -389,6 +409,18 @@ async def test_failsafe_is_named_from_parameters(
         for name, value in values.items():
             await vehicle.parameters.set(name, value)
         assert ground_station_failsafe(vehicle)["action"] == action
+
+
+async def test_recording_has_parameters_that_were_read(tmp_path: Path) -> None:
+    """A report reads PARAM_VALUE, so MAVFTP is not used during a recording."""
+    path = tmp_path / "flight.tlog"
+    async with open_stage() as stage:
+        stage.flight.vehicle.connection.record(path)
+        answer = await stage.client.get("/api/vehicles/1/parameters", headers=BEARER)
+        assert len(answer.json()["parameters"]) == len(stage.flight.copter.parameters)
+    frames = Framer().receive(b"".join(raw for _, raw in read_tlog(path)), 0.0)
+    recorded = {ParamValue.decode_body(frame.body).param_id for frame in frames if frame.message_id == ParamValue.ID}
+    assert recorded >= set(stage.flight.copter.parameters)
 
 
 async def test_parameters_have_metadata(tmp_path: Path) -> None:

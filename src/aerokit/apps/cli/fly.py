@@ -226,7 +226,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_record(command)
     add_vehicle(command)
     add_json(command)
-    command.set_defaults(run=run_fly, connect=None)
+    command.set_defaults(run=run_fly, connect=None, simulation_actions=tuple(simulated._group_actions))
 
 
 async def run_fly(options: argparse.Namespace) -> int:
@@ -255,16 +255,9 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
         raise InvalidArgument(f"{options.file} has no mission items, so there is nothing to fly")
     if options.sim and options.connect is not None:
         raise InvalidArgument("--sim and --connect cannot be used together")
-    simulation_options = {
-        "--vehicle": options.vehicle,
-        "--parameter": options.parameters or None,
-        "--wind": options.wind,
-        "--battery": options.battery,
-        "--fault": options.faults or None,
-    }
-    for name, value in simulation_options.items():
-        if value is not None and not options.sim:
-            raise InvalidArgument(f"{name} needs --sim")
+    for action in options.simulation_actions:
+        if getattr(options, action.dest) != action.default and not options.sim:
+            raise InvalidArgument(f"{action.option_strings[0]} needs --sim")
     if not (options.sim or options.yes or is_interactive()):
         raise InvalidArgument(
             "cannot ask for confirmation, because stdin is not a terminal; --yes omits the question; nothing was sent"

@@ -262,6 +262,7 @@ _RECORD_FIELDS = (
     "order",
     "arguments",
     "given_unix_s",
+    "ended_unix_s",
     "state",
     "result",
     "problem",
@@ -278,6 +279,7 @@ class OrderRecord:
     order: str
     arguments: dict[str, Any]
     given_unix_s: float
+    ended_unix_s: float | None = None
     state: str = "running"
     result: Any = None
     problem: dict[str, Any] | None = None
@@ -419,6 +421,7 @@ class OrderRunner:
             if record.problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
+            record.ended_unix_s = vehicle.connection.unix_time()
             record.ended.set()
             self._publish(record)
 

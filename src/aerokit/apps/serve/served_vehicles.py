@@ -242,6 +242,7 @@ class ServedVehicles:
             "active_failsafe": active_failsafe(vehicle),
             "mission_item": vehicle.mission.current.latest,
             "mission_items": vehicle.mission.count.latest,
+            "mission_version": list(vehicle.mission._version),
             "is_flying_mission": _is_flying_mission(vehicle),
             "unarmable_mode": unarmable_mode(vehicle),
         }

@@ -248,6 +248,9 @@ class Px4Vehicle(Px4Host):
         self._next_text_id = (text_id + 1) & 0xFFFF
         self.call_later(0.0, lambda: self.send_chunks(severity, text, text_id))
 
+    def on_speedup(self, speedup: float) -> None:
+        self.text_links.speedup = speedup
+
     def send_parts(self, chunks: list[m.Statustext]) -> None:
         self.text_links.send(chunks)
 

@@ -169,6 +169,10 @@ class Telemetry(States):
         """Return the status texts received at or after this time (64 at most), oldest first."""
         return self._texts.recent(at)
 
+    def texts_about_failsafes(self) -> tuple[StatusText, ...]:
+        """Return the last status texts (64 at most) about failsafes and problems in flight, oldest first."""
+        return self._texts.about_failsafes()
+
     # ------------------------------------------------------------------------ updating cells
 
     def _cell_of(self, name: str) -> StateCell[Any]:
