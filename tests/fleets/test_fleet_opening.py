@@ -18,7 +18,7 @@ from aerokit.errors import (
     OperationRejected,
     SubscriptionOverflow,
 )
-from aerokit.fleets.events import FleetEvent, MemberEvent, MemberTakenOver, StateUpdate
+from aerokit.fleets.events import FleetEvent, MemberEvent, MemberReclaimed, MemberTakenOver, StateUpdate
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.policy import FleetResult, MemberFailure, PolicyRules
 from aerokit.missions import Mission
@@ -293,3 +293,15 @@ def test_blocking_twin_flies_fleet() -> None:
 
 def test_fleet_twins_match_generator_output() -> None:
     assert FILES["fleet_twins"].read_text(encoding="utf-8") == generate("fleet_twins")
+
+
+async def test_events_of_base_class_has_events_of_fleet_and_vehicles() -> None:
+    async with open_stage(1) as stage:
+        with stage.fleet.events(events.Event) as received:
+            stage.fleet.release("north/1")
+            stage.fleet.reclaim("north/1")
+            await stage.fleet.set_mode("GUIDED")
+            found = set()
+            while (event := received.get_nowait()) is not None:
+                found.add(type(event))
+            assert found == {MemberReclaimed, MemberEvent}

@@ -94,9 +94,12 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
 
     def on_timesync(message: Timesync) -> None:
         frame = message.received_frame
-        sent_at = sent_at_by_timestamp.pop(message.ts1, None)
         is_answer = message.tc1 != 0
-        if frame is None or sent_at is None or not is_answer or frame.component_id != vehicle.component_id:
+        # Other components of the vehicle answer the same requests, by their own clocks.
+        if frame is None or not is_answer or frame.component_id != vehicle.component_id:
+            return
+        sent_at = sent_at_by_timestamp.pop(message.ts1, None)
+        if sent_at is None:
             return
         round_trip_s = frame.received_at - sent_at
         answered_at = sent_at + round_trip_s / 2  # if both directions take the same time

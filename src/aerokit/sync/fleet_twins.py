@@ -120,16 +120,17 @@ class Selection(SelectionTwin["AsyncSelection"]):
             speed_m_s: ground speed in m/s; None: unchanged.
             max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
-            stagger_s: delay in seconds between the starts of consecutive members; None: all at once. Not for corridors.
-            separation: result of :meth:`plan_separation` for these targets.
+            stagger_s: delay in seconds between the starts of consecutive members, on each leg; None: all at once. Not
+                for corridors.
+            separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
             InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` would change the delays of
                 corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
-            OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
-                unavailable after the separation was planned. Then nothing was sent, or after a leg the others stay in
-                their layers.
+            OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
+                members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
+                Then the others stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -153,7 +154,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> Deconfliction:
         """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
-        Members without a target count as obstacles at their current positions. Publishes :class:`PathsCompared`.
+        Members without a target count as obstacles at their last known positions. Publishes :class:`PathsCompared`.
 
         Args:
             targets: as for :meth:`go_to`.
@@ -251,9 +252,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds for each member and each leg; None: no limit.
 
         Raises:
-            InvalidArgument: a name is unknown, or two places are too close. Nothing was sent.
+            InvalidArgument: a name is unknown, two places are too close, or the speed is not allowed. Nothing was sent.
             OperationRejected: the leader is unavailable, or paths come too close. Nothing was sent.
-            ValueUnknownError: the position of the leader or of a follower is unknown.
+            ValueUnknownError: the position of the leader or of a follower, or a heading that is needed, is unknown.
         """
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
@@ -335,6 +336,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             timeout: seconds until all members have finished; None: no limit.
+
+        Raises:
+            OperationRejected: the last upload failed for a member, or had no mission for these members.
         """
         return self._loop.run(self.aio.wait_missions_finished, timeout=timeout)
 
@@ -346,8 +350,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced by the
-        member's present altitude.
+        Paths begin at the first item with a position: the members' way to it is not compared. Items without a position
+        are left out, and jumps are not followed. An altitude above terrain is replaced by the member's present
+        altitude.
 
         Args:
             missions: maps names of members to missions.
@@ -355,6 +360,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
+            OperationRejected: a member is unavailable.
             ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.call(self.aio.compare_missions, missions, min_distance_m=min_distance_m)
@@ -546,7 +552,7 @@ class Fleet(FleetTwin, Selection):
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended. Links before it have already got the corrections.
+            ConnectionClosed, LinkLost: a link has ended. The other links got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)
 
