@@ -67,6 +67,17 @@ async def test_fleet_numbers_unnamed_networks_and_selects_system_ids() -> None:
         assert list(fleet.members) == ["1/1", "1/3", "2/2"]
 
 
+async def test_fleet_keeps_number_as_name_of_vehicle() -> None:
+    async with (
+        simulated_link(copters(1)) as one,
+        simulated_link(copters(2)) as two,
+        aerokit.connect(one) as named,
+        aerokit.connect(two) as unnamed,
+        aerokit.fleet({"7": named}, unnamed) as fleet,
+    ):
+        assert list(fleet.members) == ["7", "2/2"]
+
+
 async def test_fleet_vehicle_already_connected_is_not_duplicated() -> None:
     async with (
         simulated_link(copters(1, 2)) as link,

@@ -194,11 +194,13 @@ def test_show_file_round_trip(tmp_path: FilePath) -> None:
         ("name,t_s,north_m,east_m,up_m\na,0,nan,2,3\n", "finite"),
         ("name,t_s,north_m,east_m,up_m\na,1,1,2,3\na,1,5,2,3\n", "two positions"),
         ("name,t_s,north_m,east_m,up_m\n", "a show needs at least one"),
+        ("name,t_s,north_m,east_m,up_m\na,0,1,2,3\n" + "a" * 200_000, "line 3: field larger than field limit"),
         ("{", "not JSON"),
         ('{"format": "other"}', "not a show"),
         ('{"format": "aerokit show", "version": 1}', 'the "tracks" of the show must be a JSON object'),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": [[0, 1]]}}', "track 'a'"),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": 5}}', "track 'a'"),
+        (f'{{"format": "aerokit show", "version": 1, "tracks": {{"a": [[1{"0" * 400}, 0, 0, 0]]}}}}', "track 'a'"),
     ],
 )
 def test_show_damaged_file_error_has_location(text: str, match: str, tmp_path: FilePath) -> None:

@@ -42,7 +42,8 @@ class Actions(SelectionBase):
             **options: keyword arguments of the method.
 
         Raises:
-            InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
+            InvalidArgument: there is no such action, or there are arguments for a function. Nothing was sent. If the
+                method refuses an argument, each member fails instead.
         """
         if isinstance(action, str):
             name = action
@@ -147,11 +148,12 @@ class Actions(SelectionBase):
     async def barrier(
         self, condition: Callable[[Member], bool], *, timeout: float = 60.0, description: str = "barrier"
     ) -> FleetResult:
-        """Wait until a condition is true for every member.
+        """Wait until a condition has been true for every available member, not necessarily at the same time.
 
         Args:
-            condition: function of a member; it is called four times a second and when the member's state changes.
-            timeout: seconds until the condition is true for all members.
+            condition: function of a member; it is called four times a second and when the member's state changes, until
+                it is true for this member.
+            timeout: seconds until the condition has been true for all members.
             description: name of the barrier in errors.
 
         Raises:

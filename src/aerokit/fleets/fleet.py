@@ -90,11 +90,11 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: no member matches.
         """
-        for member in self._context.matching(name):
-            self._context.members[member].reclaim()
+        for member_name in self._context.matching(name):
+            self._context.members[member_name].reclaim()
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Nothing is sent, so the members continue as before.
+        """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
         Args:
             name: a member's name or a pattern.
@@ -103,8 +103,8 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: no member matches.
         """
-        for member in self._context.matching(name):
-            self._context.members[member].release(reason)
+        for member_name in self._context.matching(name):
+            self._context.members[member_name].release(reason)
 
     def send_corrections(self, rtcm: bytes) -> int:
         """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.

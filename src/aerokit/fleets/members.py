@@ -132,7 +132,7 @@ class Member:
             self._set_state(MemberState.ACTIVE, "")
 
     def reclaim(self) -> None:
-        """End a takeover, failsafe or release. The member is then active, or lost if its vehicle is silent."""
+        """Make the member active, whatever its state is, or lost if its vehicle is silent."""
         self._control_when_reclaimed = self._current_control()
         self._ignored_failsafe = self.vehicle.system_status.latest
         self.vehicle._arbiter.clear_failsafe()

@@ -151,7 +151,7 @@ def separate_by_time(
     slack_s: float = SLACK_S,
     max_delay_s: float = 300.0,
 ) -> Deconfliction:
-    """Separate conflicting routes by time.
+    """Separate conflicting routes by time. The decision is "clear", "corridors" with the delays, or "refused".
 
     Args:
         routes: routes of the moving vehicles.

@@ -48,7 +48,8 @@ __all__ = [
 # Speed of the correction towards the track, per metre of deviation, in 1/s.
 TRACK_GAIN = 0.8
 
-# The speed limit is max(CATCH_UP_M_S, CATCH_UP_FACTOR * speed of the track) + CATCH_UP_M_S.
+# The speed limit is max(CATCH_UP_M_S, CATCH_UP_FACTOR * speed of the track) + CATCH_UP_M_S. A member can
+# therefore catch up even where the track rests.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5
@@ -305,8 +306,8 @@ class Shows(Travel):
 
         Args:
             show: the trajectories.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
 
         Raises:
             InvalidArgument: the name of a track is not that of a member.
@@ -332,8 +333,8 @@ class Shows(Travel):
 
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start.
             lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction

@@ -185,8 +185,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             show: the trajectories.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
 
         Raises:
             InvalidArgument: the name of a track is not that of a member.
@@ -211,8 +211,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start.
             lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
@@ -384,7 +384,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
             **options: keyword arguments of the method.
 
         Raises:
-            InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
+            InvalidArgument: there is no such action, or there are arguments for a function. Nothing was sent. If the
+                method refuses an argument, each member fails instead.
         """
         return self._loop.run(self.aio.do, action, *arguments, timeout=timeout, stagger_s=stagger_s, **options)
 
@@ -467,11 +468,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
         timeout: float = 60.0,
         description: str = "barrier",
     ) -> FleetResult:
-        """Wait until a condition is true for every member.
+        """Wait until a condition has been true for every available member, not necessarily at the same time.
 
         Args:
-            condition: function of a member; it is called four times a second and when the member's state changes.
-            timeout: seconds until the condition is true for all members.
+            condition: function of a member; it is called four times a second and when the member's state changes, until
+                it is true for this member.
+            timeout: seconds until the condition has been true for all members.
             description: name of the barrier in errors.
 
         Raises:
@@ -529,7 +531,7 @@ class Fleet(FleetTwin, Selection):
         self._loop.call(self.aio.reclaim, name)
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Nothing is sent, so the members continue as before.
+        """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
         Args:
             name: a member's name or a pattern.
