@@ -24,7 +24,7 @@ from aerokit.fleets.formation import Formation, Offset, follow_velocity
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions import Mission, land, return_to_launch, take_off, waypoint
+from aerokit.missions import Mission, land, region_of_interest, return_to_launch, take_off, waypoint
 from aerokit.position import Position
 from aerokit.protocols.rtcm import crc24q
 from aerokit.sim import SimulatedPx4, simulated_link
@@ -581,3 +581,33 @@ async def test_formation_needs_recent_heading_of_leader(monkeypatch: pytest.Monk
         with pytest.raises(ValueUnknownError, match="north/1: heading_deg is"):
             await stage.fleet.form(line, leader="north/1")
         assert stage.mode_of("north/2") == "BRAKE"
+
+
+async def test_compare_missions_includes_way_to_first_item() -> None:
+    """Two copters side by side whose first waypoints are swapped."""
+    async with open_stage(2, spacing_m=20, min_distance_m=5.0) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        here = [vehicle.position.value for vehicle in stage.fleet.vehicles.values()]
+
+        def mission_to(place: Position) -> Mission:
+            first = place.offset(north_m=40)
+            return Mission([take_off(8), waypoint(first.latitude_deg, first.longitude_deg, altitude_relative_m=8)])
+
+        straight = dict(zip(stage.copters, map(mission_to, here), strict=True))
+        assert stage.fleet.compare_missions(straight).decision == "clear"
+        crossing = dict(zip(stage.copters, map(mission_to, reversed(here)), strict=True))
+        plan = stage.fleet.compare_missions(crossing)
+        assert plan.decision == "refused"
+        assert plan.conflicts[0].distance_m == pytest.approx(0, abs=0.2)
+        # A copter on the ground climbs before it flies, so it passes above its neighbour.
+        above = stage.fleet.compare_missions({"north/1": mission_to(here[1]), "north/2": Mission([take_off(20)])})
+        assert above.decision == "clear"
+
+
+async def test_compare_missions_ignores_regions_of_interest() -> None:
+    async with open_stage(2, spacing_m=20, min_distance_m=5.0) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        other = stage.fleet.vehicles["north/2"].position.value
+        looking = Mission([take_off(8), region_of_interest(other, altitude_relative_m=8)])
+        there = Mission([take_off(8), waypoint(other, altitude_relative_m=8)])
+        assert stage.fleet.compare_missions({"north/1": looking, "north/2": there}).decision == "clear"

@@ -26,9 +26,11 @@ from aerokit.fleets.separation import (
     separate_by_altitude,
     separate_by_time,
 )
+from aerokit.mavlink.enums import MavCmd
 from aerokit.missions.mission import Mission
 from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
 
 # Starts and targets may differ by this much from those of a plan, because vehicles drift and positions are noisy.
 MAX_PLAN_DRIFT_M = 3.0
@@ -420,9 +422,9 @@ class Missions(SelectionBase):
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Paths begin at the first item with a position: the members' way to it is not compared. Items without a position
-        are left out, and jumps are not followed. An altitude above terrain is replaced by the member's present
-        altitude.
+        Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
+        item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
+        by the member's present altitude.
 
         Args:
             missions: maps names of members to missions.
@@ -437,13 +439,13 @@ class Missions(SelectionBase):
         if min_m is None:
             raise InvalidArgument("min_distance_m is required, because this fleet was created without it")
         members = self._require_available(missions)
-        paths: list[Path | None] = []
+        paths: list[Path] = []
         if members:
             first_member = next(iter(members.values()))
             # A position of any age will do, because it is only the origin of the coordinates.
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
-        conflicts = find_conflicts([path for path in paths if path is not None], min_m)
+        conflicts = find_conflicts(paths, min_m)
         reason = f"{describe_pairs(conflicts)} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
         self._context.publish(
@@ -467,12 +469,18 @@ class Missions(SelectionBase):
         return members
 
 
-def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
-    """Return the path of a mission, with time 0 for all points; None if no item has a position."""
-    points: list[PathPoint] = []
+def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path:
+    """Return the path of a mission from the member's present position, with time 0 for all points."""
+    here = position_of(member)
+    points = [PathPoint(0.0, *origin.of_member(member))]
     for item in mission:
+        if item.command >= MavCmd.NAV_LAST or item.command == MavCmd.NAV_ROI:  # the vehicle does not fly there
+            continue
         position = item.position
-        if position is not None and not math.isnan(position.latitude_deg):
-            north_m, east_m, up_m = origin.to_local(position, altitude_amsl(member, position))
-            points.append(PathPoint(0.0, north_m, east_m, up_m))
-    return Path(member.name, points) if points else None
+        if position is None and item.command in (MavCmd.NAV_TAKEOFF, MavCmd.NAV_VTOL_TAKEOFF):
+            position = item.replace(x=round(here.latitude_deg * 1e7), y=round(here.longitude_deg * 1e7)).position
+        if position is not None:
+            points.append(PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position))))
+    if is_reported_on_ground(member.vehicle.telemetry):  # The member climbs before it flies to the first item.
+        points[0] = points[0].replace(up_m=max(point.up_m for point in points[:2]))
+    return Path(member.name, points)

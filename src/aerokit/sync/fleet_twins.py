@@ -350,9 +350,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Paths begin at the first item with a position: the members' way to it is not compared. Items without a position
-        are left out, and jumps are not followed. An altitude above terrain is replaced by the member's present
-        altitude.
+        Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
+        item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
+        by the member's present altitude.
 
         Args:
             missions: maps names of members to missions.
