@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from aerokit.errors import AerokitError, BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.transport.link import Link, OrderRefusalListener, Peer, Receiver, keeps_peers
 from aerokit.transport.reconnecting import Backoff, InterruptionListener
 
@@ -232,7 +232,7 @@ class MultiLink(Link):
             await asyncio.sleep(backoff.next_delay())
             try:
                 error = await self._open_one(index)
-            except AerokitError as failure:  # e.g. another connection has opened the link meanwhile
+            except Exception as failure:  # e.g. another connection has opened the link meanwhile
                 logger.warning("one of several links is given up: %s", failure)
                 return
             if error is None:
