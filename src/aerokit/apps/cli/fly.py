@@ -226,6 +226,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_record(command)
     add_vehicle(command)
     add_json(command)
+    # argparse has no public list of a group's options.
     command.set_defaults(run=run_fly, connect=None, simulation_actions=tuple(simulated._group_actions))
 
 
