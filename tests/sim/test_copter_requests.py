@@ -6,7 +6,7 @@ import pytest
 from simulated_client import Client, flying_copter, ready_copter
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult
+from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult, WinchActions
 
 STREAMED_BY_A_REAL_COPTER = {
     "AHRS", "AHRS2", "ATTITUDE", "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESC_TELEMETRY_1_TO_4",
@@ -243,3 +243,13 @@ def test_flight_parameter_takes_effect() -> None:
     client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 3576, 100, 0, -10, 0, 0, 0, 0, 0, 0, 0, 0))
     client.run(5.0)
     assert copter.motion.ground_speed_m_s == pytest.approx(2.0, abs=0.05)
+
+
+def test_winch_restarted_within_step_keeps_its_rate() -> None:
+    copter, client = ready_copter(parameters={"WINCH_TYPE": 1.0})
+    for _ in range(3):
+        client.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 0.5)
+        client.command(MavCmd.DO_WINCH, 1, WinchActions.RELAXED)
+    client.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 0.5)
+    client.run(10.0)
+    assert copter.devices.line_m == pytest.approx(5.0, abs=0.1)

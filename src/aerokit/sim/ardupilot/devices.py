@@ -28,6 +28,7 @@ class ArduPilotDevices:
         self.line_m: float = 0.0  # Length of the winch's line.
         self.line_rate_m_s: float = 0.0  # Above 0 while the winch lets out line.
         self._goal_m: float | None = None  # Length at which the winch stops; None if it stops only on command.
+        self._has_scheduled_step = False  # even after RELAXED, until the step is due
 
     def _is_set(self, name: str) -> bool:
         return bool(self._vehicle.parameters.get(name, 0))
@@ -81,7 +82,6 @@ class ArduPilotDevices:
         action, length_m, rate_m_s = to_int(command.param2), command.param3, command.param4
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return Result.FAILED
-        was_moving = self.line_rate_m_s != 0.0
         self._goal_m = None
         self.line_rate_m_s = 0.0  # The action RELAXED only stops the winch.
         if action == WinchActions.RATE_CONTROL:
@@ -89,17 +89,21 @@ class ArduPilotDevices:
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
             self._goal_m = self.line_m + length_m
             self.line_rate_m_s = _WINCH_RATE_M_S if length_m > 0 else -_WINCH_RATE_M_S
-        if not was_moving and self.line_rate_m_s:  # A winch that moves already has a scheduled step.
-            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
+        self._schedule_step()
         return Result.ACCEPTED
 
+    def _schedule_step(self) -> None:
+        if self.line_rate_m_s and not self._has_scheduled_step:
+            self._has_scheduled_step = True
+            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
+
     def _run(self) -> None:
+        self._has_scheduled_step = False
         self.line_m += self.line_rate_m_s * _WINCH_INTERVAL_S
         # Once the line has passed the goal, the remaining length and the rate have opposite signs.
         if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:
             self.line_rate_m_s = 0.0
-        if self.line_rate_m_s:
-            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
+        self._schedule_step()
 
     def winch_status(self) -> m.WinchStatus | None:
         """Return WINCH_STATUS, or None if the vehicle has no winch."""

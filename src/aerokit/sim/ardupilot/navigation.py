@@ -194,6 +194,8 @@ class ArduPilotNavigation:
 
     def _use_gps_when_possible(self) -> None:
         """Let the estimator use GPS, or check again in a second if that is not possible yet."""
+        if self.flags == _WITH_POSITION:  # `_check_gps` was first.
+            return
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
             self._vehicle.call_later(1.0, self._use_gps_when_possible)
             return

@@ -281,13 +281,13 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     def return_place(self) -> Ned:
         """Return the place to which the plane returns after a breach.
 
-        With FENCE_RET_RALLY, this is a rally point. Otherwise it is the uploaded return point or home, at FENCE_RET_ALT
-        or half-way between the altitude limits.
+        With FENCE_RET_RALLY, this is where RTL would return. Otherwise it is the uploaded return point or home, at
+        FENCE_RET_ALT, half-way between the altitude limits or, if these leave no room, at RTL_ALTITUDE.
         """
         plane, parameters = self.vehicle, self.vehicle.parameters
         home_north, home_east, home_down = plane.home_or_ground
         if parameters["FENCE_RET_RALLY"]:
-            return best_return_place(plane, (home_north, home_east, home_down - parameters["RTL_ALTITUDE"]))
+            return best_return_place(plane, plane.home_of_rtl)
         lowest = parameters["FENCE_ALT_MIN"] + parameters["FENCE_MARGIN"]
         highest = parameters["FENCE_ALT_MAX"] - parameters["FENCE_MARGIN"]
         height = parameters["FENCE_RET_ALT"]
