@@ -161,7 +161,7 @@ class Px4Vehicle(Px4Host):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
-        """Create the parts that receive messages. A reboot does not replace them."""
+        """Create the parts that receive messages. Of these, a reboot replaces only the failsafes."""
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
         self.external: Px4External = Px4External(self)
@@ -383,13 +383,13 @@ class Px4Vehicle(Px4Host):
             self.mission.on_landed()
 
     def _auto_disarm(self) -> None:
-        """Disarm some time after a landing, or after arming without a take-off."""
+        """Disarm some time after a landing, or after arming without a take-off. A time of 0 turns this off."""
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown:
-            if self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
+            if 0 < self.parameters["COM_DISARM_LAND"] <= self.now - self._landed_at:
                 self.arming.disarm("landing")
-        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.armed_at:  # The value 0 turns this off.
+        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.armed_at:
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
