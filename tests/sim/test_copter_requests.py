@@ -6,7 +6,7 @@ import pytest
 from simulated_client import Client, flying_copter, ready_copter
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult, WinchActions
+from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult, ParachuteAction, WinchActions
 
 STREAMED_BY_A_REAL_COPTER = {
     "AHRS", "AHRS2", "ATTITUDE", "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESC_TELEMETRY_1_TO_4",
@@ -253,3 +253,13 @@ def test_winch_restarted_within_step_keeps_its_rate() -> None:
     client.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 0.5)
     client.run(10.0)
     assert copter.devices.line_m == pytest.approx(5.0, abs=0.1)
+
+
+def test_parachute_altitude_is_above_home() -> None:
+    copter, client = flying_copter(20.0, parameters={"CHUTE_ENABLED": 1.0})
+    north, east, down = copter.motion.place
+    copter.navigation.set_home((north, east, down + 5.0), lock=True)
+    assert client.command(MavCmd.DO_PARACHUTE, ParachuteAction.RELEASE) == MavResult.ACCEPTED
+    client.run(0.1)
+    assert client.texts[-1] == "Parachute: Too low"
+    assert copter.is_armed

@@ -239,7 +239,10 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Enter AUTO, which requires a mission; while armed on the ground, one that begins with a take-off."""
+        """Enter AUTO, which requires a mission, unless ``force`` is set.
+
+        While armed on the ground, even with ``force``, the mission must begin with a take-off.
+        """
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
             return True  # Arming enters the current mode again, which must not restart the mission.

@@ -69,7 +69,7 @@ class ArduPilotDevices:
         elif self._is_set("CHUTE_ENABLED"):
             if vehicle.is_landed:
                 vehicle.info("Parachute: Landed")
-            elif -vehicle.motion.down < _MIN_CHUTE_ALTITUDE_M:
+            elif vehicle.altitude_m < _MIN_CHUTE_ALTITUDE_M:
                 vehicle.send_text(MavSeverity.ALERT, "Parachute: Too low")
             else:
                 self.chute_is_released = True

@@ -357,7 +357,8 @@ class PlaneSetpoints:
             return
         point = plane.world_point(0, 0, message.alt, message.coordinate_frame)  # Only the altitude is used.
         if point is None:
-            plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
+            text = "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT"  # The misspelling is the firmware's.
+            plane.send_text(MavSeverity.WARNING, text)
         elif not message.type_mask & PositionMask.Z_IGNORE:
             _north, _east, down = point
             self._guided.change_altitude(down)

@@ -155,8 +155,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _check_end_of_long(self) -> None:
         """End the long failsafe once its link has returned: the ground station, or the radio."""
         parameters = self.vehicle.parameters
-        # With FS_LONG_TIMEOUT alone, the end of the long failsafe could start the short one (system.cpp,
-        # check_long_failsafe).
+        # Like the firmware (system.cpp, check_long_failsafe).
         is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if is_short_enabled else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:
