@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from simulated_client import Client, flying_copter, ready_copter
 
@@ -253,6 +255,22 @@ def test_winch_restarted_within_step_keeps_its_rate() -> None:
     client.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 0.5)
     client.run(10.0)
     assert copter.devices.line_m == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("action", "length_m", "rate_m_s", "expected_m"),
+    [
+        (WinchActions.RELATIVE_LENGTH_CONTROL, 0.25, 0.0, 0.25),
+        (WinchActions.RELATIVE_LENGTH_CONTROL, 0.0, 0.0, 0.0),
+        (WinchActions.RELATIVE_LENGTH_CONTROL, math.nan, 0.0, 0.0),
+        (WinchActions.RATE_CONTROL, 0.0, math.nan, 0.0),
+    ],
+)
+def test_winch_stops_at_its_goal(action: int, length_m: float, rate_m_s: float, expected_m: float) -> None:
+    copter, client = ready_copter(parameters={"WINCH_TYPE": 1.0})
+    client.command(MavCmd.DO_WINCH, 1, action, length_m, rate_m_s)
+    client.run(3.0)
+    assert copter.devices.line_m == expected_m
 
 
 def test_parachute_altitude_is_above_home() -> None:

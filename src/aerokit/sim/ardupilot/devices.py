@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavSeverity, ParachuteAction, WinchActions
 from aerokit.mavlink.enums import MavResult as Result
-from aerokit.sim.commands import ReceivedCommand, to_int
+from aerokit.sim.commands import ReceivedCommand, constrained, to_int
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.host import ArduPilotHost
@@ -85,10 +85,10 @@ class ArduPilotDevices:
         self._goal_m = None
         self.line_rate_m_s = 0.0  # The action RELAXED only stops the winch.
         if action == WinchActions.RATE_CONTROL:
-            self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, rate_m_s))
+            self.line_rate_m_s = constrained(rate_m_s, -_WINCH_RATE_M_S, _WINCH_RATE_M_S)
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
             self._goal_m = self.line_m + length_m
-            self.line_rate_m_s = _WINCH_RATE_M_S if length_m > 0 else -_WINCH_RATE_M_S
+            self.line_rate_m_s = _WINCH_RATE_M_S * ((length_m > 0) - (length_m < 0))  # 0 for NaN
         self._schedule_step()
         return Result.ACCEPTED
 
@@ -102,7 +102,7 @@ class ArduPilotDevices:
         self.line_m += self.line_rate_m_s * _WINCH_INTERVAL_S
         # Once the line has passed the goal, the remaining length and the rate have opposite signs.
         if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:
-            self.line_rate_m_s = 0.0
+            self.line_m, self.line_rate_m_s = self._goal_m, 0.0
         self._schedule_step()
 
     def winch_status(self) -> m.WinchStatus | None:

@@ -161,7 +161,7 @@ class Px4Vehicle(Px4Host):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
-        """Create the parts that receive messages. Of these, a reboot replaces only the failsafes."""
+        """Create the parts that receive messages. A reboot does not replace them."""
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
         self.external: Px4External = Px4External(self)
@@ -174,7 +174,6 @@ class Px4Vehicle(Px4Host):
         self.on(m.Ping, self._on_ping)
         self.serve_timesync()
         self.missions.listen()
-        self.failsafes.listen()
 
     @property
     def ftp(self) -> Px4Ftp:
@@ -208,7 +207,7 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()  # A restart has created a new object, which has to listen, too.
+        self.failsafes.listen()  # A restart has created a new object.
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 
