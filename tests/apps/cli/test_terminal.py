@@ -88,6 +88,17 @@ def test_confirm_while_waiting_does_not_block_loop(
     assert capsys.readouterr().err == "fly? [y/N] "
 
 
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no epoll")
+@pytest.mark.parametrize(("content", "is_confirmed"), [(b"y\n", True), (b"", False), (b"\xff\n", False)])
+def test_confirm_reads_redirected_input(
+    content: bytes, is_confirmed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "input").write_bytes(content)
+    with (tmp_path / "input").open(encoding="utf-8") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert asyncio.run(asyncio.wait_for(asking.confirm("fly?"), 10.0)) is is_confirmed
+
+
 # ---------------------------------------------------------------------------------- completion
 
 
