@@ -129,8 +129,12 @@ class PlanFlight(SupervisedFlight):
             distance = self._vehicle.distance_to(first_position)
             if distance > _MAX_START_DISTANCE_M:
                 warnings.append(f"the first waypoint is {distance / 1000:.1f} km away")
-        if not any(part in items[-1].name for part in ("LAND", "RETURN_TO_LAUNCH")):
-            warnings.append("the mission does not end with a landing or return: the vehicle stays at its last waypoint")
+        # The last item could also be DO_LAND_START, which does not land.
+        if not any(part in items[-1].name for part in ("NAV_LAND", "NAV_VTOL_LAND", "RETURN_TO_LAUNCH")):
+            warnings.append(
+                "the mission does not end with a landing or return: the vehicle stays at its last waypoint, or returns"
+                " to launch (ArduPlane)"
+            )
         return warnings
 
     @property
@@ -225,6 +229,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_record(command)
     add_vehicle(command)
     add_json(command)
+    # `run_fly` must know whether --connect is given, so it fills in the default address itself.
     command.set_defaults(run=run_fly, connect=None)
 
 
