@@ -30,7 +30,7 @@ from aerokit.errors import OperationRejected
 from aerokit.logs.flights import read_flight
 from aerokit.logs.report.statistics import statistics_of, summary
 from aerokit.mavlink.enums import CopterMode, MavCmd
-from aerokit.mavlink.messages import ParamValue
+from aerokit.mavlink.messages import ParamValue, VfrHud
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import read_waypoint_file
 from aerokit.position import Position
@@ -353,6 +353,34 @@ def test_fly_in_unknown_simulation_counts_its_seconds(
     assert run_virtual(scenario()) == 0
     out = capsys.readouterr().out
     assert re.search(r"armed for 1 min 0\d s \(a simulation at 5 times real speed: 1\d s on this clock\)", out)
+
+
+@pytest.mark.parametrize(
+    ("last_command", "is_warned"), [(20, False), (21, False), (85, False), (16, True), (189, True)]
+)
+def test_fly_warns_if_mission_does_not_end_with_landing(last_command: int, is_warned: bool) -> None:
+    """Commands: return, land, VTOL landing, waypoint, DO_LAND_START."""
+    Path("m.waypoints").write_text(MISSION.replace("\t20\t", f"\t{last_command}\t"))
+    options = make_parser("fly").parse_args(["fly", "m.waypoints"])
+    vehicle: Any = SimpleNamespace(distance_to=lambda _: 10.0, connection=SimpleNamespace(now=lambda: 0.0))
+    report = FlightReport(vehicle, options, speedup=1.0)
+    flight = PlanFlight(vehicle, read_plan("m.waypoints"), report, InterruptStack(), options)
+    assert any("does not end with a landing or return" in text for text in flight._warnings()) is is_warned
+
+
+def test_status_line_has_no_old_speed(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:
+    options = make_parser("fly").parse_args(["fly", "m.waypoints"])
+
+    async def scenario() -> None:
+        async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            copter.faults.lose(VfrHud, times=1000)
+            async with FlightReport(vehicle, options, speedup=1.0).running():
+                await anyio.sleep(8)
+
+    run_virtual(scenario())
+    assert "STABILIZE, speed unknown" in capsys.readouterr().out
 
 
 def test_fly_progress_ends_silently_with_connection(copter: SimulatedCopter) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import io
 import os
@@ -53,6 +54,22 @@ def test_countdown_on_terminal_shows_remaining_seconds(
 def test_countdown_with_json_or_pipe_is_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stderr_without_vehicle(monkeypatch, Terminal(), "params", "list", "--json").startswith("aerokit: ")
     assert stderr_without_vehicle(monkeypatch, io.StringIO(), "params", "list").startswith("aerokit: ")
+
+
+class FullTerminal(Terminal):
+    def write(self, text: str) -> int:
+        raise OSError(28, "No space left on device")
+
+
+def test_countdown_error_does_not_replace_error_of_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def wait() -> None:
+        async with asking.waiting(argparse.Namespace(json=False), "tcp:127.0.0.1:1", 30.0):
+            await asyncio.sleep(3.0)
+            raise LookupError
+
+    with monkeypatch.context() as patch, pytest.raises(LookupError):
+        patch.setattr(sys, "stderr", FullTerminal())
+        run_virtual(wait())
 
 
 # ------------------------------------------------------------------------------------ question
