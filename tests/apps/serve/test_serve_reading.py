@@ -20,6 +20,7 @@ from aerokit.apps.readiness import readiness
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
 from aerokit.apps.serve.failsafe import ground_station_failsafe
+from aerokit.apps.serve.served_vehicles import _thin_out
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
@@ -38,6 +39,7 @@ from aerokit.missions import (
     take_off,
 )
 from aerokit.parameters import load_metadata
+from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedRover, SimulatedVehicle, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -281,6 +283,33 @@ async def test_slow_client_gets_newest_state_and_stalled_is_closed() -> None:
         assert socket.task.done()
 
 
+class SlowSocket(Socket):
+    """Takes a message every 10 ms, while a new event is published."""
+
+    async def _take(self, message: object) -> None:
+        await anyio.sleep(0.01)
+        self.app._served.publish({"type": "event", "event": "Test"})
+        await super()._take(message)
+
+
+async def test_stream_of_slow_client_has_states_among_many_events() -> None:
+    async with open_stage() as stage, SlowSocket(stage.app, query="rate_hz=5") as socket:
+        with anyio.fail_after(2):
+            for _ in range(5):
+                await socket.next("state")
+
+
+async def test_failed_stream_is_logged_and_closed(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with open_stage() as stage, Socket(stage.app) as socket:
+        await socket.next("state")
+        monkeypatch.setattr(stage.app._served, "snapshot", lambda: json.dumps(object()))
+        assert (await socket.next("websocket.close"))["code"] == 1011
+    assert "the stream of states has failed" in caplog.text
+    assert "is not JSON serializable" in caplog.text
+
+
 async def test_client_that_sends_is_disconnected() -> None:
     async with open_stage() as stage, Socket(stage.app) as socket:
         await socket.next("state")
@@ -305,6 +334,28 @@ async def test_track_covers_flight_within_limit(monkeypatch: pytest.MonkeyPatch)
         assert points[0][:2] == pytest.approx((start.latitude_deg, start.longitude_deg), abs=1e-6)
         end = vehicle.position.value
         assert points[-1][:2] == pytest.approx((end.latitude_deg, end.longitude_deg), abs=2e-5)
+
+
+def test_full_track_keeps_marks_of_gaps() -> None:
+    here = Position(47.0, 8.0)
+    track = [(here.offset(north_m=index), index in (4, 7)) for index in range(8)]
+    _thin_out(track)
+    assert [(round(position.distance_to(here)), is_after_gap) for position, is_after_gap in track] == [
+        (0, False),
+        (1, False),
+        (3, False),
+        (5, True),
+        (7, True),
+    ]
+
+
+async def test_failed_background_task_is_logged(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aerokit.apps.serve.served_vehicles.TRACK_GAP_S", None)
+    async with open_stage():
+        await anyio.sleep(1)
+    assert "a task of aerokit serve has failed" in caplog.text
 
 
 async def test_track_marks_gap_after_silence() -> None:
