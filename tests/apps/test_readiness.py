@@ -9,6 +9,7 @@ from flight_harness import in_the_air, open_flight, open_px4
 from aerokit.apps.cli.status import _vehicle_lines
 from aerokit.apps.monitor.lines import VehicleText
 from aerokit.apps.readiness import active_failsafe, not_armable, readiness, run_arming_checks
+from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavSeverity, MavState
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 
@@ -97,6 +98,11 @@ async def test_radio_failsafe_is_named_until_it_ends() -> None:
         await system_status.wait_until(lambda state: state == MavState.ACTIVE)
         assert active_failsafe(vehicle) is None
         assert dict(VehicleText(vehicle).rows())["missing"].plain == "nothing"
+        await anyio.sleep(3)
+        flight.copter.faults.lose(m.Statustext, times=1000)
+        flight.copter.faults.rc_lost = True
+        await system_status.wait_until(lambda state: state == MavState.CRITICAL)
+        assert active_failsafe(vehicle) == ["no text about its cause was received"]
 
 
 async def test_battery_and_estimator_failsafes_show_newest_texts() -> None:

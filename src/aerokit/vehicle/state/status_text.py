@@ -70,14 +70,18 @@ class StatusTextAssembler:
         return tuple(text for text in self._recent if text.at >= since)
 
     def about_failsafes(self) -> tuple[StatusText, ...]:
-        """Return the last texts (64 at most) about failsafes and problems in flight, oldest first."""
+        """Return the last texts (64 at most) about failsafes and problems in flight since the last failsafe ended."""
         return tuple(self._failsafes)
+
+    def clear_failsafes(self) -> None:
+        """Discard the texts about failsafes, because the failsafe has ended. They are still among the recent texts."""
+        self._failsafes.clear()
 
     def clear(self) -> None:
         """Discard incomplete and recent texts."""
         self._incomplete.clear()
         self._recent.clear()
-        self._failsafes.clear()
+        self.clear_failsafes()
 
     def _store(self, texts: Iterable[StatusText]) -> None:
         for text in texts:
