@@ -201,6 +201,7 @@ def test_gimbal_fast_orders_use_answers_to_replaced_ones(stage: Stage) -> None:
 
 
 def test_rotate_falls_back_to_mount_messages(stage: Stage) -> None:
+    stage.report("ATTITUDE", yaw=0.0)
     stage.fc.results.update({PITCHYAW: UNSUPPORTED, MOUNT_CONTROL: UNSUPPORTED})
     since = stage.fc.mark()
     with stage.logged() as lines:

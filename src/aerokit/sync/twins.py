@@ -1167,7 +1167,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
                 then turns with the vehicle, so a yaw from north is correct only at the time of the order.
-            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
+            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards, except after a
+                mount command (see ``roll_deg`` and below), after which it always turns with the vehicle.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
@@ -1177,8 +1178,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         support that command either, it gets MOUNT_CONTROL, which is not acknowledged.
 
         Raises:
-            InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
-                called before. Nothing was sent.
+            InvalidArgument: an angle or the tolerance is out of range, or an angle is beyond the limits of the gimbal
+                if :meth:`information` was called before. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
         """
@@ -1230,6 +1231,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Raises:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
+            GimbalTaken: your program had control and lost it. Nothing was sent.
+            OperationRejected: another order was given meanwhile.
         """
         self._loop.run(self.aio.release)
 

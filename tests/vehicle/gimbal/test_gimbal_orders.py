@@ -219,6 +219,17 @@ async def test_old_mount_neutral_uses_mount_mode(name: str, mode: int) -> None:
         assert len(flight.wire.commands(PITCHYAW)) == 1
 
 
+async def test_neutral_requires_known_direction() -> None:
+    async with with_gimbals(SimulatedGimbal(attitude_rate_hz=0.0)) as flight:
+        copter, neutral = flight.copter, flight.vehicle.gimbal.neutral
+        reported = attitude_of(0, (math.nan,) * 4)
+        copter.every(0.2, lambda: copter.send(reported, None, (1, 154)))
+        with pytest.raises(OperationTimeout):
+            await neutral(timeout=3.0)
+        reported = m.GimbalDeviceAttitudeStatus(0, 0, 0, Flags.NEUTRAL, reported.q, 0, 0, 0, 0)
+        await neutral(timeout=3.0)
+
+
 # --------------------------------------------------------------------------------------------- regions of interest
 
 
