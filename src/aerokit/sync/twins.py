@@ -1273,7 +1273,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: the gimbal turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop the gimbal if no new rates are set for this many seconds.
-            max_lag_s: stop the gimbal if the event loop is blocked for this many seconds.
+            max_lag_s: if the event loop is blocked for longer than this many seconds, stop the gimbal as soon as the
+                loop runs again.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.

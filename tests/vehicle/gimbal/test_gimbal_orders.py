@@ -354,6 +354,19 @@ async def test_information_of_autopilot_gimbal() -> None:
         assert flight.vehicle.gimbals.ids == (1,)
 
 
+async def test_second_information_call_needs_new_answer() -> None:
+    gimbal = SimulatedGimbal(pitch_deg=(-80.0, 10.0))
+    async with with_gimbals(gimbal) as flight:
+        await flight.vehicle.gimbal.information()
+        roll, _, yaw = gimbal.limits
+        gimbal.limits = (roll, (math.radians(-50.0), 0.0), yaw)
+        changed = await flight.vehicle.gimbal.information()
+        assert changed.pitch_deg == (-50.0, 0.0)
+        gimbal.faults.refuse(REQUEST, MavResult.FAILED)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.gimbal.information()
+
+
 async def test_information_without_gimbal_is_rejected() -> None:
     async with open_flight() as flight:
         flight.copter.faults.refuse(REQUEST, MavResult.FAILED)

@@ -182,7 +182,7 @@ class GimbalRegistry:
     ) -> GimbalDevice | None:
         """Record the sender as manager if its rank is high enough, and return the gimbal that its message is about.
 
-        None if orders to this gimbal go to another component.
+        Returns None if orders to this gimbal go to another component, or if the gimbal or the sender is unknown.
         """
         frame = message.received_frame
         if frame is None:
@@ -197,11 +197,11 @@ class GimbalRegistry:
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
         else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
             device = self._device_of(message, device_id)
-            rank = max(rank, RANK_INFORMATION)
+            rank = max(rank, RANK_INFORMATION)  # For its own gimbals, a status shows as much as an information.
         if device is None:
             return None
-        is_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)
-        device.update_manager(sender, rank, is_gone=is_gone)
+        is_old_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)
+        device.update_manager(sender, rank, is_old_gone=is_old_gone)
         return device if device.manager_id == sender else None
 
     def _device_with_own_id(self, device_id: int, *, may_be_new: bool) -> GimbalDevice | None:

@@ -241,15 +241,15 @@ class GimbalOrders:
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )
 
-    async def wait_for(self, value: Callable[[], object], message_type: type[Message], within_s: float) -> None:
-        """Wait until ``value()`` is not None, at most ``within_s`` seconds. Each message of the type causes a check."""
+    async def wait_for(self, is_done: Callable[[], bool], message_type: type[Message], within_s: float) -> None:
+        """Wait until ``is_done()``, at most ``within_s`` seconds. Each message of the type causes a check."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:
-            if value() is not None:
+            if is_done():
                 done.set()
 
-        if value() is not None:
+        if is_done():
             return
         bus = self.session.connection.bus
         detach = bus.attach(message_type, check, system_id=self.session.system_id)
@@ -267,7 +267,7 @@ class GimbalOrders:
             # If the device does not answer, the autopilot counts as the manager.
             with suppress(CommandRejected, CommandTimeout):
                 await self.ask(GimbalManagerInformation.ID, device.component_id, attempts=1)
-                await self.wait_for(lambda: device.manager_id, GimbalManagerInformation, MANAGER_TIMEOUT_S)
+                await self.wait_for(lambda: device.manager_id is not None, GimbalManagerInformation, MANAGER_TIMEOUT_S)
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
