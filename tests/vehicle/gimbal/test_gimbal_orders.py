@@ -88,6 +88,16 @@ async def test_autopilot_attitude_is_requested_while_pointing() -> None:
         assert of_it == [250_000, 0]
 
 
+async def test_point_from_north_without_default_rates_returns() -> None:
+    async with open_flight(copter_with_mount(), rates={}) as flight:
+        await flight.vehicle.gimbal.point(-20.0, 90.0)
+        await anyio.sleep(6.0)  # The heading is too old now.
+        flight.copter.send(attitude_of(1))
+        await anyio.sleep(0.1)
+        attitude = flight.vehicle.gimbal.attitude.value
+        assert (attitude.yaw_deg, attitude.yaw_from_nose_deg) == (None, 0.0)
+
+
 async def test_unreachable_angle_timeout_reports_attitude() -> None:
     async with with_gimbals(SimulatedGimbal(pitch_deg=(-45.0, 10.0))) as flight:
         with pytest.raises(OperationTimeout) as caught:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 MAX_GIMBALS = 32
 GIMBAL_COMPONENT_IDS = frozenset((154, *range(171, 176)))
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
+HEADING_MAX_AGE_S = 5.0
 # A component counts as gone if it is silent for this many seconds while the autopilot is not.
 MAX_SILENCE_S = 10.0
 # Precedence of managers. A device that manages itself has at least RANK_INFORMATION.
@@ -154,7 +155,7 @@ class GimbalRegistry:
         device.update_flags(message)
         attitude = UNKNOWN_ATTITUDE
         if all(map(math.isfinite, message.q)):
-            attitude = from_device(message, self._heading())
+            attitude = from_device(message, self.heading())
         device.set_attitude(message, attitude)
         if device is self.first_reporting:
             self.placeholder.update_flags(message)
@@ -162,7 +163,7 @@ class GimbalRegistry:
 
     def _on_orientation(self, message: MountOrientation) -> None:
         if self.first_reporting is None:
-            self.placeholder.set_attitude(message, from_orientation(message, self._heading()))
+            self.placeholder.set_attitude(message, from_orientation(message, self.heading()))
 
     def _on_status(self, message: GimbalManagerStatus) -> None:
         device = self._managed_device(message, message.gimbal_device_id)
@@ -216,9 +217,10 @@ class GimbalRegistry:
         if device is not None:
             device.device_information = message
 
-    def _heading(self) -> float | None:
-        attitude = self._session.telemetry.attitude.latest
-        return None if attitude is None else attitude.yaw_deg
+    def heading(self) -> float | None:
+        """Return the vehicle's heading in degrees; None while no recent one is known."""
+        attitude = self._session.telemetry.attitude
+        return attitude.value.yaw_deg if attitude.age <= HEADING_MAX_AGE_S else None
 
     def _on_reboot(self) -> None:
         # Control blocks and pending orders survive a reboot of the vehicle.

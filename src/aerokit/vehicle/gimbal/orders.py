@@ -12,7 +12,6 @@ from aerokit.autopilots import GimbalRules
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, NotSupported
 from aerokit.mavlink.enums import GimbalManagerFlags, MavCmd, MavMountMode, MavResult
 from aerokit.mavlink.messages import GimbalManagerInformation, MountConfigure, MountControl
-from aerokit.vehicle.commanding.progress import POSITION_MAX_AGE_S
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -216,15 +215,16 @@ class GimbalOrders:
 
     async def _heading(self) -> float:
         """Return the vehicle's heading in degrees; request it, and wait for it, if no recent one is known."""
-        attitude = self.session.telemetry.attitude
-        if attitude.age > POSITION_MAX_AGE_S:
+        heading = self.registry.heading()
+        if heading is None:
             with self.session.streaming("attitude"):
-                await attitude.wait_until(
-                    lambda _: attitude.age <= POSITION_MAX_AGE_S,
+                attitude = await self.session.telemetry.attitude.wait_until(
+                    lambda _: self.registry.heading() is not None,
                     timeout=HEADING_TIMEOUT_S,
                     description=f"{self.name}: the vehicle's heading, to convert the yaw",
                 )
-        return attitude.value.yaw_deg
+            heading = attitude.yaw_deg
+        return heading
 
     def ask_in_background(self, message_id: int) -> None:
         """Request a message from the manager once; errors are ignored."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.arguments import check_range, checks_arguments
@@ -118,18 +118,16 @@ class RestTarget:
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Request the attitude from the autopilot during a block.
+    """Request the gimbal's attitude from the autopilot, and the vehicle's attitude to convert yaws, during a block.
 
     Gimbals with their own component id send their attitude without a request.
     """
-    if orders.device.component_id not in (0, orders.session.component_id):
+    session = orders.session
+    with ExitStack() as requests:
+        requests.enter_context(session.streaming("attitude"))
+        if orders.device.component_id in (0, session.component_id):
+            requests.callback(session.rates.request(GimbalDeviceAttitudeStatus, ACTION_HZ, is_optional=True))
         yield
-        return
-    release = orders.session.rates.request(GimbalDeviceAttitudeStatus, ACTION_HZ, is_optional=True)
-    try:
-        yield
-    finally:
-        release()
 
 
 async def wait_until_reached(
