@@ -2934,7 +2934,7 @@ class NtripClient(BlockTwin["AsyncNtripClient"]):
     Entering raises:
         OperationRejected: the caster refused the user or the password, or has no such mount point. The error text lists
             the caster's mount points.
-        LinkOpenError: the caster could not be reached.
+        LinkOpenError: the caster could not be reached, or the connection failed before its answer.
         OperationTimeout: the caster did not answer in time.
         BusyError: the client was entered before; call ``ntrip()`` again.
     """
