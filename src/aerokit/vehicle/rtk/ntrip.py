@@ -294,6 +294,7 @@ class NtripClient:
         finally:
             if position_task is not None:
                 position_task.cancel()
+                # If sending the position failed, so did reading, which says why.
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {message_count} messages")
