@@ -173,6 +173,10 @@ def _table() -> Table:
         ("Gimbal.retract", "NotSupported"): P(_call("retract"), on="px4"),
         ("Gimbal.release", "CommandRejected"): P(_call("release"), before=refused(Cmd.DO_MOUNT_CONTROL)),
         ("Gimbal.release", "CommandTimeout"): P(_call("release"), grounded, ignored(Cmd.DO_MOUNT_CONTROL)),
+        ("Gimbal.release", "GimbalTaken"): _taken(_call("release")),
+        ("Gimbal.release", "OperationRejected"): later(
+            _call("release"), _another_order, 0.1, before=refused(Cmd.DO_MOUNT_CONTROL, MavResult.UNSUPPORTED)
+        ),
         ("Gimbal.stop_looking", "CommandRejected"): P(_call("stop_looking"), before=refused(Cmd.DO_SET_ROI_NONE)),
         ("Gimbal.stop_looking", "CommandTimeout"): P(_call("stop_looking"), grounded, ignored(Cmd.DO_SET_ROI_NONE)),
         ("Gimbal.stop_looking", "GimbalTaken"): _taken(_call("stop_looking")),

@@ -95,7 +95,7 @@ def test_mount_orientation_yaw_is_from_north(stage: Stage) -> None:
     assert angles(stage) == (-30, 2, 350)
     assert [name for _, name, _ in events] == ["gimbal"]
     stage.report("MOUNT_ORIENTATION", pitch=-30, roll=NAN, yaw=-10)
-    assert angles(stage) == (-30, None, -10)
+    assert angles(stage) == (-30, None, None)  # the vehicle's heading is not known yet
     stage.report("ATTITUDE", yaw=math.radians(5))
     stage.report("MOUNT_ORIENTATION", pitch=-30, roll=0, yaw=-10)
     assert angles(stage) == (-30, 0, 355)
@@ -104,7 +104,7 @@ def test_mount_orientation_yaw_is_from_north(stage: Stage) -> None:
 def test_gimbal_device_yaw_is_from_north(stage: Stage) -> None:
     events = stage.listen("mount", "gimbal")
     send_device_attitude(stage, -45, 1, 10)
-    assert angles(stage) == (-45, 1, 10)  # the vehicle's heading is not known yet
+    assert angles(stage) == (-45, 1, None)  # the vehicle's heading is not known yet
     assert [name for _, name, _ in events] == ["mount", "gimbal"]
     stage.report("ATTITUDE", yaw=math.radians(-90))
     send_device_attitude(stage, -45, 1, 10)
@@ -201,6 +201,7 @@ def test_gimbal_fast_orders_use_answers_to_replaced_ones(stage: Stage) -> None:
 
 
 def test_rotate_falls_back_to_mount_messages(stage: Stage) -> None:
+    stage.report("ATTITUDE", yaw=0.0)
     stage.fc.results.update({PITCHYAW: UNSUPPORTED, MOUNT_CONTROL: UNSUPPORTED})
     since = stage.fc.mark()
     with stage.logged() as lines:

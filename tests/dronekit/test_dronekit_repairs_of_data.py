@@ -161,6 +161,7 @@ def test_gimbal_uses_supported_commands(copter: Stage, angles: tuple[float, ...]
 
 
 def test_gimbal_old_firmware(copter: Stage) -> None:
+    copter.report("ATTITUDE", yaw=0.0)
     copter.fc.results.update({1000: 3, 205: 3})
     copter.vehicle.gimbal.rotate(-90, 0, 0)
     configure, control = copter.fc.wait_for("MOUNT_CONFIGURE"), copter.fc.wait_for("MOUNT_CONTROL")

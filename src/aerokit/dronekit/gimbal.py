@@ -48,7 +48,7 @@ class Gimbal(GimbalPrivates):
 
     @property
     def yaw(self) -> float | None:
-        """Yaw in degrees clockwise from north, 0 to 360.
+        """Yaw in degrees clockwise from north, 0 to 360. May be None while the vehicle's heading is unknown.
 
         ArduPilot before 4.3 reports the angle in MOUNT_STATUS, whose reference depends on the firmware.
         """

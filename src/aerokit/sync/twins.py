@@ -1167,7 +1167,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
                 then turns with the vehicle, so a yaw from north is correct only at the time of the order.
-            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
+            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards, except after a
+                mount command (see ``roll_deg`` and below), after which it always turns with the vehicle.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
@@ -1177,8 +1178,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         support that command either, it gets MOUNT_CONTROL, which is not acknowledged.
 
         Raises:
-            InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
-                called before. Nothing was sent.
+            InvalidArgument: an angle or the tolerance is out of range, or an angle is beyond the limits of the gimbal
+                if :meth:`information` was called before. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
         """
@@ -1230,6 +1231,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
         Raises:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
+            GimbalTaken: your program had control and lost it. Nothing was sent.
+            OperationRejected: another order was given meanwhile.
         """
         self._loop.run(self.aio.release)
 
@@ -1270,7 +1273,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: the gimbal turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop the gimbal if no new rates are set for this many seconds.
-            max_lag_s: stop the gimbal if the event loop is blocked for this many seconds.
+            max_lag_s: if the event loop is blocked for longer than this many seconds, stop the gimbal as soon as the
+                loop runs again.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.
@@ -2935,7 +2939,7 @@ class NtripClient(BlockTwin["AsyncNtripClient"]):
     Entering raises:
         OperationRejected: the caster refused the user or the password, or has no such mount point. The error text lists
             the caster's mount points.
-        LinkOpenError: the caster could not be reached.
+        LinkOpenError: the caster could not be reached, or the connection failed before its answer.
         OperationTimeout: the caster did not answer in time.
         BusyError: the client was entered before; call ``ntrip()`` again.
     """
@@ -5251,17 +5255,19 @@ class Vehicle(VehicleTwin):
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
-        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
-        If you cancel the call, the vehicle may still have accepted the key. See docs/signing.md.
+        signed with the key, or with None, when they are no longer signed. Every other vehicle on this connection needs
+        the key too, or ``signing.allow_unsigned``. If you cancel the call, the vehicle may still have accepted the
+        change. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
-            timeout: seconds until the vehicle must use the key.
+            timeout: seconds until the vehicle must use the key, or no longer sign.
 
         Raises:
             NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
-            OperationTimeout: the vehicle did not start to use the key; the error text includes its status texts.
+            OperationTimeout: the vehicle did not start to use the key, or did not stop signing; the error text includes
+                its status texts.
             BusyError: another key exchange is in progress on this connection. Nothing was sent.
         """
         self._loop.run(self.aio.setup_signing, signing, timeout=timeout)

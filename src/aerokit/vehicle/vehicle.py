@@ -340,17 +340,19 @@ class Vehicle(
         """Install a signing key on the vehicle and sign all traffic with it from then on; None removes the key.
 
         **The key is sent unencrypted**: do this over a cable or a private link. Returns when the vehicle's frames are
-        signed with the key. Every other vehicle on this connection needs the key too, or ``signing.allow_unsigned``.
-        If you cancel the call, the vehicle may still have accepted the key. See docs/signing.md.
+        signed with the key, or with None, when they are no longer signed. Every other vehicle on this connection needs
+        the key too, or ``signing.allow_unsigned``. If you cancel the call, the vehicle may still have accepted the
+        change. See docs/signing.md.
 
         Args:
             signing: the key, as for ``connect(signing=…)``.
-            timeout: seconds until the vehicle must use the key.
+            timeout: seconds until the vehicle must use the key, or no longer sign.
 
         Raises:
             NotSupported: this program or the vehicle uses MAVLink 1, which has no signatures. Nothing was sent.
             OperationRejected: the vehicle is armed, or not known to be disarmed. Nothing was sent.
-            OperationTimeout: the vehicle did not start to use the key; the error text includes its status texts.
+            OperationTimeout: the vehicle did not start to use the key, or did not stop signing; the error text includes
+                its status texts.
             BusyError: another key exchange is in progress on this connection. Nothing was sent.
         """
         from aerokit.vehicle.session.signing import set_up_signing

@@ -546,14 +546,15 @@ async def test_orders_before_reboot_end(grounded: Flight) -> None:
 
 
 @pytest.mark.anyio
-async def test_mode_reported_after_refusal_succeeds(grounded: Flight) -> None:
+@pytest.mark.parametrize("after_s", [0.1, 0.7])  # before, and during the wait that follows the refusal
+async def test_mode_reported_after_refusal_succeeds(grounded: Flight, after_s: float) -> None:
     vehicle, faults = grounded.vehicle, grounded.copter.faults
     guided = vehicle.autopilot.find_mode("GUIDED")
     faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED, times=1)
     async with anyio.create_task_group() as tasks:
         with vehicle.posted("mode", modes=(guided,)) as order:
             tasks.start_soon(order.set_mode, guided)
-            await anyio.sleep(0.1)
+            await anyio.sleep(after_s)
             grounded.copter.set_mode(guided.custom_mode)
             await anyio.sleep(8)
     assert grounded.wire.mode_orders() == [guided.custom_mode]

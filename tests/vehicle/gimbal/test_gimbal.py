@@ -121,6 +121,53 @@ async def test_denied_order_claims_control_until_release() -> None:
         assert [params(command)[:3] for command in flight.wire.commands(CONFIGURE)[1:]] == [(-3, -3, -1)]
 
 
+async def test_release_refused_by_mount_still_releases_control() -> None:
+    async with open_flight() as flight:
+        flight.copter.faults.refuse(PITCHYAW, DENIED)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.gimbal.point(-45.0, 0.0, wait=False)
+        flight.wire.clear()
+        for command in (MOUNT, CONFIGURE):
+            flight.copter.faults.refuse(command, DENIED)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.gimbal.release()
+        flight.copter.faults.refuse(CONFIGURE, MavResult.ACCEPTED)
+        for _ in range(2):  # The first release of control was refused, so it is sent again, but only once.
+            with pytest.raises(CommandRejected):
+                await flight.vehicle.gimbal.release()
+        assert [params(command)[:2] for command in flight.wire.commands(CONFIGURE)] == [(-3, -3)] * 2
+
+
+async def test_mount_angles_wait_for_unknown_heading() -> None:
+    async with open_flight(with_gimbal(), rates={}) as flight:
+        await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0, wait=False)
+        heading = flight.vehicle.attitude.value.yaw_deg
+        (command,) = flight.wire.commands(MOUNT)
+        assert params(command)[2] == pytest.approx(math.remainder(80 - heading, 360), abs=2)
+        flight.copter.faults.lose(m.Attitude, times=99)
+        await anyio.sleep(6.0)  # The known heading is too old now.
+        with pytest.raises(OperationTimeout, match="the vehicle's heading"):
+            await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0, wait=False)
+        await flight.vehicle.gimbal.point(-45.0, 80.0, roll_deg=5.0, frame="vehicle", wait=False)
+        assert [params(command)[2] for command in flight.wire.commands(MOUNT)[1:]] == [80]
+
+
+async def test_mount_configure_superseded_is_not_sent() -> None:
+    async with open_flight() as flight:
+        for command in (PITCHYAW, MOUNT):
+            flight.copter.faults.refuse(command, UNSUPPORTED)
+
+        async def point() -> None:
+            with pytest.raises(OperationRejected, match="another order was given"):
+                await flight.vehicle.gimbal.point(-45.0, 0.0, roll_deg=5.0, frame="vehicle", wait=False)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(point)
+            await anyio.sleep(0.1)
+            await flight.vehicle.gimbal.release()
+        assert [message.mount_mode for message in flight.wire.all(m.MountConfigure)] == [3]
+
+
 async def test_old_firmware_gets_mount_messages() -> None:
     async with open_flight() as flight:
         for command in (PITCHYAW, MOUNT):

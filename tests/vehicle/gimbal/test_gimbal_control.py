@@ -14,6 +14,7 @@ import pytest
 from flight_harness import Px4Flight, block_loop, now, open_flight, open_px4
 from gimbal_stage import (
     CONFIGURE,
+    MOUNT,
     OTHER,
     PITCHYAW,
     configured,
@@ -135,6 +136,18 @@ async def test_vehicle_block_end_releases_control() -> None:
             await anyio.lowlevel.checkpoint()
         assert configured(flight)[-1] == (-3, -3, *KEEP, 154)
         tasks.cancel_scope.cancel()
+
+
+async def test_mount_orders_after_lost_control_are_not_sent() -> None:
+    async with mounted() as flight:
+        gimbal = flight.vehicle.gimbal
+        async with gimbal.control() as control:
+            takes_control(flight, 1)
+            await control.until_lost()
+            for order in (gimbal.release(), gimbal.point(-20.0, 0.0, roll_deg=5.0, wait=False)):
+                with pytest.raises(GimbalTaken):
+                    await order
+        assert not flight.wire.commands(MOUNT)
 
 
 async def test_lost_control_publishes_event_and_ends_waits() -> None:

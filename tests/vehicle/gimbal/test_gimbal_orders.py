@@ -88,6 +88,16 @@ async def test_autopilot_attitude_is_requested_while_pointing() -> None:
         assert of_it == [250_000, 0]
 
 
+async def test_point_from_north_without_default_rates_returns() -> None:
+    async with open_flight(copter_with_mount(), rates={}) as flight:
+        await flight.vehicle.gimbal.point(-20.0, 90.0)
+        await anyio.sleep(6.0)  # The heading is too old now.
+        flight.copter.send(attitude_of(1))
+        await anyio.sleep(0.1)
+        attitude = flight.vehicle.gimbal.attitude.value
+        assert (attitude.yaw_deg, attitude.yaw_from_nose_deg) == (None, 0.0)
+
+
 async def test_unreachable_angle_timeout_reports_attitude() -> None:
     async with with_gimbals(SimulatedGimbal(pitch_deg=(-45.0, 10.0))) as flight:
         with pytest.raises(OperationTimeout) as caught:
@@ -219,6 +229,17 @@ async def test_old_mount_neutral_uses_mount_mode(name: str, mode: int) -> None:
         assert len(flight.wire.commands(PITCHYAW)) == 1
 
 
+async def test_neutral_requires_known_direction() -> None:
+    async with with_gimbals(SimulatedGimbal(attitude_rate_hz=0.0)) as flight:
+        copter, neutral = flight.copter, flight.vehicle.gimbal.neutral
+        reported = attitude_of(0, (math.nan,) * 4)
+        copter.every(0.2, lambda: copter.send(reported, None, (1, 154)))
+        with pytest.raises(OperationTimeout):
+            await neutral(timeout=3.0)
+        reported = m.GimbalDeviceAttitudeStatus(0, 0, 0, Flags.NEUTRAL, reported.q, 0, 0, 0, 0)
+        await neutral(timeout=3.0)
+
+
 # --------------------------------------------------------------------------------------------- regions of interest
 
 
@@ -341,6 +362,19 @@ async def test_information_of_autopilot_gimbal() -> None:
         assert (reported.gimbal_device_id, reported.manager_component_id, reported.vendor) == (1, 1, "")
         assert (reported.pitch_deg, reported.yaw_deg) == ((-90.0, 20.0), (-180.0, 180.0))
         assert flight.vehicle.gimbals.ids == (1,)
+
+
+async def test_second_information_call_needs_new_answer() -> None:
+    gimbal = SimulatedGimbal(pitch_deg=(-80.0, 10.0))
+    async with with_gimbals(gimbal) as flight:
+        await flight.vehicle.gimbal.information()
+        roll, _, yaw = gimbal.limits
+        gimbal.limits = (roll, (math.radians(-50.0), 0.0), yaw)
+        changed = await flight.vehicle.gimbal.information()
+        assert changed.pitch_deg == (-50.0, 0.0)
+        gimbal.faults.refuse(REQUEST, MavResult.FAILED)
+        with pytest.raises(CommandRejected):
+            await flight.vehicle.gimbal.information()
 
 
 async def test_information_without_gimbal_is_rejected() -> None:

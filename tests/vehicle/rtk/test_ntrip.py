@@ -141,6 +141,25 @@ async def test_long_message_is_left_out() -> None:
         assert client.oversized == 1
 
 
+class StalledTable:
+    """A source table whose end arrives in two pieces, or not at all; the caster keeps the connection open."""
+
+    def __init__(self, *pieces: bytes) -> None:
+        self._pieces = pieces
+
+    async def body(self) -> AsyncIterator[bytes]:
+        for piece in (b"STR;MOUNT;Town\r\n", *self._pieces):
+            yield piece
+        await asyncio.Event().wait()
+
+
+@pytest.mark.parametrize(("pieces", "timeout"), [((b"ENDSOURCE", b"TABLE\r\n"), 1000.0), ((), 0.01)])
+async def test_stalled_source_table_ends(pieces: tuple[bytes, ...], timeout: float) -> None:
+    async with stage() as (caster, vehicle, _):
+        client = vehicle.rtk.ntrip(caster.url(), timeout=timeout)
+        assert await client._read_source_table(StalledTable(*pieces)) == {"MOUNT": False}  # type: ignore[arg-type]
+
+
 STRANGE_ANSWERS = (
     b"",
     b"\xff" * 100,
@@ -169,19 +188,23 @@ async def test_endless_header_line_is_refused() -> None:
 
 
 @pytest.mark.exhaustive
-async def test_wrong_chunk_size_ends_connection_only(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("size", [b"zz", b"-1", b"100001"])
+async def test_wrong_chunk_size_ends_connection_only(
+    size: bytes, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(ntrip, "MIN_RETRY_S", 0.01)
-    answer = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n"
+    answer = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n%s\r\n" % size
     async with stage(answer=answer) as (caster, vehicle, _), vehicle.rtk.ntrip(caster.url()) as client:
         while not client.reconnects:  # noqa: ASYNC110
             await anyio.sleep(0.01)
+    assert "the connection failed (ValueError) after 0 messages" in caplog.text
 
 
 @pytest.mark.exhaustive
 async def test_caster_that_is_absent_raises_link_error() -> None:
     async with stage() as (caster, vehicle, _):
         url = caster.url().replace(str(caster.port), "1")
-        with pytest.raises(LinkOpenError, match="could not be reached"):
+        with pytest.raises(LinkOpenError, match="the connection to the caster failed"):
             async with vehicle.rtk.ntrip(url):
                 pass
 

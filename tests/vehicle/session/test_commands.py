@@ -425,3 +425,16 @@ async def test_land_lost_during_failsafe_is_repeated(flying: Flight, name: str) 
     flying.copter.parameters["BATT_LOW_MAH"] = flying.copter.parameters["BATT_CAPACITY"]
     await getattr(flying.vehicle, name)()
     assert len(flying.wire.commands(MavCmd.DO_SET_MODE)) == 2
+
+
+@pytest.mark.parametrize(("fault", "requests"), [("none", 1), ("lost", 2), ("refused", 3)])
+async def test_modes_are_requested_until_received(fault: str, requests: int) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    if fault == "lost":  # The request is acknowledged, but the modes do not arrive.
+        copter.faults.lose(m.AvailableModes, times=len(copter.available_modes()))
+    if fault == "refused":
+        copter.faults.refuse(MavCmd.REQUEST_MESSAGE, MavResult.FAILED)
+    async with open_flight(copter) as flight:
+        await anyio.sleep(60)
+        sent = flight.wire.commands(MavCmd.REQUEST_MESSAGE)
+        assert len([command for command in sent if command.param1 == m.AvailableModes.ID]) == requests

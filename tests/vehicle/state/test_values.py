@@ -138,7 +138,7 @@ def test_mount_status_is_in_hundredths_of_degrees() -> None:
         (10.0, 0.0, 355.0, 5.0),
         (10.0, -90.0, 355.0, 270.0),
         (10.0, math.nan, 355.0, 5.0),
-        (-10.0, 0.0, None, -10.0),
+        (-10.0, 0.0, None, None),
         (math.nan, 0.0, None, None),
     ],
 )
@@ -178,14 +178,14 @@ def turned(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ..
         (FROM_NOSE, 0.0, 100.0, 130.0, 30.0),
         (FROM_NOSE, math.nan, 100.0, 130.0, 30.0),
         (FROM_NOSE | LOCK, 0.0, 100.0, 130.0, 30.0),
-        (FROM_NOSE, 0.0, None, 30.0, 30.0),
+        (FROM_NOSE, 0.0, None, None, 30.0),
         (LOCK, 50.0, 100.0, 30.0, -70.0),
         (LOCK, 50.0, 250.0, 30.0, 140.0),
         (0, 50.0, 100.0, 130.0, 30.0),
     ],
 )
 def test_gimbal_yaw_from_nose_or_north_is_converted(
-    flags: int, delta_deg: float, heading: float | None, yaw_deg: float, from_nose_deg: float | None
+    flags: int, delta_deg: float, heading: float | None, yaw_deg: float | None, from_nose_deg: float | None
 ) -> None:
     message = pointing(turned(10, -20, 30), flags, math.radians(delta_deg))
     attitude = gimbal.from_device(message, heading)

@@ -121,15 +121,14 @@ class PostedOrder:
                 await self._sender.request_mode(mode, self._order, base_mode=mode.base_mode, component_id=component_id)
                 await self.wait_confirmed(timeout)
             except CommandRejected as error:
-                # The order may have other modes, too, so its effect does not show that this mode was accepted.
-                if self._order.is_confirmed and self._session.telemetry.is_in(mode):
-                    return
-                if error.result != MavResult.TEMPORARILY_REJECTED or not attempts_left:
+                may_retry = error.result == MavResult.TEMPORARILY_REJECTED and attempts_left and not self.end
+                if may_retry and await self._is_valid_at_next_heartbeat(timeout):
+                    continue
+                # HEARTBEAT may have reported the effect before the refusal, or during the wait. The order may have
+                # other modes, too, so its effect alone does not show that this mode was accepted.
+                if not (self._order.is_confirmed and self._session.telemetry.is_in(mode)):
                     raise
-                if not await self._is_valid_at_next_heartbeat(timeout):
-                    raise
-            else:
-                return
+            return
 
     async def _is_valid_at_next_heartbeat(self, timeout: float) -> bool:
         """Wait for the next HEARTBEAT; return True if the order is still valid after it."""

@@ -246,11 +246,11 @@ class GimbalDevice:
         secondary = (message.secondary_control_sysid, message.secondary_control_compid)
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
-    def update_manager(self, component_id: int, rank: int, *, is_gone: bool) -> None:
-        """Record a manager. It replaces the present manager if that has a lower rank, or ``is_gone``."""
+    def update_manager(self, component_id: int, rank: int, *, is_old_gone: bool) -> None:
+        """Record a manager. It replaces the present manager if that has a lower rank, or if ``is_old_gone``."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
-        elif self.manager_id is None or rank > self._manager_rank or is_gone:
+        elif self.manager_id is None or rank > self._manager_rank or is_old_gone:
             self.manager_id = component_id
             self._manager_rank = rank
             self._status_ms = 0  # The time stamps of the new manager are from another clock.

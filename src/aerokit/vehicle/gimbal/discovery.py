@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 MAX_GIMBALS = 32
 GIMBAL_COMPONENT_IDS = frozenset((154, *range(171, 176)))
 UNKNOWN_ATTITUDE = GimbalAttitude(None, None, None, None)
+HEADING_MAX_AGE_S = 5.0
 # A component counts as gone if it is silent for this many seconds while the autopilot is not.
 MAX_SILENCE_S = 10.0
 # Precedence of managers. A device that manages itself has at least RANK_INFORMATION.
@@ -154,7 +155,7 @@ class GimbalRegistry:
         device.update_flags(message)
         attitude = UNKNOWN_ATTITUDE
         if all(map(math.isfinite, message.q)):
-            attitude = from_device(message, self._heading())
+            attitude = from_device(message, self.heading())
         device.set_attitude(message, attitude)
         if device is self.first_reporting:
             self.placeholder.update_flags(message)
@@ -162,7 +163,7 @@ class GimbalRegistry:
 
     def _on_orientation(self, message: MountOrientation) -> None:
         if self.first_reporting is None:
-            self.placeholder.set_attitude(message, from_orientation(message, self._heading()))
+            self.placeholder.set_attitude(message, from_orientation(message, self.heading()))
 
     def _on_status(self, message: GimbalManagerStatus) -> None:
         device = self._managed_device(message, message.gimbal_device_id)
@@ -182,7 +183,7 @@ class GimbalRegistry:
     ) -> GimbalDevice | None:
         """Record the sender as manager if its rank is high enough, and return the gimbal that its message is about.
 
-        None if orders to this gimbal go to another component.
+        Returns None if orders to this gimbal go to another component, or if the gimbal or the sender is unknown.
         """
         frame = message.received_frame
         if frame is None:
@@ -197,11 +198,11 @@ class GimbalRegistry:
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
         else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
             device = self._device_of(message, device_id)
-            rank = max(rank, RANK_INFORMATION)
+            rank = max(rank, RANK_INFORMATION)  # For its own gimbals, a status shows as much as an information.
         if device is None:
             return None
-        is_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)
-        device.update_manager(sender, rank, is_gone=is_gone)
+        is_old_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)
+        device.update_manager(sender, rank, is_old_gone=is_old_gone)
         return device if device.manager_id == sender else None
 
     def _device_with_own_id(self, device_id: int, *, may_be_new: bool) -> GimbalDevice | None:
@@ -216,9 +217,10 @@ class GimbalRegistry:
         if device is not None:
             device.device_information = message
 
-    def _heading(self) -> float | None:
-        attitude = self._session.telemetry.attitude.latest
-        return None if attitude is None else attitude.yaw_deg
+    def heading(self) -> float | None:
+        """Return the vehicle's heading in degrees; None while no recent one is known."""
+        attitude = self._session.telemetry.attitude
+        return attitude.value.yaw_deg if attitude.age <= HEADING_MAX_AGE_S else None
 
     def _on_reboot(self) -> None:
         # Control blocks and pending orders survive a reboot of the vehicle.

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.connection.bus import Detach
+    from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.gimbal.device import GimbalDevice, GimbalInformation
     from aerokit.vehicle.gimbal.pointing import Angles
@@ -173,6 +174,10 @@ class RoiMixin(GimbalMixin):
 INFORMATION_TIMEOUT_S = 2.0
 
 
+def _is_new(message: Message | None, before: Message | None) -> bool:
+    return message is not None and message is not before
+
+
 @checks_arguments
 class Gimbal(ReadOnly, PointingMixin, RoiMixin):
     """One gimbal with the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
@@ -195,10 +200,14 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
         orders = self._orders
         manager_id = await orders.find_manager()
         failure: CommandRejected | CommandTimeout | None = None
+        # Messages that were received before do not count as answers.
+        before = (orders.device.manager_information, orders.device.device_information)
         try:
             await orders.ask(GimbalManagerInformation.ID, manager_id)
             await orders.wait_for(
-                lambda: orders.device.manager_information, GimbalManagerInformation, INFORMATION_TIMEOUT_S
+                lambda: _is_new(orders.device.manager_information, before[0]),
+                GimbalManagerInformation,
+                INFORMATION_TIMEOUT_S,
             )
         except (CommandRejected, CommandTimeout) as error:
             failure = error
@@ -210,13 +219,15 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
             try:
                 await orders.ask(GimbalDeviceInformation.ID, target, attempts=1)
                 await orders.wait_for(
-                    lambda: orders.device.device_information, GimbalDeviceInformation, INFORMATION_TIMEOUT_S
+                    lambda: _is_new(orders.device.device_information, before[1]),
+                    GimbalDeviceInformation,
+                    INFORMATION_TIMEOUT_S,
                 )
             except (CommandRejected, CommandTimeout):
                 pass  # Autopilots do not support this message for servo gimbals.
         device = orders.device
         messages = (device.manager_information, device.device_information)
-        if messages == (None, None):
+        if not any(map(_is_new, messages, before)):
             raise failure or CommandTimeout(
                 f"{orders.name}: the request for information was accepted, but no information was received;"
                 f" {self._session.describe_link()}"
@@ -250,7 +261,8 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
             frame: ``"earth"``: the yaw stays relative to north; ``"vehicle"``: the gimbal turns with the vehicle.
             rate_hz: how often the latest rates are sent, 2 to 100.
             valid_for_s: stop the gimbal if no new rates are set for this many seconds.
-            max_lag_s: stop the gimbal if the event loop is blocked for this many seconds.
+            max_lag_s: if the event loop is blocked for longer than this many seconds, stop the gimbal as soon as the
+                loop runs again.
 
         Raises:
             InvalidArgument: a value is out of range. Nothing was sent.

@@ -38,6 +38,7 @@ LOCKED = LEVEL | GimbalManagerFlags.YAW_LOCK
 # Ids with a special meaning in MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE.
 RELEASE, UNCHANGED = -3, -1
 MANAGER_TIMEOUT_S = 1.0
+HEADING_TIMEOUT_S = 3.0
 STANDARD_RULES = GimbalRules()
 
 
@@ -49,7 +50,7 @@ class GimbalOrders:
         self.session: VehicleSession = context.session
         self.registry: GimbalRegistry = registry
         self._device = device
-        # The manager whose control was claimed outside of a control block.
+        # The manager to which a claim of control was sent outside of a control block.
         self._claimed_manager_id: int | None = None
 
     @property
@@ -125,7 +126,7 @@ class GimbalOrders:
         except CommandRejected:
             self.raise_if_taken()
             was_claimed = self.claim_if_denied(command)
-            if not was_claimed:  # The manager refused for another reason.
+            if not was_claimed:  # The manager refused for another reason, or an open control block handles control.
                 raise
             await send()
 
@@ -173,6 +174,7 @@ class GimbalOrders:
 
         Returns False if MOUNT_CONFIGURE was sent, which contains the mode but no angles.
         """
+        self.raise_if_taken()
         if not self.session.commands.is_unsupported(MOUNT, self.manager_id):
             try:
                 unused_place = (0, 0, 0)  # altitude, latitude, longitude
@@ -182,21 +184,25 @@ class GimbalOrders:
                     raise
             else:
                 return True
-        if not order.is_newest:  # A newer order was given during the wait for the answer, so nothing more is sent.
-            return True
         stabilized = {"stab_roll": 1, "stab_pitch": 1, "stab_yaw": 1}
-        self.session.send(MountConfigure(self.session.system_id, self.manager_id, mode, **stabilized))
+        self._send_unanswered(order, MountConfigure(self.session.system_id, self.manager_id, mode, **stabilized))
         return False
 
+    def _send_unanswered(self, order: Order, message: Message) -> None:
+        """Send a message without an acknowledgement. Raises OperationRejected if a newer order was given meanwhile."""
+        with self.context.arbiter.auxiliary_order(order):
+            self.session.send(message)
+
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
-        """Send mount angles. The mount turns with the vehicle, so a yaw from north is only correct when it is sent."""
-        attitude = self.session.telemetry.attitude.latest
-        heading = 0.0 if attitude is None else attitude.yaw_deg  # An unknown heading counts as north.
-        yaw_from_nose = yaw if from_nose else math.remainder(yaw - heading, 360.0)
+        """Send mount angles. The mount turns with the vehicle: a yaw from north is correct only at the time of sending.
+
+        Raises OperationTimeout if the vehicle's heading is needed and stays unknown.
+        """
+        yaw_from_nose = yaw if from_nose else math.remainder(yaw - await self._heading(), 360.0)
         were_angles_sent = await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose)
         if not were_angles_sent:
             # MOUNT_CONTROL, for older firmware, has a yaw from north, and all angles in centidegrees.
-            yaw_from_north = yaw + heading if from_nose else yaw
+            yaw_from_north = yaw + await self._heading() if from_nose else yaw
             message = MountControl(
                 self.session.system_id,
                 self.manager_id,
@@ -205,7 +211,20 @@ class GimbalOrders:
                 input_c=round(yaw_from_north * 100),
                 save_position=0,
             )
-            self.session.send(message)
+            self._send_unanswered(order, message)
+
+    async def _heading(self) -> float:
+        """Return the vehicle's heading in degrees; request it, and wait for it, if no recent one is known."""
+        heading = self.registry.heading()
+        if heading is None:
+            with self.session.streaming("attitude"):
+                attitude = await self.session.telemetry.attitude.wait_until(
+                    lambda _: self.registry.heading() is not None,
+                    timeout=HEADING_TIMEOUT_S,
+                    description=f"{self.name}: the vehicle's heading, to convert the yaw",
+                )
+            heading = attitude.yaw_deg
+        return heading
 
     def ask_in_background(self, message_id: int) -> None:
         """Request a message from the manager once; errors are ignored."""
@@ -222,15 +241,15 @@ class GimbalOrders:
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )
 
-    async def wait_for(self, value: Callable[[], object], message_type: type[Message], within_s: float) -> None:
-        """Wait until ``value()`` is not None, at most ``within_s`` seconds. Each message of the type causes a check."""
+    async def wait_for(self, is_done: Callable[[], bool], message_type: type[Message], within_s: float) -> None:
+        """Wait until ``is_done()``, at most ``within_s`` seconds. Each message of the type causes a check."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:
-            if value() is not None:
+            if is_done():
                 done.set()
 
-        if value() is not None:
+        if is_done():
             return
         bus = self.session.connection.bus
         detach = bus.attach(message_type, check, system_id=self.session.system_id)
@@ -248,7 +267,7 @@ class GimbalOrders:
             # If the device does not answer, the autopilot counts as the manager.
             with suppress(CommandRejected, CommandTimeout):
                 await self.ask(GimbalManagerInformation.ID, device.component_id, attempts=1)
-                await self.wait_for(lambda: device.manager_id, GimbalManagerInformation, MANAGER_TIMEOUT_S)
+                await self.wait_for(lambda: device.manager_id is not None, GimbalManagerInformation, MANAGER_TIMEOUT_S)
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
@@ -265,7 +284,7 @@ class GimbalOrders:
     def claim_if_denied(self, command: int) -> bool:
         """Claim control if the manager denied this command because we are not in control.
 
-        Returns True if control was claimed.
+        Returns True if a claim was sent; its answer is not awaited.
         """
         commands, manager_id = self.session.commands, self.manager_id
         # An open control block has requested control itself, and reports if it loses control.
@@ -279,8 +298,8 @@ class GimbalOrders:
     async def release_control(self, order: Order) -> None:
         """Release control that was claimed outside of a control block."""
         if self._claimed_manager_id == self.manager_id:
-            self._claimed_manager_id = None
             await self.send(order, CONFIGURE, *self.control_params(is_primary=True, release=True))
+            self._claimed_manager_id = None
 
     def raise_if_taken(self) -> None:
         """Raise GimbalTaken if an open control block has lost control and no other open block is in control."""

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
 from aerokit._internal.arguments import check_range, checks_arguments
-from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, OperationTimeout
+from aerokit.errors import (
+    CommandRejected,
+    CommandTimeout,
+    HeartbeatTimeout,
+    InvalidArgument,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.enums import GimbalDeviceFlags, MavMountMode
 from aerokit.mavlink.messages import GimbalDeviceAttitudeStatus
 from aerokit.vehicle.commanding.order import SUPERSEDED
@@ -89,9 +96,15 @@ class RestTarget:
             self._last_angles = (pitch, roll, yaw)
             self._moved_at = updated_at
             return False
-        is_ahead = abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
+        is_ahead = self._is_direction_known(device) and abs(pitch) <= 2 * STILL_DEG and abs(yaw) <= 2 * STILL_DEG
         is_at_rest = bool(device.flags & self._flag) or (self._accepts_ahead and is_ahead)
         return updated_at - self._moved_at >= STILL_S and is_at_rest
+
+    def _is_direction_known(self, device: GimbalDevice) -> bool:
+        attitude, source = device.attitude.value, device.attitude.source
+        # MOUNT_STATUS has no yaw from the nose, so its pitch decides.
+        has_no_yaw = source is not None and source.message == "MOUNT_STATUS"
+        return attitude.pitch_deg is not None and (attitude.yaw_from_nose_deg is not None or has_no_yaw)
 
     def _has_moved(self, angles: tuple[float, float, float]) -> bool:
         if self._last_angles is None:
@@ -105,18 +118,16 @@ class RestTarget:
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Request the attitude from the autopilot during a block.
+    """Request the gimbal's attitude from the autopilot, and the vehicle's attitude to convert yaws, during a block.
 
     Gimbals with their own component id send their attitude without a request.
     """
-    if orders.device.component_id not in (0, orders.session.component_id):
+    session = orders.session
+    with ExitStack() as requests:
+        requests.enter_context(session.streaming("attitude"))
+        if orders.device.component_id in (0, session.component_id):
+            requests.callback(session.rates.request(GimbalDeviceAttitudeStatus, ACTION_HZ, is_optional=True))
         yield
-        return
-    release = orders.session.rates.request(GimbalDeviceAttitudeStatus, ACTION_HZ, is_optional=True)
-    try:
-        yield
-    finally:
-        release()
 
 
 async def wait_until_reached(
@@ -264,7 +275,8 @@ class PointingMixin(GimbalMixin):
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
                 then turns with the vehicle, so a yaw from north is correct only at the time of the order.
-            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards.
+            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards, except after a
+                mount command (see ``roll_deg`` and below), after which it always turns with the vehicle.
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
@@ -274,8 +286,8 @@ class PointingMixin(GimbalMixin):
         support that command either, it gets MOUNT_CONTROL, which is not acknowledged.
 
         Raises:
-            InvalidArgument: an angle is out of range, or beyond the limits of the gimbal if :meth:`information` was
-                called before. Nothing was sent.
+            InvalidArgument: an angle or the tolerance is out of range, or an angle is beyond the limits of the gimbal
+                if :meth:`information` was called before. Nothing was sent.
 
         Otherwise raises as :meth:`neutral`.
         """
@@ -344,9 +356,15 @@ class PointingMixin(GimbalMixin):
         Raises:
             CommandRejected: the vehicle refused.
             CommandTimeout: there was no answer.
+            GimbalTaken: your program had control and lost it. Nothing was sent.
+            OperationRejected: another order was given meanwhile.
         """
         order = self._orders.begin_order()
-        await self._orders.send_mount_mode(order, MavMountMode.RC_TARGETING)
+        try:
+            await self._orders.send_mount_mode(order, MavMountMode.RC_TARGETING)
+        except (CommandRejected, CommandTimeout):
+            await self._orders.release_control(order)
+            raise
         await self._orders.release_control(order)
 
     async def _rest(self, action: str, flag: int, mode: int, *, wait: bool, timeout: float) -> None:

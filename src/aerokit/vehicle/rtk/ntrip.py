@@ -132,7 +132,7 @@ class _Response:
         return cls(reader, status, headers)
 
     async def body(self) -> AsyncIterator[bytes]:
-        """Yield the data until the caster closes the connection."""
+        """Yield the data until the caster ends them. Raises ValueError for an invalid chunk."""
         if self._headers.get("transfer-encoding") != "chunked":
             while data := await self._reader.read(4096):
                 yield data
@@ -140,8 +140,10 @@ class _Response:
         while line := await self._reader.readline():
             size_text, _, _ = line.partition(b";")  # Extensions of the chunk may follow the size.
             chunk_size = int(size_text or b"0", 16)
-            if not 0 < chunk_size <= MAX_CHUNK_SIZE:  # Size 0 ends the body; a greater size is invalid.
+            if chunk_size == 0:  # The end of the body.
                 return
+            if not 0 < chunk_size <= MAX_CHUNK_SIZE:
+                raise ValueError("invalid chunk size")
             yield await self._reader.readexactly(chunk_size)
             await self._reader.readline()  # Skip the line break after the chunk.
 
@@ -156,7 +158,7 @@ class NtripClient:
     Entering raises:
         OperationRejected: the caster refused the user or the password, or has no such mount point. The error text lists
             the caster's mount points.
-        LinkOpenError: the caster could not be reached.
+        LinkOpenError: the caster could not be reached, or the connection failed before its answer.
         OperationTimeout: the caster did not answer in time.
         BusyError: the client was entered before; call ``ntrip()`` again.
     """
@@ -292,6 +294,7 @@ class NtripClient:
         finally:
             if position_task is not None:
                 position_task.cancel()
+                # If sending the position failed, so did reading, which says why.
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {message_count} messages")
@@ -339,7 +342,7 @@ class NtripClient:
         except (OSError, ValueError) as error:
             self._close()
             reason = getattr(error, "strerror", None) or type(error).__name__
-            raise LinkOpenError(f"{self._name}: the caster could not be reached: {reason}") from None
+            raise LinkOpenError(f"{self._name}: the connection to the caster failed: {reason}") from None
 
     async def _asks_for_position(self) -> bool:
         """Return True if the source table says that the mount point needs the position (GGA)."""
@@ -352,11 +355,12 @@ class NtripClient:
     async def _read_source_table(self, response: _Response) -> dict[str, bool]:
         """Read a source table: map each mount point to True if it needs the position (field ``nmea``)."""
         text = b""
-        # If the table does not arrive completely, use the rows that have arrived.
-        with suppress(OSError, ValueError, EOFError, asyncio.TimeoutError):
+        # If the table does not arrive completely in time, use the rows that have arrived.
+        with anyio.move_on_after(self._timeout), suppress(OSError, ValueError, EOFError):
             async for data in response.body():
                 text += data
-                if b"ENDSOURCETABLE" in data or len(text) > MAX_TABLE_SIZE:
+                # The last row may arrive in two pieces.
+                if b"ENDSOURCETABLE" in text[-len(data) - 14 :] or len(text) > MAX_TABLE_SIZE:
                     break
         # In a row, column 1 is the name of the mount point, and column 11 is `nmea`.
         rows = [line.split(";") for line in text.decode("latin-1").splitlines() if line.startswith("STR;")]

@@ -137,7 +137,10 @@ class Rtk:
         return NtripClient(self._session, self._send, Caster.parse(url), send_position, timeout)
 
     def _send(self, message: bytes) -> None:
-        """Send one RTCM message and update the statistics."""
+        """Send one RTCM message and update the statistics.
+
+        A message that another vehicle of this connection has just sent counts too, because it reaches all vehicles.
+        """
         if self._session.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
         send_rtcm(self._session.connection, message, self)

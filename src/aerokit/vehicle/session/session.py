@@ -59,16 +59,20 @@ if TYPE_CHECKING:
 # Seconds between requests for constants that are not known yet.
 RETRY_INTERVAL_S = 3.0
 
+# The modes are requested until one is received, or until this many requests were answered. An answer may belong to an
+# earlier request, because PX4 acknowledges a command over each of its ports.
+MAX_MODE_REQUESTS = 3
+
 # Number of requests for the version that are sent at short intervals at first, and the interval in seconds.
 EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home and origin until they are known, and again after each reboot. Request the modes once.
+    """Request version, home and origin until they are known, and again after each reboot. Request the modes.
 
     Runs until the link closes.
     """
-    has_requested_modes = False
+    mode_requests_left = MAX_MODE_REQUESTS
     await _learn_version(commands, telemetry)
     while connection.is_open:
         for message_id, cell in (
@@ -78,8 +82,10 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
         ):
             if not cell.is_known:
                 await _request(commands, message_id)
-        if not has_requested_modes:  # Only once, because the mode names are kept when the vehicle reboots.
-            has_requested_modes = await _request(commands, AvailableModes.ID)
+        # Not again after a reboot, because the mode names are kept.
+        if mode_requests_left and not telemetry.has_available_modes:
+            is_answered = await _request(commands, AvailableModes.ID)
+            mode_requests_left -= is_answered
         await anyio.sleep(RETRY_INTERVAL_S)
 
 

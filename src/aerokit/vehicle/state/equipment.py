@@ -314,8 +314,8 @@ class GimbalAttitude(Snapshot):
 
     ``pitch_deg`` (0 level, −90 straight down) and ``roll_deg`` are from the horizon. ``yaw_deg`` is 0 to 360 clockwise
     from north, ``yaw_from_nose_deg`` −180 to 180 clockwise from the vehicle's nose. While the vehicle's heading is
-    unknown, ``yaw_deg`` may be relative to the nose. ArduPilot before 4.3 reports MOUNT_STATUS, whose yaw may be
-    relative to north or to the nose; ``yaw_deg`` is then this yaw, unchanged.
+    unknown, one of the two may be None. ArduPilot before 4.3 reports MOUNT_STATUS, whose yaw may be relative to north
+    or to the nose; ``yaw_deg`` is then this yaw, unchanged.
     """
 
     pitch_deg: float | None
@@ -332,23 +332,21 @@ def from_status(message: MountStatus) -> GimbalAttitude:
 def from_orientation(message: MountOrientation, heading: float | None) -> GimbalAttitude:
     """Return the attitude of MOUNT_ORIENTATION, whose yaw from north may be missing.
 
-    ``heading`` is the vehicle's heading in degrees; while it is unknown, ``yaw_deg`` is relative to the nose.
+    ``heading`` is the vehicle's heading in degrees. While that is unknown too, ``yaw_deg`` is None.
     """
     # ``yaw_absolute`` is an extension field: 0 may mean that it was not sent.
     if message.yaw_absolute and math.isfinite(message.yaw_absolute):
         yaw = _rounded_to_360(message.yaw_absolute)
-    elif heading is not None:
-        yaw = _rounded_to_360(message.yaw + heading)
     else:
-        yaw = _rounded(message.yaw)
+        yaw = None if heading is None else _rounded_to_360(message.yaw + heading)
     return GimbalAttitude(_rounded(message.pitch), _rounded(message.roll), yaw, _rounded_to_180(message.yaw))
 
 
 def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> GimbalAttitude:
     """Return the attitude of GIMBAL_DEVICE_ATTITUDE_STATUS.
 
-    A yaw from the nose is converted to a yaw from north by ``delta_yaw`` in the message, or by the vehicle's
-    ``heading`` in degrees. While both are unknown, ``yaw_deg`` stays relative to the nose.
+    Yaws from the nose and from north are converted by ``delta_yaw`` in the message, or by the vehicle's ``heading`` in
+    degrees. While both are unknown, the yaw that would need the conversion is None.
     """
     pitch, roll, yaw = _euler(message.q)
     # Older gimbals send neither these flags nor ``delta_yaw``, which is an extension of the message.
@@ -359,7 +357,7 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> G
         nose_heading = heading
     pitch_and_roll = (_rounded(pitch), _rounded(roll))
     if _is_from_nose(message.flags):
-        yaw_from_north = _rounded(yaw) if nose_heading is None else _rounded_to_360(yaw + nose_heading)
+        yaw_from_north = None if nose_heading is None else _rounded_to_360(yaw + nose_heading)
         return GimbalAttitude(*pitch_and_roll, yaw_from_north, _rounded_to_180(yaw))
     yaw_from_nose = None if nose_heading is None else _rounded_to_180(yaw - nose_heading)
     return GimbalAttitude(*pitch_and_roll, _rounded_to_360(yaw), yaw_from_nose)

@@ -62,6 +62,8 @@ class Telemetry(States):
         # Arrival time of the message that is being processed; None if it has no frame, and between messages.
         self._arrived_at: float | None = None
         self._texts = StatusTextAssembler()
+        self.has_available_modes: bool = False
+        """True once AVAILABLE_MODES was received."""
         # Maps custom_mode to the name in AVAILABLE_MODES.
         self._mode_names: dict[int, str] = {}
         # Additional input of the decoders, the same object for all of them.
@@ -311,6 +313,7 @@ class Telemetry(States):
 
     def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
         """Store the name of a mode, unless the autopilot's own table has the mode or too many names are stored."""
+        self.has_available_modes = True
         name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
         if name is not None and (message.custom_mode in self._mode_names or len(self._mode_names) < MAX_MODE_NAMES):
             self._mode_names[message.custom_mode] = name
