@@ -377,7 +377,12 @@ def test_connection_end_while_reading_parameter_raises(fc: FlightController) -> 
     fc.parameters.is_silent = True
     with connected(fc) as vehicle:
         handler = vehicle._handler
-        fc.answers["PARAM_REQUEST_READ"] = lambda _: handler.loop.call_soon(handler.connection.close)
+
+        def close(_: Received) -> None:
+            fc.answers["PARAM_REQUEST_READ"] = lambda _: None
+            handler.loop.call_soon(handler.connection.close)
+
+        fc.answers["PARAM_REQUEST_READ"] = close
         with pytest.raises(dronekit.APIException, match="closed"):
             vehicle.parameters["FOO"]
 

@@ -311,7 +311,7 @@ def test_pymavlink_module_import_error_is_raised(tmp_path: Path, monkeypatch: py
         Dialect.from_pymavlink("broken_dialect")
 
 
-def test_missing_module_with_prefix_of_dialect_name_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_module_with_similar_name_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "absent_module_dialect.py").write_text("import absent_module\n")
     with pytest.raises(ModuleNotFoundError, match="absent_module"):
