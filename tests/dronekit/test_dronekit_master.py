@@ -321,6 +321,19 @@ def test_recv_match_returns_messages_in_order(connected: Connected) -> None:
     assert master.recv_match(type="ATTITUDE", blocking=True, timeout=0.01) is None
 
 
+def test_location_is_newest_received(connected: Connected) -> None:
+    master, vehicle = connected
+    len(master.messages)  # From the first access on, messages are stored.
+    for latitude in (470000000, 480000000):
+        vehicle.mav.gps_raw_int_send(0, 3, latitude, 80000000, 0, 0, 0, 0, 0, 9)
+        vehicle.mav.vfr_hud_send(0, 0, 271, 0, latitude / 1e6, 0)
+        vehicle.mav.global_position_int_send(0, latitude, 80000000, 0, latitude, 0, 0, 0, 0)
+    until(lambda: "GLOBAL_POSITION_INT" in master.messages)
+    until(lambda: bool(master.messages["GLOBAL_POSITION_INT"].lat == 480000000))
+    location = master.location()
+    assert (location.lat, location.lng, location.alt, location.heading) == (48.0, 8.0, 480.0, 271)
+
+
 def test_wait_heartbeat(connected: Connected) -> None:
     master, vehicle = connected
     found: list[Any] = []
@@ -360,6 +373,8 @@ def test_recv_match_ends_on_close(connected: Connected) -> None:
     master.close()
     waiting.join(LIMIT_S)
     assert len(ended) == 1
+    with pytest.raises(APIException, match="closed"):
+        master.recv_match(type="ATTITUDE")
     with pytest.raises(APIException):
         master.arducopter_arm()
 

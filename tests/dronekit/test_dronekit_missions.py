@@ -173,6 +173,15 @@ def test_next_unconfirmed_message_is_followed_by_command(three: Pair, monkeypatc
     assert controller.wait_for_command(224).param1 == 2
 
 
+def test_next_is_not_confirmed_by_older_message(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("aerokit.dronekit.flight_orders.MISSION_CURRENT_TIMEOUT_S", 0.3)
+    controller, cmds = three
+    controller.answers["MISSION_SET_CURRENT"] = lambda frame: None
+    assert next_becomes(cmds, 2, lambda: controller.report("MISSION_CURRENT", seq=2))
+    cmds.next = 2
+    assert controller.wait_for_command(224).param1 == 2
+
+
 def test_next_is_not_repeated_while_vehicle_is_silent(
     three: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -373,6 +373,20 @@ def test_unanswered_parameter_waits_for_list(fc: FlightController) -> None:
         assert vehicle.parameters.known_values().keys() == {"FOO", "BAR", "THR_MIN"}
 
 
+def test_connection_end_while_reading_parameter_raises(fc: FlightController) -> None:
+    fc.parameters.is_silent = True
+    with connected(fc) as vehicle:
+        handler = vehicle._handler
+
+        def close(_: Received) -> None:
+            fc.answers["PARAM_REQUEST_READ"] = lambda _: None
+            handler.loop.call_soon(handler.connection.close)
+
+        fc.answers["PARAM_REQUEST_READ"] = close
+        with pytest.raises(dronekit.APIException, match="closed"):
+            vehicle.parameters["FOO"]
+
+
 def test_parameters_added_later_are_found(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     assert "NEW" not in vehicle.parameters
     fc.parameters.values["NEW"] = 5.0

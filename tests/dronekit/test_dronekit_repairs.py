@@ -145,6 +145,15 @@ def test_rejections_are_warnings_with_reason(copter: Stage) -> None:
     assert "Compass not healthy" in lines[0]
 
 
+def test_altitude_of_home_unknown_sends_no_goto(copter: Stage) -> None:
+    copter.vehicle._home_location = dronekit.LocationGlobal(47.0, 8.0)  # as programs do that use DroneKit's privates
+    since = copter.fc.mark()
+    with pytest.raises(dronekit.APIException, match="home"):
+        copter.vehicle.simple_goto(dronekit.LocationGlobal(47.1, 8.1, 600))
+    copter.reached()
+    assert not [frame for frame in copter.fc.received("COMMAND_INT", since=since) if frame.command == 192]
+
+
 def test_lost_orders_are_repeated(copter: Stage) -> None:
     copter.fc.results[178] = None
     copter.vehicle.groundspeed = 5

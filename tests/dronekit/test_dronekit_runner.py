@@ -125,6 +125,15 @@ def test_module_environment_matches_python(tmp_path: Path) -> None:
     assert run("-m", "aerokit.dronekit", *arguments, cwd=tmp_path).stdout == run(*arguments, cwd=tmp_path).stdout
 
 
+def test_module_package_may_change_search_path(tmp_path: Path) -> None:
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "__init__.py").write_text("import sys\nsys.path.insert(0, 'vendored')\n")
+    program(tmp_path / "package", "import json, sys\njson.dump(sys.path[:2], sys.stdout)\n")
+    arguments = ("-m", "package.program")
+    ours = run("-m", "aerokit.dronekit", *arguments, cwd=tmp_path)
+    assert json.loads(ours.stdout) == json.loads(run(*arguments, cwd=tmp_path).stdout) == ["vendored", str(tmp_path)]
+
+
 @pytest.mark.parametrize(
     "text",
     ["import sys\n\ndef fail():\n    raise ValueError('no')\n\nfail()\n", "x = = 1\n"],

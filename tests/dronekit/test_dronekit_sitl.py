@@ -6,14 +6,17 @@ import random
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from aerokit.dronekit import runner
-from aerokit.dronekit.sitl import SITL, start_default
+from aerokit.dronekit.sitl import SITL, ServedVehicle, start_default
 from aerokit.errors import InvalidArgument, LinkOpenError
 
+LIMIT_S = 100.0
 OWN = """\
 import dronekit_sitl
 from dronekit import connect
@@ -117,6 +120,51 @@ def test_sim_option_serves_vehicle(
     notified = capsys.readouterr()
     assert (code, notified.out) == (0, "STABILIZE\n")
     assert f"a simulated copter is on tcp:127.0.0.1:{port}" in notified.err
+
+
+def simulated_vehicle_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "aerokit simulated vehicle"]
+
+
+def test_sim_option_missing_module_stops_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    addresses = ("tcpin:127.0.0.1:0", f"udpout:127.0.0.1:{5760 + 10 * free_instance()}")
+    monkeypatch.setattr("aerokit.dronekit.sitl.USUAL_ADDRESSES", addresses)
+    monkeypatch.setattr(sys, "path", ["", *sys.path])
+    try:
+        assert runner.main(["--sim", "-m", "no_such_module"]) == 1
+    finally:
+        runner.uninstall()
+    assert not simulated_vehicle_threads()
+
+
+def test_sitl_start_timeout_ends_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    may_start = threading.Event()
+    monkeypatch.setattr("aerokit.dronekit.sitl.scale_timeouts", lambda *_: may_start.wait(LIMIT_S))
+    monkeypatch.setattr("aerokit.dronekit.sitl.START_TIMEOUT_S", 0.0)
+    with pytest.raises(LinkOpenError, match="not started within 0 s"):
+        ServedVehicle("copter", ["tcpin:127.0.0.1:0"])
+    may_start.set()
+    for thread in simulated_vehicle_threads():
+        thread.join(LIMIT_S)
+        assert not thread.is_alive()
+
+
+def test_sitl_model_has_priority_over_sim_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Launched:
+        kind, speedup, is_up = "copter", 1.0, False
+
+        def __init__(self, kind: str, *_: Any, **__: Any) -> None:
+            self.kind = kind
+
+        def stop(self) -> None: ...
+
+    monkeypatch.setattr("aerokit.dronekit.sitl.ServedVehicle", Launched)
+    for arguments, kind in ((["--model", "plane"], "plane"), (["--model", "quad"], "rover")):
+        monkeypatch.setattr("aerokit.dronekit.sitl._vehicle_for_program", Launched("rover"))
+        sitl = SITL(instance=0)
+        sitl.launch(arguments)
+        assert sitl._served is not None
+        assert sitl._served.kind == kind
 
 
 @pytest.mark.sampled(2)

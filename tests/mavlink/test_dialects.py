@@ -311,6 +311,13 @@ def test_pymavlink_module_import_error_is_raised(tmp_path: Path, monkeypatch: py
         Dialect.from_pymavlink("broken_dialect")
 
 
+def test_missing_module_with_similar_name_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "absent_module_dialect.py").write_text("import absent_module\n")
+    with pytest.raises(ModuleNotFoundError, match="absent_module"):
+        Dialect.from_pymavlink("absent_module_dialect")
+
+
 # -------------------------------------------------------------------------------- combined dialects
 
 
@@ -359,7 +366,7 @@ def test_conflicting_dialects_are_rejected(tmp_path: Path) -> None:
     private = Dialect.from_xml(write(tmp_path, include="empty.xml", id=30))
     with pytest.raises(InvalidArgument) as caught:
         STANDARD.extended_by(private)
-    assert "message id 30 is ATTITUDE (CRC_EXTRA 39) in 'standard', but WINCH_REPORT" in str(caught.value)
+    assert "message id 30 is ATTITUDE (CRC_EXTRA 39, 28 bytes) in 'standard', but WINCH_REPORT" in str(caught.value)
 
 
 # ------------------------------------------------------------------------------------- the standard

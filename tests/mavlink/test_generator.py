@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink import enums, generator, messages
+from aerokit.mavlink import enums, generator, messages, rendering
 from aerokit.mavlink.definitions import DialectDefinition, merged_enums, read_xml
 from aerokit.mavlink.generator import read_additions, with_added_enums, with_added_messages
 
@@ -59,6 +60,12 @@ def test_generator_writes_without_check(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(generator, "FOLDER", tmp_path)
     assert generator.main([]) == 0
     assert {path: (tmp_path / path).read_bytes().decode() for path in files} == files
+
+
+@pytest.mark.parametrize("text", ['the "best"', '"', 'x"'])
+def test_docstring_ending_with_quotation_mark_is_valid(text: str) -> None:
+    (line,) = rendering._docstring([text], "")
+    assert ast.literal_eval(line) == f"{text} "
 
 
 @pytest.mark.parametrize("other", [False, True])

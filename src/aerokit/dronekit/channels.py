@@ -242,7 +242,10 @@ class ChannelsOverride(_ChannelDict):
         return checked
 
     def _send(self, active: dict[str, int], released: set[str]) -> None:
-        """Send RC_CHANNELS_OVERRIDE with the overridden channels, and with the channels to release."""
+        """Send RC_CHANNELS_OVERRIDE with the overridden channels, and with the channels to release.
+
+        Channels 1 to 8 that are not overridden are always released, higher ones only if they are in ``released``.
+        """
         aio = self._core.check_link()
         if aio.connection.mavlink_version == 1 and any(int(channel) > MAVLINK_1_CHANNELS for channel in active):
             raise APIException("channels above 8 need MAVLink 2, and this vehicle uses MAVLink 1")

@@ -246,6 +246,7 @@ class CommandSequence:
 
     def __setitem__(self, index: int, value: Any) -> None:
         self._require_downloaded()
+        # As in DroneKit, the object itself is stored, unlike by add(), so that the program can continue to edit it.
         command = value if isinstance(value, Command) else _command_from(value)
         with self._lock:
             items = list(self._state.items)
@@ -374,8 +375,8 @@ def _comparable(value: Any) -> Any:
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
     """Return True if a command is the home row of a waypoint file rather than a waypoint.
 
-    The home row is a waypoint without parameters whose altitude is above sea level. In addition, its ``current`` is 1,
-    its position is all zeros, or its position is that of home.
+    The home row is a waypoint without parameters whose frame has altitudes above sea level. In addition, its
+    ``current`` is 1, its position is all zeros, or its position is that of home.
     """
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False

@@ -118,11 +118,7 @@ class LatestMessage(Generic[MessageT]):
         return tuple([None if message is None else getattr(message, field) for field in fields])
 
     def add(self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None) -> None:
-        """Add a handler, called with each message.
-
-        With ``names``, the handler is called only while one of these attributes has no value yet, or has listeners on
-        the vehicle or in ``listeners``.
-        """
+        """Add a handler; see :meth:`Core.on`."""
         self._handlers.append(handler)
         self._announced_names.update(names)
         if listeners is not None:
@@ -211,10 +207,11 @@ class Core:
     ) -> LatestMessage[MessageT]:
         """Call a handler with each message of this type from the autopilot; return the holder of the latest message.
 
-        The handler is called on the loop thread, as long as this object exists.
+        The handler is called on the loop thread, as long as this object exists. Add it before the vehicle is connected.
 
-        If the handler only announces attributes, pass their ``names``. The handler is then called only while one of
-        these attributes has no value yet, or has listeners on the vehicle or in ``listeners``.
+        If the handlers of a type only announce attributes, pass their ``names``. The handlers are then called only
+        while one of these attributes has no value yet, or has listeners on the vehicle or in ``listeners``. Do not mix
+        them with handlers that need each message.
         """
         if message_type not in self._latest:
             self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)

@@ -49,7 +49,7 @@ class FlightMethods(VehicleAttributes):
 
         Set it to a :class:`VehicleMode`, a name or, on ArduPilot, a number. Setting it sends the order at once
         (MAV_CMD_DO_SET_MODE, or SET_MODE for old firmware) and does not wait; :meth:`wait_for_mode` waits. Raises
-        KeyError, without sending, if the vehicle has no such mode.
+        KeyError, without sending, if the vehicle has no mode of this name; numbers are not checked.
         """
         return VehicleMode(self._flightmode)
 
@@ -147,14 +147,14 @@ class FlightMethods(VehicleAttributes):
             # ArduPilot takes the altitude above home, and does not change the mode when it gets this command.
             params = (0, 0, 0, 0, 0, 0, altitude)
             return order_take_off((), MavCmd.NAV_TAKEOFF, *params)
-        plan = aio.autopilot.take_off(altitude, self._dk_known_home().alt, is_vtol=aio.is_vtol)
+        plan = aio.autopilot.take_off(altitude, self._dk_home_altitude(), is_vtol=aio.is_vtol)
         mode = aio.autopilot.mode_for("take_off")
         if plan is None or plan.command is None or mode is None:
             raise APIException("simple_takeoff: this vehicle has no take-off command")
         return order_take_off((mode,), plan.command, *plan.params)
 
     def wait_simple_takeoff(self, alt: float | None = None, epsilon: float = 0.1, timeout: float | None = None) -> None:
-        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`.
+        """Call :meth:`simple_takeoff` and wait like :meth:`wait_for_alt`. Without an altitude, do nothing.
 
         Raises TimeoutError as soon as the order fails.
         """
@@ -185,8 +185,7 @@ class FlightMethods(VehicleAttributes):
         """
         aio = self._dk.check_link()
         modes = flight_orders.reposition_modes(aio)
-        # Autopilots without reposition modes take the altitude above home.
-        target = self._dk_target(location, is_relative=not modes)
+        target = self._dk_target(location, is_relative=not aio.autopilot.repositions_amsl)
         for name, speed in (("airspeed", airspeed), ("groundspeed", groundspeed)):
             flight_orders.check_speed(name, speed)  # Raises before anything is sent.
         if modes and self._flightmode not in map(str, modes):
@@ -208,9 +207,9 @@ class FlightMethods(VehicleAttributes):
             raise ValueError("Expecting location to be LocationGlobal or LocationGlobalRelative.")
         latitude, longitude, altitude = flight_orders.checked_location(location)
         if is_relative and isinstance(location, LocationGlobal):
-            altitude -= self._dk_known_home().alt or 0.0
+            altitude -= self._dk_home_altitude()
         elif not is_relative and not isinstance(location, LocationGlobal):
-            altitude += self._dk_known_home().alt or 0.0
+            altitude += self._dk_home_altitude()
         return latitude, longitude, altitude
 
     # -------------------------------------------------------------------------------- speeds
@@ -245,8 +244,8 @@ class FlightMethods(VehicleAttributes):
     def home_location(self) -> LocationGlobal | Any:
         """Home location, a new object each time; None until HOME_POSITION or a downloaded mission reports home.
 
-        Set it to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME); the attribute changes at once. Raises ValueError,
-        without sending, for another type or for a missing or wrong number.
+        Set it to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME). As in DroneKit, the attribute changes at once; a
+        refusal restores it. Raises ValueError, without sending, for another type or for a missing or wrong number.
         """
         home = self._home_location
         return None if home is None else LocationGlobal(home.lat, home.lon, home.alt)
@@ -267,14 +266,14 @@ class FlightMethods(VehicleAttributes):
         if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_reported_home
 
-    def _dk_known_home(self) -> LocationGlobal:
-        """Return home. If it is unknown, request it; APIException if the vehicle has none."""
+    def _dk_home_altitude(self) -> float:
+        """Return home's altitude above sea level. If home is unknown, request it; APIException if there is none."""
         if self._home_location is None:
             self._dk.run(self._dk_fetch_home)
         home = self.home_location
-        if home is None:
+        if home is None or home.alt is None:
             raise APIException("the vehicle has not reported home yet: it sets home when it has a good position")
-        return home
+        return float(home.alt)
 
     async def _dk_fetch_home(self) -> None:
         aio = self._dk.check_link()

@@ -53,9 +53,9 @@ def mode_name(vehicle: AsyncVehicle, custom_mode: int) -> str:
 
 
 def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
-    """Return a mode by its name or, on ArduPilot, its number; KeyError if the vehicle has no such mode.
+    """Return a mode by its name or, on ArduPilot, its number; KeyError if the vehicle has no mode of this name.
 
-    The name must be in capitals, or spelled as the vehicle reports it.
+    The name must be in capitals, or spelled as the vehicle reports it. Numbers are not checked, as in DroneKit.
     """
     autopilot = _autopilot_with_mode_numbers(vehicle)
     if isinstance(mode, int) and autopilot.modes_are_numbered:
@@ -160,7 +160,7 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes that must be checked before a reposition command; empty if the vehicle checks its mode itself.
+    """Return the modes in which a reposition command may be sent; empty if the vehicle checks its mode itself.
 
     On PX4, the command sets the first of these modes. On other autopilots, it does not change the mode, and the vehicle
     refuses it in wrong modes.
@@ -251,8 +251,10 @@ class CurrentCommand:
             self._requested_index = seq - 1  # -1 is not the index of an item.
             return
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
+        current, sent_at = aio.telemetry.mission_current, aio.connection.now()
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
-            await aio.telemetry.mission_current.wait_until(lambda progress: progress.current == seq)
+            # A value from before the sending confirms nothing, even if it has this number.
+            await current.wait_until(lambda progress: progress.current == seq and current.updated_at > sent_at)
             return
         # MISSION_SET_CURRENT was not confirmed in time, so send a command instead, which the vehicle acknowledges.
         if aio.heartbeat_age > MODE_MAX_AGE_S:

@@ -186,7 +186,7 @@ class Master:
 
         From the first call on, messages are stored: the last 1,000, each for at most five seconds. If none matches,
         returns None at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises
-        APIException if the connection is closed.
+        APIException if the connection is closed and no stored message matches.
         """
         types = (type,) if isinstance(type, str) else type
         names = None if types is None else set(types)
@@ -219,13 +219,15 @@ class Master:
         return value
 
     def location(self, relative_alt: bool = False) -> Any:
-        """Wait for a 3D GPS fix and for new messages; return the vehicle's location as ``mavutil.location``.
+        """Wait for a 3D GPS fix, and return the vehicle's last location as ``mavutil.location``.
 
         ``alt`` is in metres above home with ``relative_alt``, otherwise above sea level.
         """
-        gps = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
-        hud = self.recv_match(type="VFR_HUD", blocking=True)  # As in pymavlink, the altitude is from VFR_HUD.
-        position = self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
+        self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
+        self.recv_match(type="VFR_HUD", blocking=True)  # As in pymavlink, the altitude is from VFR_HUD.
+        self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
+        # The messages that were waited for may have been stored for seconds, so the last ones are used.
+        gps, hud, position = map(self.messages.__getitem__, ("GPS_RAW_INT", "VFR_HUD", "GLOBAL_POSITION_INT"))
         alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
         return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)
 
@@ -333,14 +335,13 @@ class Inbox(Mapping[str, Any]):
                     frame = self._frames.popleft()
                     if now() - frame.received_at < MESSAGE_MAX_AGE_S:
                         return frame
+                self._raise_if_closed()
                 wait_s = SIGNAL_CHECK_INTERVAL_S
                 if deadline is not None:
                     wait_s = min(wait_s, deadline - time.monotonic())
-                if wait_s > 0:
-                    self._raise_if_closed()
-                    self._frame_arrived.wait(wait_s)
-                else:
+                if wait_s <= 0:
                     return None
+                self._frame_arrived.wait(wait_s)
 
     def _raise_if_closed(self) -> None:
         if self._connection.is_closed or not self._connection.connection.is_open:

@@ -71,9 +71,9 @@ class MAVConnection(ClassicConnection):
         """Functions called about 20 times a second; see :meth:`forward_loop`."""
         self.message_listeners: list[Callable[[MAVConnection, Any], object]] = []
         """Functions called with every message; see :meth:`forward_message`."""
-        collected = _collected_connections.get()
-        if collected is not None:
-            collected.add(self)
+        created = _created_connections.get()
+        if created is not None:
+            created.add(self)
 
     def fix_targets(self, message: Any) -> None:
         """Set ``message.target_system`` to the vehicle's system id, if the message has this field."""
@@ -183,7 +183,7 @@ class MAVConnection(ClassicConnection):
             self.connection.write_raw(frame.raw)
 
 
-_collected_connections: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar(
+_created_connections: ContextVar[weakref.WeakSet[MAVConnection] | None] = ContextVar(
     "created_connections", default=None
 )
 
@@ -192,11 +192,11 @@ _collected_connections: ContextVar[weakref.WeakSet[MAVConnection] | None] = Cont
 def created_connections() -> Iterator[weakref.WeakSet[MAVConnection]]:
     """Collect the connections that this thread creates in the block, by weak reference."""
     connections: weakref.WeakSet[MAVConnection] = weakref.WeakSet()
-    token = _collected_connections.set(connections)
+    token = _created_connections.set(connections)
     try:
         yield connections
     finally:
-        _collected_connections.reset(token)
+        _created_connections.reset(token)
 
 
 def _open(

@@ -58,7 +58,7 @@ class Listeners:
             if listener in present:
                 return
             self.by_name[name] = (*present, listener)
-            self._keep_owner()
+            self._update_kept_owner()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
         """Remove a listener; ValueError if the name has listeners, but not this one."""
@@ -73,7 +73,7 @@ class Listeners:
                 self.by_name[name] = remaining
             else:
                 del self.by_name[name]
-                self._keep_owner()
+                self._update_kept_owner()
 
     def has_listener(self, name: str) -> bool:
         return name in self.by_name or EVERY_NAME in self.by_name
@@ -84,8 +84,8 @@ class Listeners:
         With a listener thread, returns immediately or, with ``waits``, after the calls. Without one, the listeners run
         in this call.
 
-        With ``cache``, listeners are called only if the value has changed. Without it, values are skipped while too
-        many calls are queued.
+        With ``cache``, listeners are called only if the value has changed. Without ``cache`` and ``waits``, values are
+        skipped while too many calls are queued.
         """
         if cache:
             if name in self.last_values and self.last_values[name] == value:
@@ -120,7 +120,7 @@ class Listeners:
                 except BaseException:  # SystemExit, too, would only end the listener thread.
                     logger.exception("Exception in %s handler for %s", self.kind, attr_name)
 
-    def _keep_owner(self) -> None:
+    def _update_kept_owner(self) -> None:
         # Listeners get the owner as an argument, so they keep the owner alive even if the program has dropped it.
         if self._thread is not None:
             self._thread.keep_alive(self, has_listeners=bool(self.by_name))

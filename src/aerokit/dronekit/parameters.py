@@ -74,7 +74,10 @@ class ParameterDownload:
             self._core.handler.calls.post(self.begin)
 
     async def wait_for(self, name: str) -> None:
-        """Wait until the parameter is received, alone or with the list, or reported as missing by the vehicle."""
+        """Wait until the parameter is received, alone or with the list, or reported as missing by the vehicle.
+
+        If the list is complete, wait for one request only, answered or not. Return if the connection ends.
+        """
         if self.is_complete:
             await self._request(name)
             return
@@ -90,7 +93,7 @@ class ParameterDownload:
             group.cancel_scope.cancel()
 
     async def _until_complete(self) -> None:
-        while not self.is_complete:
+        while not self.is_complete and self._core.aio.connection.is_open:
             self.begin()
             if self._ended is not None:
                 await self._ended.wait()
@@ -365,6 +368,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     async def _wait_for(self, name: str) -> None:
         with anyio.move_on_after(WAIT_TIMEOUT_S) as waiting:
             await self._download.wait_for(name)
+        self._core.aio.connection.raise_if_ended()
         if waiting.cancelled_caught:
             raise TimeoutError(f"wait_ready experienced a timeout after {WAIT_TIMEOUT_S:.0f} seconds.")
 

@@ -161,15 +161,16 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
     except (AerokitError, ImportError) as error:
         errprinter(f"{prog}: {error}")
         return FAILED
-    error_text = _module_error(options.program) if options.module else _missing_main_error(options.program)
-    if error_text:
-        errprinter(f"{prog}: {error_text}")
-        return FAILED
-    sys.excepthook = _print_program_traceback
     if not getattr(sys.flags, "safe_path", False):
-        del sys.path[:1]  # The program's folder takes the place of this command's folder.
-    run = _run_module if options.module else _run_file
+        # The program's folder takes the place of this command's folder.
+        sys.path[:1] = [os.getcwd()] if options.module else []
     try:
+        error_text = _module_error(options.program) if options.module else _missing_main_error(options.program)
+        if error_text:
+            errprinter(f"{prog}: {error_text}")
+            return FAILED
+        sys.excepthook = _print_program_traceback
+        run = _run_module if options.module else _run_file
         run(options.program, program_arguments)
     finally:
         if served is not None:
@@ -237,9 +238,8 @@ def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
 def _module_error(module: str) -> str | None:
     """Return the error text that ``python -m`` prints if it cannot run the module; None if it can.
 
-    Modules are searched in the working directory, too.
+    Imports the module's parent packages, as ``python -m`` does.
     """
-    sys.path.insert(0, os.getcwd())
     try:
         spec = importlib.util.find_spec(module)
         if spec is None:
@@ -250,8 +250,6 @@ def _module_error(module: str) -> str | None:
         return f"No module named {module}.__main__; {module!r} is a package and cannot be directly executed"
     except ModuleNotFoundError as error:
         return str(error)
-    finally:
-        del sys.path[0]
 
 
 def _missing_main_error(path: str) -> str | None:
@@ -276,7 +274,6 @@ def _file_error(path: str) -> str | None:
 
 
 def _run_module(name: str, arguments: Sequence[str]) -> None:
-    _prepend_path(os.getcwd())
     sys.argv[:] = ["-m", *arguments]
     runpy.run_module(name, run_name="__main__", alter_sys=True)
 

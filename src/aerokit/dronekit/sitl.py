@@ -58,6 +58,7 @@ class ServedVehicle:
         self._thread = threading.Thread(target=self._run, name="aerokit simulated vehicle", daemon=True)
         self._thread.start()
         if not self._startup_ended.wait(START_TIMEOUT_S):
+            self._loop.call_soon_threadsafe(self._stop_requested.set)  # A late start ends at once.
             raise LinkOpenError(f"the simulated vehicle has not started within {START_TIMEOUT_S:g} s")
         self._raise_error()
 
@@ -161,7 +162,7 @@ class SITL:
         options, _ = _sitl_options().parse_known_args(list(initial_args))
         if options.instance is not None:
             self.instance = options.instance
-        kind = self._kind
+        kind = self._kind or KINDS.get(options.model or "")
         speedup = speedup or options.speedup
         addresses = [self._address()]
         # The new vehicle replaces that of --sim, whose kind and speed are the defaults.
@@ -172,9 +173,8 @@ class SITL:
             addresses.append(udp_address)
             _vehicle_for_program.stop()
             _vehicle_for_program = None
-        kind = kind or KINDS.get(options.model or "", "copter")
         home = parse_home(options.home) if options.home else HOME
-        self._served = ServedVehicle(kind, addresses, home=home, speedup=speedup or 1.0)
+        self._served = ServedVehicle(kind or "copter", addresses, home=home, speedup=speedup or 1.0)
 
     def poll(self) -> int | None:
         """Return None while the vehicle runs, 0 otherwise."""

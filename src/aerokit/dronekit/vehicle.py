@@ -259,7 +259,10 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving, in the same loop iteration in which the vehicle was found. Uses weak references only."""
+        """Start receiving, in the same loop iteration in which the vehicle was found.
+
+        The loop gets weak references only. The handler, which the vehicle owns, gets strong ones.
+        """
         core = self._dk
         core.start_receiving(aio, tasks)
         self._handler.vehicle = self

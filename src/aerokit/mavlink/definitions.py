@@ -179,7 +179,8 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
     Includes are searched beside the file, then in the folders of ``search``.
 
     Raises:
-        InvalidArgument: a file is missing, is larger than 16 MB, or is not MAVLink XML.
+        InvalidArgument: a file is missing or is not MAVLink XML.
+        FileFormatError: a file is larger than 16 MB.
     """
     dialects: dict[str, DialectDefinition] = {}
     # Files that are being read. They are not read again, because files may include each other.
@@ -199,7 +200,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 
 def read_xml(path: Path) -> DialectDefinition:
-    """Read one file without its includes. Raises InvalidArgument if the file is not MAVLink XML."""
+    """Read one file without its includes; errors as for :func:`read_dialect`."""
     # The XML parsers are imported here, because definitions from pymavlink do not need them.
     from xml.etree.ElementTree import ParseError
 

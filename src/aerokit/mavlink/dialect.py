@@ -128,8 +128,9 @@ class Dialect:
             if self.rows[message_id] != other.rows[message_id]:
                 ours, theirs = self[message_id], other[message_id]
                 raise InvalidArgument(
-                    f"message id {message_id} is {ours.NAME} (CRC_EXTRA {ours.CRC_EXTRA}) in {self.name!r},"
-                    f" but {theirs.NAME} (CRC_EXTRA {theirs.CRC_EXTRA}) in {other.name!r}"
+                    f"message id {message_id} is {ours.NAME} (CRC_EXTRA {ours.CRC_EXTRA}, {ours.LENGTH} bytes) in"
+                    f" {self.name!r}, but {theirs.NAME} (CRC_EXTRA {theirs.CRC_EXTRA}, {theirs.LENGTH} bytes) in"
+                    f" {other.name!r}"
                 )
         return _Extended(self, other)
 

@@ -208,8 +208,8 @@ class PythonFramer:
         """Sort the frames that were out of order into :attr:`late` and :attr:`foreign`.
 
         ``out_of_order`` has (position in ``frames``, result of `SourceStatistics.out_of_order`, sequence and sender).
-        A frame of an unwanted message is not in ``frames``. Its position belongs to the next wanted frame, which is
-        recognized by its sequence or sender.
+        A frame of an unwanted message is not in ``frames``. At its position is the next wanted frame, if any, which is
+        skipped because its sequence or sender differs.
         """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
@@ -248,7 +248,8 @@ class PythonFramer:
                 unknown_begin = -1
             if position >= size:
                 break
-            if end <= size and verdict != _UNKNOWN:  # Enough data has arrived to examine the candidate.
+            # Examine the candidate if enough data has arrived. An unknown frame was whole when it was examined.
+            if end <= size and verdict != _UNKNOWN:
                 verdict, end, frame = self._examine(data, position)
                 if verdict == _GOOD:
                     self._count_skipped(begin, position, bad_crcs)

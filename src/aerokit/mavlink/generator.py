@@ -90,7 +90,10 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
 
 
 def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
-    """Return the fields of both definitions. If both have a field, its type is the existing one."""
+    """Return the fields of both definitions.
+
+    If both have a field, units, enum and invalid value are the added ones, even if empty; the rest is the existing one.
+    """
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:
         existing_field = fields.get(field.name)
@@ -111,7 +114,10 @@ def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[En
 
 
 def _merged_entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
-    """Return an entry with the params of both definitions. An added param replaces one with the same number."""
+    """Return an entry with the params of both definitions. An added param replaces one with the same number.
+
+    The value and any remarks are those of the addition, the description is the existing one.
+    """
     params = {number: (number, label, units, text) for number, label, units, text in (*existing.params, *added.params)}
     return replace(
         existing,

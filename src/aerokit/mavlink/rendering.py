@@ -121,15 +121,15 @@ def _sentence(text: str) -> str:
 def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
     """Return the lines of a docstring with these paragraphs."""
     texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
-    if texts and texts[-1].endswith('"'):  # Without a space, this quotation mark would join the closing quotes.
-        texts[-1] += " "
     wrapped: list[str] = []
     for number, text in enumerate(texts):
         if number:  # An empty line separates paragraphs.
             wrapped.append("")
         wrapped += textwrap.wrap(text, _WIDTH - len(indent) - 6, break_long_words=False, break_on_hyphens=False)
     if len(wrapped) == 1:
-        return [f'{indent}"""{wrapped[0]}"""']
+        # Without a space, a quotation mark would join the closing quotes.
+        space = " " if wrapped[0].endswith('"') else ""
+        return [f'{indent}"""{wrapped[0]}{space}"""']
     body = [f"{indent}{line}" if line else "" for line in wrapped[1:]]
     return [f'{indent}"""{wrapped[0]}', *body, f'{indent}"""']
 

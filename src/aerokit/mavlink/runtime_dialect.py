@@ -146,7 +146,7 @@ def _import(name: str) -> ModuleType:
             return import_module(candidate)
         except ModuleNotFoundError as error:
             # The error may be about another module, which the candidate itself imports.
-            is_candidate_missing = error.name is not None and candidate.startswith(error.name)
+            is_candidate_missing = error.name is not None and f"{candidate}.".startswith(f"{error.name}.")
             if not is_candidate_missing:
                 raise
     raise InvalidArgument(f"there is no pymavlink dialect {name!r}: tried {', '.join(candidates)}")

@@ -184,7 +184,7 @@ class Signing:
         # A signature is a hash that begins with the key. The key is hashed once; each signature copies this state.
         self._keyed = sha256(key.secret)
         self.streams: dict[tuple[int, int, int], int] = {}
-        """Last timestamp of each (system id, component id, link id), shared by all links with the same key."""
+        """Last timestamp of each (system id, component id, link id). :meth:`for_link` shares it among links."""
 
     def for_link(self, link_id: int) -> Signing:
         """Create signing for another link (0–255) with the same key. Replays across these links are detected."""
@@ -226,7 +226,7 @@ class Signing:
 
     @property
     def keep_error(self) -> OSError | None:
-        """Error of the last write of the ``keep`` file; None if the write succeeded. The next write tries again."""
+        """Error of the last write of the ``keep`` file; None if it succeeded. The next write is half a minute later."""
         return None if self._timestamp_file is None else self._timestamp_file.error
 
     @property
@@ -311,13 +311,16 @@ class TimestampFile:
     def __init__(self, path: str | PathLike[str], maximum: int) -> None:
         self._path, self._maximum = Path(path), maximum
         self.timestamp: int = self._read()
-        """Timestamp in the file; 0 if there is no file."""
+        """Timestamp of the last write, also if it failed; 0 if there is no file."""
         self.error: OSError | None = None
         """Error of the last write; None if the write succeeded."""
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``."""
+        """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``.
+
+        A failed write is repeated only after ``ahead``, because each attempt may block the event loop.
+        """
         if timestamp < self.timestamp:
             return
         self.timestamp = min(timestamp + ahead, self._maximum)

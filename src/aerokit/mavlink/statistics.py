@@ -217,6 +217,7 @@ class SourceStatistics(SourceFields):
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # The frame does not count as one of the current stream.
+        # The longer stream is the sender's own, so the frame was overtaken; a frame of the shorter one is a stranger's.
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
