@@ -207,7 +207,7 @@ class Master:
         return getattr(self.messages.get(type), field, default)
 
     def time_since(self, mtype: str) -> float:
-        """Return the age of the last message of a type in seconds; without one, the time since the first access."""
+        """Return the age of the last message of a type in seconds; without one, the time since its first access."""
         return self.messages.age_s(mtype)
 
     def param(self, name: str, default: float | None = None) -> float | None:

@@ -227,7 +227,7 @@ class Port:
         self.writes_single_frames = False
         """True to write each frame separately, because autopilots read datagrams into small buffers."""
         self.batch: list[bytes] = []
-        """Data to write: single frames, or pieces of several."""
+        """Data to write: each element is one frame, or several frames joined."""
         self.joined_frames: int = 0
         """Number of frames in ``batch`` minus the number of its pieces, for the counters."""
         self.node: RouterPort[Port] | None = None

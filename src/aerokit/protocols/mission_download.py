@@ -153,7 +153,6 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self.round_trip.add_sample(now - self._requested_at[item.seq])
         del self._requested_at[item.seq]
         self._items[item.seq] = from_wire(item)
-        # An item that was received before also counts as progress, because it shows that the vehicle answers.
         self._report_progress(now, len(self._items), len(self._indices))
         self._proceed(now)
 

@@ -233,7 +233,8 @@ class SimulatorServer:
 
     def _flush(self) -> None:
         """Write the datagrams of all vehicles to their links."""
-        # Batching saves datagrams in real time. On virtual time, with an event source, each vehicle sends its own.
+        # On the real clock, the frames of all vehicles share datagrams, so that fewer are sent. On virtual time, each
+        # vehicle sends its own datagrams.
         is_real_time = self._remove_source is None
         for port in self._ports:
             for datagram in port.take_datagrams(together=is_real_time):

@@ -336,7 +336,8 @@ class _Calls:
         call.has_started = True
         task = asyncio.get_running_loop().create_task(call.run())
         self._tasks[task] = call
-        # The callback finishes a call whose task was cancelled before its first step. `run` finishes all other calls.
+        # `finish` changes nothing if `run` has finished the call. It is needed for a task that was cancelled before its
+        # first step.
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:

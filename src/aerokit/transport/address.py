@@ -235,8 +235,8 @@ class _Parser:
             tail = colon + port
             if _is_ipv6(host):
                 raise self.error("an IPv6 address needs brackets, as in [::1]:14550")
-            if host.isdigit() and not tail:  # The text is only a port, e.g. in "udpin:14550".
-                raise self.error(f"the host is missing; write {kind}:127.0.0.1:{host}")
+            if text.isdigit():  # The text is only a port, e.g. in "udpin:14550".
+                raise self.error(f"the host is missing; write {kind}:127.0.0.1:{text}")
         if not host and kind in _LISTENING:
             host = "0.0.0.0"
         if not host:

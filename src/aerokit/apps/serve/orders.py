@@ -330,7 +330,8 @@ class OrderRunner:
             return earlier
         if earlier is not None:
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
-        if key in self._used_keys:  # perhaps for this order, which a new key would repeat
+        # The key may belong to this same order. A retry with a new key would then execute it again.
+        if key in self._used_keys:
             raise HttpProblem(
                 409,
                 "KeyUsed",

@@ -101,7 +101,10 @@ class Copies:
         return self._current is not None and self._current.is_admitted
 
     def arrived_over(self, link: int) -> bool:
-        """Return True if the last checked frame, or an equal one, arrived over this link, not from a second sender."""
+        """Return True if the last checked frame or a copy of it arrived over this link.
+
+        A copy from a second sender with the same ids does not count.
+        """
         return self._current is not None and bool(self._current.proving_bits & 1 << link)
 
     def admit(self) -> None:

@@ -218,13 +218,13 @@ class MessageTablesWriter:
     def _open_table(self, record: LogRecord) -> tuple[_AddRow, _MakeRow]:
         """Create the table for records of this type, and return its two functions."""
         columns = self._log.columns(record)
-        # The name becomes a file name, but the log is untrusted input, so other characters are replaced.
+        # The log is untrusted input, so all but letters, digits, "_" and "-" are replaced in the file name.
         name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
         if (self._path / name).exists():
             name = f"{len(self._tables)}_{name}"
         table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
         self._tables.append(table)
-        # Fields of messages that are no texts are Python's own numbers; a flight controller's log may have NumPy's.
+        # The numbers of MAVLink messages are Python's own; those of a flight controller's log may be NumPy's.
         has_only_numbers = record.message is not None and all(column.kind != "str" for column in columns)
         add_row = table.add_numbers if has_only_numbers else table.add
         self._converters[record.table] = add_row, _row_maker(columns, record)

@@ -107,8 +107,8 @@ class ArduPilotSigning(VehicleSigning):
 
     The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. Set
     ``trusts_first_port`` to False, and call `load`, for a vehicle whose only link is a radio. Bit 0 of MAV1_OPTIONS,
-    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING. No text reports a
-    new key.
+    MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING. ArduPilot sends no
+    status text about a new key.
     """
 
     AHEAD: ClassVar[int] = ONE_MINUTE

@@ -200,9 +200,9 @@ class Px4MissionServer(MissionServer):
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        A transfer of all items counts as complete. PX4 does not check its direction: the request also ends an upload,
-        if as many items were received as are stored (mavlink_mission.cpp, handle_mission_request_list). PX4 still
-        remembers that upload as unfinished, so it refuses other uploads until a download times out.
+        Like PX4, this treats an open transfer as finished if its item count equals the stored count, even if it is an
+        upload (mavlink_mission.cpp, handle_mission_request_list). PX4 still remembers such an upload as unfinished, so
+        it refuses other uploads until a download times out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):

@@ -427,5 +427,5 @@ class PhotoInterval:
                 f"{self._link.describe()} ended the series after {self._delivered + self._missed} pictures"
             )
         elif silent_checks >= MAX_SILENT_CHECKS:
-            known = "takes pictures, but " if status is not None else ""
-            raise self._link.timeout_error(f"{known}reports no more pictures")
+            activity = "takes pictures, but " if status is not None and not is_over else ""
+            raise self._link.timeout_error(f"{activity}reports no more pictures")

@@ -208,9 +208,9 @@ class LobeCounter:
         """True while the vehicle is in one of the lobes, far enough from the crossing to tell them apart."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Count half a figure for the first lobe, and each time the vehicle reaches the other lobe.
+        """Process a position of the vehicle, in metres from the centre.
 
-        The position is in metres from the centre.
+        Each arrival in another lobe than the previous one counts as half a figure, and so does the first arrival.
         """
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._min_along_m

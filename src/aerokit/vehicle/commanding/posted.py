@@ -131,14 +131,17 @@ class PostedOrder:
             return
 
     async def _is_valid_at_next_heartbeat(self, timeout: float) -> bool:
-        """Wait for the next HEARTBEAT; return True if the order is still valid after it."""
-        answered_at, armed = self._session.connection.now(), self._session.telemetry.armed
+        """Pause for `MODE_RETRY_INTERVAL_S`, then wait for a HEARTBEAT from after this call.
+
+        Return True if the order is still valid then; False if it is not, or after ``timeout`` seconds without one.
+        """
+        started_at, armed = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(MODE_RETRY_INTERVAL_S)
         with (
             ChangeSignal(self._session, armed, every_arrival=True) as changes,
             anyio.move_on_after(timeout),
         ):
-            while armed.updated_at <= answered_at or not self._arbiter.is_state_recent:
+            while armed.updated_at <= started_at or not self._arbiter.is_state_recent:
                 await changes.next(POLL_INTERVAL_S)
             return not self.end
         return False  # No HEARTBEAT was received in time.

@@ -231,8 +231,9 @@ class RoundFlight:
         here = position.fresh(POSITION_MAX_AGE_S)
         north, east = self._offset(here)
         up = self._context.vehicle_position.height_above(here, self._center)
-        centre = (local.north_m - north, local.east_m - east, local.down_m + up)
-        return PathFlight(path, self._rounds, speed_m_s, (north, east, -up), centre, self._heading_function(facing))
+        local_center = (local.north_m - north, local.east_m - east, local.down_m + up)
+        start, heading = (north, east, -up), self._heading_function(facing)  # `start` is relative to the center
+        return PathFlight(path, self._rounds, speed_m_s, start, local_center, heading)
 
     def _heading_function(self, facing: str) -> Callable[[Vector, Vector], float | None]:
         """Return a function that returns the heading in degrees; None leaves the heading to the autopilot."""

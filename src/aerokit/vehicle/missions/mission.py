@@ -82,7 +82,7 @@ class MissionEndDetector:
             if command == last_command or not self._is_last_item_landing_or_return
         ]
         # Until this time, HEARTBEAT may not report the mission mode yet.
-        self._grace_until = session.connection.now() + MODE_GRACE_S
+        self._mode_grace_until = session.connection.now() + MODE_GRACE_S
         self._was_in_mode = False
         self._left_at: float | None = None  # when the vehicle was first seen disarmed, or in an unexpected mode
         self.ground: GroundCheck = GroundCheck(session)
@@ -164,7 +164,7 @@ class MissionEndDetector:
         # The mission's end also changes the mode. Its report may arrive after the mode change, so wait for END_GRACE_S.
         if self._left_at is None:
             self._left_at = now
-        if now - self._left_at < END_GRACE_S or now < self._grace_until:
+        if now - self._left_at < END_GRACE_S or now < self._mode_grace_until:
             return None
         if session.telemetry.is_confirmed_disarmed:
             return f"the mission has not ended ({self.describe()}), but the vehicle is disarmed"
