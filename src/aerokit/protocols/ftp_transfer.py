@@ -128,9 +128,11 @@ class FtpDownload(FtpExchange[int]):
         self._highest_blocks: dict[int, int] = {}  # by sequence number of a burst: the highest received block number
         self._supports_bursts = True
         self._burst_active_at = 0.0  # time of the last block of a burst or, before any, of the request for the burst
-        self._last_burst: _Burst | None = None  # the burst to which the last received block belongs
-        self._highest_number = -1  # highest block number received of this burst
-        self._highest_at = 0.0  # time when that block arrived
+        # The burst to which the last received block belongs. Of this burst, the block with the highest number so far:
+        # its number, and the time when it arrived.
+        self._last_burst: _Burst | None = None
+        self._highest_number = -1
+        self._highest_at = 0.0
         self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
 
     def start(self, now: float) -> None:
