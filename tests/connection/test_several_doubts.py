@@ -66,6 +66,10 @@ def an_order_to_all() -> m.CommandLong:
     return m.CommandLong(0, 0, 400, 0, 1.0, 0, 0, 0, 0, 0, 0)
 
 
+def version(uid2: bytes) -> m.AutopilotVersion:
+    return m.AutopilotVersion(0, 0, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 0, uid2)
+
+
 async def opened(radios: Radios) -> None:
     for far in radios.far:
         await far.open(IgnoringReceiver())
@@ -245,6 +249,23 @@ async def test_copies_of_second_sender_prove_no_link(is_first_used: bool, is_sec
             for index in (0, 1) if is_first_used else (1, 0):
                 link._on_bytes(index, data, peers[1 if is_second_sender else index])
         assert candidates_of(connection)[1].is_proven is not is_second_sender
+
+
+async def test_hardware_id_relayed_by_second_sender_proves_no_link() -> None:
+    """The second link leads to another vehicle, but also gets frames that our vehicle sends to both ports."""
+    async with open_connection(["udpin:127.0.0.1:0", "udpin:127.0.0.1:0"]) as connection:
+        link = connection.link
+        assert isinstance(link, MultiLink)
+        ours, theirs = FrameEncoder(1, 1), FrameEncoder(1, 1)
+        peers = {0: ("127.0.0.1", 9), 1: ("127.0.0.2", 9)}
+        for index, encoder, uid in ((0, ours, b"A" * 18), (1, theirs, b"B" * 18)):
+            link._on_bytes(index, encoder.encode(AUTOPILOT), peers[index])
+            link._on_bytes(index, encoder.encode(version(uid)), peers[index])
+        assert candidates_of(connection)[1].is_other_hardware
+        data = ours.encode(version(b"A" * 18))
+        for index in (0, 1):
+            link._on_bytes(index, data, peers[0])
+        assert candidates_of(connection)[1].is_other_hardware
 
 
 @pytest.mark.parametrize("is_signed", [True, False])

@@ -194,8 +194,9 @@ def test_items_are_sent_ahead_within_window() -> None:
     assert request_item(exchange, 2, 1.1) == [3, 4]
     assert exchange.was_sent_completely
     assert request_item(exchange, 5, 1.2) == []  # no such item
+    assert request_item(exchange, 4, 1.2) == []
     assert acknowledge(exchange, Result.ACCEPTED, 1.2) == []
-    assert exchange.result() == UploadResult(True, 0, 2)
+    assert exchange.result() == UploadResult(True, 0, 4)
 
 
 def test_invalid_sequence_resends_window_and_next_item() -> None:
@@ -224,6 +225,15 @@ def test_early_acceptance_is_ignored() -> None:
     request_item(exchange, 1, 1.2)
     acknowledge(exchange, Result.ACCEPTED, 1.3)
     assert exchange.result().is_confirmed
+
+
+def test_acceptance_before_request_of_last_item_is_unconfirmed() -> None:
+    """The delayed answer to an earlier upload looks the same."""
+    exchange = upload(3, window=6)
+    request_item(exchange, 0, 1.0)
+    assert exchange.was_sent_completely
+    acknowledge(exchange, Result.ACCEPTED, 1.1)
+    assert exchange.result() == UploadResult(False, 0, 0)
 
 
 def test_acceptance_after_repeated_tail_is_unconfirmed() -> None:

@@ -51,7 +51,7 @@ def test_request_timeout_grows_after_silence() -> None:
 
 def test_spaced_block_requests_have_own_deadline() -> None:
     round_trip = RoundTrip(0.1)
-    requests = BlockRequests(round_trip, burst_size=1, spacing_s=0.005)
+    requests = BlockRequests(round_trip, batch_size=1, spacing_s=0.005)
     assert BlockRequests(round_trip).deadline is None
     for offset in (0, 239, 478):
         requests.request(offset)
@@ -62,7 +62,7 @@ def test_spaced_block_requests_have_own_deadline() -> None:
 
 
 def test_single_block_request_is_not_delayed() -> None:
-    requests = BlockRequests(RoundTrip(0.1), burst_size=1, spacing_s=0.005)
+    requests = BlockRequests(RoundTrip(0.1), batch_size=1, spacing_s=0.005)
     for offset in (0, 239):
         requests.request(offset)
         assert requests.take_due(0.001) == [offset]

@@ -201,7 +201,7 @@ def _check_that_peers_apply(targets: Sequence[Link | LinkAddress]) -> None:
 def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | LinkAddress]) -> None:
     """Raise InvalidArgument if an address is listed twice.
 
-    Otherwise its second link could not be opened, and the error would look like a broken link.
+    Without this check, its second link would fail to open, and the error would look like a broken link.
     """
     seen: set[object] = set()
     for address, target in zip(addresses, targets):  # noqa: B905 - equal lengths

@@ -42,7 +42,7 @@ class SignatureGate:
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # None if the file of ``Signing(keep=…)`` could be written
-        # The owner calls `set_signing` before the first frame, which updates `is_open`.
+        # The owner calls `set_signing`, which updates `is_open`, before the first frame.
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = lambda: None
@@ -102,7 +102,7 @@ class SignatureGate:
                 # reported nor counted as refused.
                 return signing.may_be_unsigned(frame)
             refusal = signing.check(frame, self._unix_time())
-        except Exception:
+        except Exception:  # from `allow_unsigned`, a function of the program; nothing else here or above raises
             logger.exception("the check of a frame by %r raised; the frame was refused", signing)
             return False
         if refusal is not None and refusal not in self._reported:
@@ -167,7 +167,7 @@ class _Handover:
         return (frame.system_id, frame.component_id) == self._source
 
     def is_completed_by(self, frame: Frame, unix_time_s: float) -> bool:
-        """Return True once the frames up to this one show that the component uses the new key, or no key."""
+        """Return True once the frames up to this one show the change: the new key is used or, if it is None, no key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _is_signed_with_a_key(frame):

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 OVERTAKEN = 3
 
 # Number of requests that are sent at once. ArduPilot queues at most five, processes one every 2 ms, and drops the rest.
-BURST_SIZE = 4
+BATCH_SIZE = 4
 
-# Pause between further requests, after the first ``BURST_SIZE`` were sent at once.
+# Pause between further requests, after the first ``BATCH_SIZE`` were sent at once.
 SPACING_S = 0.002
 
 # An answer that arrives sooner than this fraction of the fastest round trip belongs to an earlier transmission.
@@ -96,14 +96,14 @@ class _BlockRequest:
 class BlockRequests:
     """Requests for blocks, keyed by offset. An adaptive window limits the number of requests in flight.
 
-    The first ``burst_size`` requests are sent without delay, further ones ``spacing_s`` seconds apart. A request is
+    The first ``batch_size`` requests are sent without delay, further ones ``spacing_s`` seconds apart. A request is
     repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
-    def __init__(self, round_trip: RoundTrip, *, burst_size: int = BURST_SIZE, spacing_s: float = SPACING_S) -> None:
+    def __init__(self, round_trip: RoundTrip, *, batch_size: int = BATCH_SIZE, spacing_s: float = SPACING_S) -> None:
         self.window: AdaptiveWindow = AdaptiveWindow()
         self._round_trip = round_trip
-        self._burst_size = burst_size
+        self._batch_size = batch_size
         self._spacing_s = spacing_s
         # All keys are offsets. An overdue block is in `_waiting` and still in `_sent_blocks`.
         self._waiting: dict[int, None] = {}  # blocks to request, in order
@@ -112,7 +112,7 @@ class BlockRequests:
         self._sent_count = 0
         self._timeouts = 0  # number of times that answers were overdue since the last answer
         self._busy_until = float("-inf")  # until this time, the server is busy with a burst
-        self._next_send_at = float("-inf")  # earliest time for the next request beyond the first `burst_size`
+        self._next_send_at = float("-inf")  # earliest time for the next request beyond the first `batch_size`
         self._must_wait_to_send = False  # True if a request fits into the window, but must wait until `_next_send_at`
 
     def __len__(self) -> int:
@@ -176,7 +176,7 @@ class BlockRequests:
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
         """Return the offsets to request now, and count them as sent. Overdue blocks come first.
 
-        ``limit`` reduces the number of requests in flight. While fewer than ``burst_size`` requests are in flight, the
+        ``limit`` reduces the number of requests in flight. While fewer than ``batch_size`` requests are in flight, the
         next one is sent without delay; beyond that, one every ``spacing_s`` seconds.
         """
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
@@ -187,7 +187,7 @@ class BlockRequests:
         due: list[int] = []
         self._must_wait_to_send = False
         while self._waiting and len(self._in_flight) < size:
-            if len(self._in_flight) >= self._burst_size:
+            if len(self._in_flight) >= self._batch_size:
                 if now < self._next_send_at:
                     self._must_wait_to_send = True
                     break

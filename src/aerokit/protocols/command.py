@@ -151,7 +151,8 @@ def command_int(
     positive down in NED frames. ``frame`` is a MAV_FRAME.
 
     Raises:
-        InvalidArgument: there are more than four parameters, a value exceeds its type, or ``target_system`` is 0.
+        InvalidArgument: there are more than four parameters, a parameter or ``z`` cannot be converted to a 32-bit float
+            or is infinite, ``x`` or ``y`` is not a 32-bit integer, or ``target_system`` is 0.
     """
     _check_target(target_system, command)
     if len(params) > 4:

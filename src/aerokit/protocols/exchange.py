@@ -201,7 +201,7 @@ class MessageStream:
     def on_message(self, now: float, messages: int) -> None:
         """Record a message. ``messages`` counts it and the lost messages right before it, so 1 means no loss.
 
-        Without a count above 0, the message is a repeated or delayed one, which does not measure the interval.
+        Without a count above 0, the message is a repeated or delayed one. It ends an interval without measuring it.
         """
         elapsed_s = now - self._last_at
         if self._has_started and messages > 0:
@@ -338,6 +338,7 @@ class StaleAnswerFilter:
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
         """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``.
 
+        Such an early answer is counted, because several of them show that the vehicle has become faster.
         ``attempts`` is the number of transmissions of the request. The caller needs further evidence for answers that
         are accepted: an answer to another station may be accepted once the vehicle counts as faster.
         """

@@ -407,8 +407,8 @@ class FtpRequest(FtpExchange[FtpMessage]):
         """Return True if this NAK only means that the operation was executed before."""
         opcode = self._request.opcode
         if opcode == MavFtpOpcode.TERMINATESESSION:
-            # The session does not exist, so it is already closed. ArduPilot and PX4 refuse a close for no other reason,
-            # but after a FILEEXISTS, PX4 answers with another error (see `NO_SESSION_ERRORS`).
+            # Any NAK means that there is no session, because ArduPilot and PX4 refuse a close for no other reason. The
+            # code is not compared, because PX4 sends several, see `NO_SESSION_ERRORS`.
             return True
         if self.attempts == 1:
             return False

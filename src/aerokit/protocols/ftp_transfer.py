@@ -128,11 +128,11 @@ class FtpDownload(FtpExchange[int]):
         self._highest_blocks: dict[int, int] = {}  # by sequence number of a burst: the highest received block number
         self._supports_bursts = True
         self._burst_active_at = 0.0  # time of the last block of a burst or, before any, of the request for the burst
-        # The burst to which the last received block belongs. Of this burst, the highest block number so far, and the
-        # time when that block arrived.
+        # The burst to which the last received block belongs. Of this burst, the block with the highest number so far:
+        # its number, and the time when it arrived.
         self._last_burst: _Burst | None = None
-        self._last_block_at = 0.0
-        self._last_block_number = -1
+        self._highest_number = -1
+        self._highest_at = 0.0
         self._interval = RoundTrip(min_s=0.001)  # smoothed time between two blocks of a burst
 
     def start(self, now: float) -> None:
@@ -198,11 +198,11 @@ class FtpDownload(FtpExchange[int]):
         # one.
         if self._last_burst is None and number == 0 and len(self._bursts) == 1:
             self.round_trip.add_sample(now - burst.sent_at)
-        elif self._last_burst is burst and number > self._last_block_number:
-            self._interval.add_sample((now - self._last_block_at) / (number - self._last_block_number))
-        is_late = self._last_burst is burst and number <= self._last_block_number
+        elif self._last_burst is burst and number > self._highest_number:
+            self._interval.add_sample((now - self._highest_at) / (number - self._highest_number))
+        is_late = self._last_burst is burst and number <= self._highest_number
         if not is_late:
-            self._last_burst, self._last_block_number, self._last_block_at = burst, number, now
+            self._last_burst, self._highest_number, self._highest_at = burst, number, now
 
     def _stop_bursting(self) -> None:
         self._is_bursting = False
@@ -223,6 +223,7 @@ class FtpDownload(FtpExchange[int]):
             return
         # Before the first block, the errors in NO_BURST mean that the server does not support bursts. After it, they
         # mean that the transfer has failed.
+        # `received_bytes` counts the bytes before `start`, too.
         has_no_block = self._reassembly.received_bytes == self._reassembly.start
         if has_no_block and reply.error_code in NO_BURST:
             self._supports_bursts = False
@@ -320,8 +321,8 @@ class FtpDownload(FtpExchange[int]):
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. A later request with one of them would look like a
         # repetition of this request, and the server would only repeat its last reply. The request, the full blocks, a
-        # shorter block and the NAK have one number each. At most half of all numbers are reserved, because the numbers
-        # of a longer burst wrap around in any case. If the size is unknown, it is ArduPilot's number of blocks.
+        # shorter block and the NAK have one number each. If the size is unknown, ArduPilot's burst length is assumed.
+        # At most half of all numbers are reserved, because the numbers of a longer burst wrap around in any case.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True

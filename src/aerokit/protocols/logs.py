@@ -42,7 +42,7 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# Ranges grow until one takes this many time-outs of the round trip, so that the pause between two ranges is negligible.
+# Ranges are adapted to take this many time-outs of the round trip, so that the pause between two ranges is negligible.
 MIN_RANGE_TIMEOUTS = 60
 
 MAX_EARLY_ENDS = 3
@@ -72,11 +72,12 @@ class LogDownload(Transfer[int]):
         self._id = log_id
         self._size = size
         self._reassembly = into
-        self._requests = BlockRequests(self.round_trip, burst_size=1, spacing_s=SPACING_S)
+        self._requests = BlockRequests(self.round_trip, batch_size=1, spacing_s=SPACING_S)
         self._stream = MessageStream(self.round_trip)
         self._is_streaming = False
         self._range_end = into.position
-        self._latest_offset = self._range_end  # largest offset received in the range, or the block before the range
+        # Largest offset received in the range, or the block before the range.
+        self._latest_offset = into.position - LOG_BLOCK
         self._max_range_blocks = FIRST_RANGE
         self._requested_blocks = 0  # number of requested blocks of the current range
         self._received_blocks = 0
@@ -212,7 +213,7 @@ class LogDownload(Transfer[int]):
         if self._received_blocks < self._requested_blocks / 2:
             self._max_range_blocks = max(self._max_range_blocks // 2, MIN_RANGE)
         elif self._requested_blocks >= self._max_range_blocks and self._stream.interval_s:
-            # Ranges grow until the pause between two ranges is negligible.
+            # Ranges get just so long that the pause between two ranges is negligible.
             useful_blocks = MIN_RANGE_TIMEOUTS * self.round_trip.timeout_s() / self._stream.interval_s
             self._max_range_blocks = min(2 * self._max_range_blocks, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
 

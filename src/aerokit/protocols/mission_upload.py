@@ -206,7 +206,11 @@ class MissionUpload(MissionExchange[UploadResult]):
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
             if self._is_requesting and self._sent_end == self._end:
-                self._succeed(now, is_confirmed=not self._was_tail_repeated, opaque_id=ack.opaque_id)
+                # Items are sent ahead, so even then it may be a delayed answer to an earlier upload, unless the vehicle
+                # has requested the last item.
+                was_last_requested = self._confirmed_end == self._end - 1
+                is_confirmed = was_last_requested and not self._was_tail_repeated
+                self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_requesting:
                 # The vehicle already has the item that was sent, or an item before it was lost.
@@ -318,8 +322,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         The vehicle's requests for the repeated items may have been lost.
         """
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
-            # Not only the last item may be repeated. PX4 takes any repeated item for the mission's last item, and
-            # confirms the upload. This confirmation does not prove that PX4 has all items.
+            # Items before the last one may be repeated, too. PX4 takes any repeated item for the mission's last item,
+            # and confirms the upload. This confirmation does not prove that PX4 has all items.
             self._was_tail_repeated = True
         # One more than the window, because the vehicle may already have the first unconfirmed item.
         new_end = min(self._sent_end + ahead, self._confirmed_end + self._window + 1, self._end)

@@ -276,10 +276,9 @@ def mission_checksum(items: Iterable[MissionItem]) -> int:
     """Compute the checksum with which PX4 identifies a plan.
 
     The checksum is a CRC-32 with initial value 0 and without final inversion, over frame, command, autocontinue and the
-    seven numbers of each item, with x and y as the integers of MISSION_ITEM_INT. PX4 (since 1.15) reports it as
+    seven numbers of each item; x and y must be whole numbers, as in MISSION_ITEM_INT. PX4 (since 1.15) reports it as
     ``opaque_id`` in MISSION_ACK and MISSION_COUNT, and as ``mission_id``, ``fence_id`` and ``rally_points_id`` in
-    MISSION_CURRENT
-    (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
+    MISSION_CURRENT (https://mavlink.io/en/messages/common.html#MISSION_CURRENT).
     """
     # zlib.crc32 inverts its start value and its result, so both are inverted once more.
     checksum = _INVERT

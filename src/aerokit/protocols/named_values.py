@@ -57,7 +57,7 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self._is_streaming = False
         self._quiet_at: float | None = None  # The stream has stopped if no message of it arrives before this time.
         self._last_at = 0.0  # time of the stream's last message
-        self._pause_s = 0.0  # longest recent pause of the stream; decays with each value
+        self._pause_s = 0.0  # longest pause of the stream; ParameterList lets it decay
         self._attempts = 0  # number of requests for the list
         self._refreshes = 0  # number of times that old values were requested again
 

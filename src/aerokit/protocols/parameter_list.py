@@ -142,8 +142,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _on_refusal(self, message: ParamError) -> None:
         # The error means that the list has become shorter. PX4 also sends it if it has no room for the value, but
         # hardly ever `MAX_REFUSALS` times for one index. If later parameters were received, they no longer fit the
-        # count, so `_drop_stale` requests values again, and their messages correct the count. Only the index in the
-        # message is used, because PX4 does not fill in the name.
+        # count, so `_finish_when_complete` drops stale values, which are requested again, and the answers correct the
+        # count. Only the index in the message is used, because PX4 does not fill in the name.
         index = message.param_index
         if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._received:
             return

@@ -143,8 +143,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
 
     def _on_value(self, message: ParamValue, now: float) -> None:
         """Process the answer to a probe, or the value of a requested name. A message may be both."""
-        # An answer to another station also counts. `_loss_probability` rejects a name only after so many probes that
-        # such a coincidence has no effect.
+        # An answer to another station also counts. A name is rejected only after so many probes that such a coincidence
+        # has no effect, see `_loss_probability`.
         is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
         if is_probe_answer:
             self._count_probe()
@@ -246,7 +246,7 @@ class ParameterWrites(ParameterRequests):
         """Accept the reported value as the result, or request it again, because it may be old or unintended."""
         name = message.param_id
         if not self._window.attempts(name):
-            return  # The message answers another station, because our write of the name was not sent yet.
+            return  # No request for the name is in flight, so the message may answer another station.
         requested = self._requested[name]
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
         answers = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))

@@ -238,6 +238,23 @@ async def test_ambiguous_upload_without_read_back_is_unknown() -> None:
         assert flight.vehicle.mission._context.caches[0].items is None
 
 
+async def test_late_ack_of_earlier_upload_does_not_confirm_lost_items() -> None:
+    async with open_flight(latency_s=0.02) as flight:
+        await flight.vehicle.mission.upload(long_mission(9), method="items")
+        on_item = flight.copter.handlers[m.MissionItemInt.ID]
+
+        def lose_items(message: m.MissionItemInt, channel: Any) -> None:
+            if message.seq == 0:
+                on_item(message, channel)
+                flight.copter.send(m.MissionAck(255, 190, Result.ACCEPTED, 0))
+
+        flight.copter.handlers[m.MissionItemInt.ID] = lose_items
+        other = changed(long_mission(3), 1)
+        with pytest.raises(MissionRejected, match="the vehicle refused the plan at about item 0, and now has other"):
+            await flight.vehicle.mission.upload(other, method="items", only_changes=False, verify=False)
+        assert not holds(flight, other)
+
+
 async def test_too_many_items_has_the_vehicles_reasons() -> None:
     async with open_flight() as flight:
         with pytest.raises(MissionRejected, match="items are supported") as caught:

@@ -203,9 +203,9 @@ class MultiLinkRoutes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers that get a message for this component: those on the best link that reaches it.
 
-        No peer gets it if the link in use leads to another vehicle with the same id, and no other link works. For its
-        sender, the vehicle is then as silent as behind a lost link. A message for a system without a link in use goes
-        to every peer. A broadcast reaches each known system once if possible, and is also sent over links without a
+        No peer gets it if the link in use leads to another vehicle with the same id, and no other link works. The
+        caller then sees a silent vehicle, as if the link were lost. A message for a system without a link in use goes
+        to every peer. A broadcast reaches each known system, mostly only once, and is also sent over links without a
         known system; broadcasts of heartbeats and time go to all peers of all links. ``message`` is None for raw
         frames, which count as commands. The call may change the link in use, and records the time of commands.
         """
@@ -237,9 +237,11 @@ class MultiLinkRoutes:
         link = _link_index(peer)
         if not self._merged.was_accepted(frame, link, may_prove=not is_other_peer):
             return False
+        if is_other_peer:  # A second sender proves nothing, because commands over this link go to the first sender.
+            return True
         # A copy is not delivered. It still proves that this link works, and which vehicle the link leads to.
         self._probes.record_hardware(frame, link)
-        if frame.message_id == m.Heartbeat.ID and not is_other_peer:
+        if frame.message_id == m.Heartbeat.ID:
             counters = self._counters.get((frame.system_id, link), {}).get(frame.component_id)
             self.record_heartbeat(frame, peer, counters)
         return True
@@ -314,7 +316,7 @@ class MultiLinkRoutes:
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
-        """Return peers that together reach every system with a link in use, each only once if possible.
+        """Return peers that together reach every system with a link in use, mostly only once (chosen greedily).
 
         Links over which no system is known are added as well.
         """
