@@ -38,7 +38,10 @@ class MissionStore(Protocol):
         ...
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Replace all items in one step, as the upload of a file does, and return the MAV_MISSION_RESULT."""
+        """Store ``items`` from index ``start`` on in one step, as the upload of a file does.
+
+        ``clear`` deletes the old items first. Return the MAV_MISSION_RESULT.
+        """
         ...
 
 

@@ -107,7 +107,7 @@ class FixedWing(Motion):
         self.bank_and_climb(0.0, 0.0, 0.0)
 
     def climb_to(self, down: float) -> float:
-        """Return the climb rate in m/s that leads to this height."""
+        """Return the climb rate in m/s with which the plane approaches the coordinate ``down``."""
         return _HEIGHT_GAIN_PER_S * (self.down - down)
 
     @property

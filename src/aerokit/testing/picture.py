@@ -49,7 +49,7 @@ class Drawable(Protocol):
     def __len__(self) -> int: ...
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return metres north and east of ``origin``, by default home, and metres above home."""
+        """Return each point as metres north and east of ``origin``, and metres above home. Default origin: home."""
         ...
 
     def snapshot(self) -> Drawable:

@@ -96,7 +96,7 @@ class MultiLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """Sum of `Link.dropped_writes` over all links."""
+        """Sum of `Link.dropped_writes` over all links, and the writes that no link could take."""
         return self._dropped + sum(link.dropped_writes for link in self._links)
 
     @property

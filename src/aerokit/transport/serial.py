@@ -315,7 +315,7 @@ class PtyLink(BaseLink):
         self._loop.add_reader(ours, self._read)
 
     def _make_symlink(self, target: str) -> None:
-        """Make the symbolic link to the other end. OSError if a file of that name exists."""
+        """Make the symbolic link to ``target``. OSError if a file exists at the path of the link."""
         # A symbolic link without a target is left over, e.g. from a killed program.
         if os.path.islink(self._path) and not os.path.exists(self._path):
             os.unlink(self._path)

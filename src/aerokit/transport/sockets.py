@@ -85,7 +85,7 @@ def discard_on_close(sock: socket.socket) -> None:
 
 
 def readable_check(sock: socket.socket) -> Callable[[], object]:
-    """Return a function that tells whether data can be read, in a third of the time of a failed read."""
+    """Return a function that tells whether data can be read. It takes a third of the time of a failed read."""
     if sys.platform == "win32":  # Windows has no poll(), so a read is always attempted.
         return lambda: True
     poll = select.poll()

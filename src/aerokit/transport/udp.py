@@ -289,9 +289,9 @@ class UdpBroadcast(_UdpLink):
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
-        """Return True if another sender than the present peer may be received.
+        """Return True if datagrams of another sender than the present peer may be delivered.
 
-        Another port of the same host is passed on to a receiver that keeps peers. The receiver checks the frames before
+        Those of another port of the same host are delivered if the receiver keeps peers. It checks the frames before
         it accepts the port by `keep_peer`.
         """
         host, *_ = source

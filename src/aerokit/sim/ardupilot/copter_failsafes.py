@@ -148,7 +148,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self._set_radio_lost(is_lost=True)
 
     def _set_radio_lost(self, *, is_lost: bool) -> None:
-        """Record a change of the radio, and act on its loss."""
+        """Record that the radio signal was lost or has returned, and act on a loss."""
         if is_lost == self.is_radio_lost:
             return
         self.is_radio_lost = is_lost

@@ -261,7 +261,7 @@ class CopterPilotedMode(CopterModeBase):
         copter.motion.turn(yaw * _FULL_STICK_TURN_RAD_S)
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
-        """Fly as the roll and pitch sticks (-1 to 1) and the climb rate in m/s command."""
+        """Lean as the roll and pitch sticks (-1 to 1) demand, and climb at ``climb`` m/s."""
         self.vehicle.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
@@ -289,7 +289,10 @@ class CopterStabilize(CopterPilotedMode):
 
 
 class CopterLoiter(CopterPilotedMode):
-    """LOITER and similar modes: sticks set velocities, centred sticks hold the position. Low throttle: landing."""
+    """LOITER and similar modes: sticks set velocities, and centred sticks hold the position.
+
+    With a low throttle stick, the copter descends and lands.
+    """
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
         velocity = (-pitch * _LOITER_SPEED_M_S, roll * _LOITER_SPEED_M_S, -climb)

@@ -51,7 +51,7 @@ class ArduPilotDevices:
         return Result.ACCEPTED
 
     def move_gear(self, command: ReceivedCommand) -> int:
-        """Accept every command, as the firmware does if no landing gear is fitted."""
+        """Retract (param 2 is 1) or deploy the landing gear. As in the firmware, accept it even without one."""
         is_retraction = command.param2 == 1
         if self._is_set("LGR_ENABLE") and is_retraction is not self.gear_is_up:
             self.gear_is_up = is_retraction

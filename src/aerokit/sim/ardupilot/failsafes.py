@@ -70,7 +70,7 @@ class BatteryFailsafe:
         return None
 
     def _level_if_below(self, level: int) -> int:
-        """Return ``level`` if the battery has been below the limits of this level for long enough, otherwise 0."""
+        """Return ``level`` if the charge is below its limit, or the voltage longer than BATT_LOW_TIMER; else 0."""
         is_voltage_low, is_charge_low = self._low_quantities(level)
         voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
         timeout = self._vehicle.parameters["BATT_LOW_TIMER"]  # 0 ignores a low voltage.

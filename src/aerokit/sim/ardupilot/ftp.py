@@ -221,7 +221,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._work()
 
     def _entries(self, path: str) -> list[Entry]:
-        """Return the entries of a folder with `.` and `..`, as Linux lists them. The root also contains the mounts."""
+        """Return the entries of a folder. Outside mounts, they include `.` and `..`, as Linux lists them.
+
+        The root also contains the listed mounts.
+        """
         entries = super()._entries(path)
         if self.files.mounted(path) is not None:
             return entries

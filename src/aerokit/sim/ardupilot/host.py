@@ -69,7 +69,10 @@ class ArduPilotMode:
         """Set the targets of motors and motion for the next ``dt`` seconds."""
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
-        """Climb to an altitude above home. Return False if the mode does not support take-off by command."""
+        """Climb to an altitude above home. Return False if the mode does not support take-off by command.
+
+        With ``must_navigate``, also return False if the mode cannot hold its horizontal position.
+        """
         return False
 
     def pause(self) -> bool:

@@ -46,7 +46,7 @@ class PlaneHost(ArduPilotVehicle):
 
     @property
     def home_of_rtl(self) -> Ned:
-        """Home at RTL_ALTITUDE, or at the current altitude if that is negative."""
+        """Home at RTL_ALTITUDE. If RTL_ALTITUDE is negative, home at the current altitude."""
         north, east, home_down = self.home_or_ground
         height = self.parameters["RTL_ALTITUDE"]
         return (north, east, self.wing.down if height < 0 else home_down - height)
@@ -234,7 +234,7 @@ class PlaneAltitudeMode(PlaneModeBase):
         self.steer(wing.climb_to(self._down))
 
     def climb_rate(self) -> float:
-        """Return the rate at which the altitude changes, in m/s."""
+        """Return the climb rate in m/s that the pitch stick commands."""
         return self.stick(RC_PITCH) * self.vehicle.parameters["FBWB_CLIMB_RATE"]
 
     def steer(self, climb: float) -> None:
@@ -309,7 +309,7 @@ class PlaneNavigatingMode(PlaneModeBase):
 
 
 class PlaneRtl(PlaneNavigatingMode):
-    """RTL: circles above a rally point or home at RTL_ALTITUDE, or at the current altitude if that is negative."""
+    """RTL: circles above a rally point or home at RTL_ALTITUDE. If RTL_ALTITUDE is negative, keeps the altitude."""
 
     can_arm = False
 

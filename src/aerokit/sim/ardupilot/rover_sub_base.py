@@ -73,7 +73,7 @@ class GuidedSetpoints:
         raise NotImplementedError
 
     def is_complete(self, target: GuidedTarget) -> bool:
-        """Return True if the firmware accepts this combination of values."""
+        """Return True if the firmware accepts this combination of values: at least a position or a velocity."""
         return target.position is not None or target.velocity is not None
 
     @property

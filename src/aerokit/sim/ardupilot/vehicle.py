@@ -236,7 +236,7 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Return True for this system, except its other components.
+        """Return True for a message to all systems or to this one, but not to one of its other components.
 
         As in the firmware (MAVLink_routing.cpp), messages to components that do not exist are included.
         """
@@ -285,7 +285,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a text, because the firmware sends the reason of a refusal after the acknowledgement."""
+        """Send a text; after the boot, queue it, because the firmware sends the reason of a refusal last."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:
@@ -329,7 +329,7 @@ class ArduPilotVehicle(ArduPilotHost):
         return MavResult.ACCEPTED if self.set_mode(number) else MavResult.FAILED
 
     def mode_of(self, kind: type[ModeT]) -> ModeT:
-        """Return the mode of this class."""
+        """Return the mode object of the class ``kind``."""
         mode = self._modes[kind.number]
         assert isinstance(mode, kind)
         return mode

@@ -213,7 +213,7 @@ class Px4Flight:
             vehicle.call_later(0.0, self.announce_take_off)
 
     def announce_take_off(self) -> None:
-        """Send the text about the take-off."""
+        """If the take-off uses the default height, send the text that says so."""
         if self._is_default_height:
             altitude = self._vehicle.parameters["MIS_TAKEOFF_ALT"]
             self._vehicle.info(f"Using default takeoff altitude: {altitude:.1f} m")

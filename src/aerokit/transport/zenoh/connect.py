@@ -98,7 +98,7 @@ class ZenohConnect(NetworkLink):
 
     @property
     def late_frames(self) -> int:
-        """Datagrams and beacons dropped because they arrived more than 2 s late."""
+        """Number of datagrams and beacons that were dropped because they arrived more than 2 s late."""
         return self._tracker.late
 
     def write(self, data: bytes, peer: Peer = None) -> None:

@@ -232,7 +232,7 @@ class ZenohListen(NetworkLink):
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        """Add a client that has come online, and send an extra beacon, so that it need not wait for the next one."""
+        """Add a client that has come online, and send the next beacon earlier, so that the client need not wait."""
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
@@ -263,7 +263,7 @@ class ZenohListen(NetworkLink):
         self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
     def _send_notices(self, client: str, notices: list[RefusalNotice], stamp: Stamp | None) -> None:
-        """Send notices to the program that sent a datagram with this stamp; without a valid stamp, to all namesakes."""
+        """Send notices to the sender of the datagram with this stamp; without one, to all with its client name."""
         nonce = None if stamp is None else stamp.nonce
         for notice in notices:
             self._put(self._keys.notices(client), notice.replace(nonce=nonce).encode(), b"")

@@ -192,7 +192,7 @@ async def open_session(address: str, options: NetworkOptions, declare: Callable[
 
 @contextlib.contextmanager
 def zenoh_errors(address: str, zenoh: Any) -> Iterator[None]:
-    """Convert errors of zenoh while a link is opened to LinkOpenError."""
+    """Convert the errors that zenoh raises while a link is being opened to LinkOpenError."""
     try:
         yield
     except zenoh.ZError as error:
@@ -216,7 +216,7 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
 
 
 def call(function: Callable[[], object]) -> object:
-    """Call a function: the ``process`` argument of a `LoopQueue` of functions."""
+    """Call a function. Used as the argument ``process`` of a `LoopQueue` whose items are functions."""
     return function()
 
 
