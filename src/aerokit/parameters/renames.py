@@ -130,7 +130,7 @@ class Renamed(Snapshot):
 def find_rename(name: str, other: str = "") -> Rename | None:
     """Find a renamed parameter by any of its names; return None for parameters that were not renamed.
 
-    The new names of a few old names depend on the vehicle type: ``other`` selects one of the new names.
+    A few old names have several new names, one for each vehicle type: ``other`` selects one of these.
     """
     return next((rename for rename in _by_name().get(name, ()) if not other or other in rename.names), None)
 

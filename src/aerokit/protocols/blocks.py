@@ -54,7 +54,7 @@ class AdaptiveWindow:
         return int(self._size)
 
     def widen(self, size: float) -> None:
-        """Raise the size to ``size`` or half of the maximum, because so many answers fit into one round trip."""
+        """Raise the size to ``size``, the number of answers in one round trip, but at most to half of the maximum."""
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
@@ -82,7 +82,7 @@ class AdaptiveWindow:
 
 
 class _BlockRequest:
-    """The request for one block. All transmissions are numbered; ``transmission_number`` is that of its latest one."""
+    """The request for one block. Of all transmissions, its latest one has the number ``transmission_number``."""
 
     __slots__ = ("attempts", "previous_sent_at", "sent_at", "transmission_number")
 

@@ -356,7 +356,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _in_flight_s(self) -> float:
-        """Seconds after a transmission in which its answer cannot have arrived yet."""
+        """Seconds from the transmission of an item to the earliest possible arrival of the answer."""
         round_trip_s = self.round_trip.smoothed_s
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()

@@ -80,7 +80,7 @@ RESULTS: dict[int, str] = {
 class MissionExchange(Transfer[ResultT]):
     """A transfer with one component. It ignores messages to other systems and of other mission types.
 
-    Errors number the items as the caller does: by the index in the messages minus ``offset``.
+    Error texts have the item numbers of the caller: the index in the messages minus ``offset``.
     """
 
     def __init__(

@@ -264,7 +264,7 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """If the timer is more than ``_MAX_CATCH_UP_S`` simulated seconds late, skip the excess, unless the speed is 1."""
+        """If the timer is over ``_MAX_CATCH_UP_S`` simulated seconds late, skip the excess, unless the speed is 1."""
         has_nothing_scheduled = self._timer is None and self._remove_source is None
         if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return

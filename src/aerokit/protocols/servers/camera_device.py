@@ -111,7 +111,7 @@ class CameraDevice:
         return self.free_mib > 0
 
     def store_image(self, image: CameraImageCaptured) -> str | None:
-        """Write the file of an image and return its URL; None if it cannot be stored."""
+        """Store an image and return its URL; empty if images have no URL, None if the image cannot be stored."""
         return ""
 
     def storage(self, number: int) -> list[m.StorageInformation]:
@@ -263,7 +263,7 @@ class Captures:
             self._begin_image(series)
 
     def record(self, status_interval_s: float) -> None:
-        """Register the start of a video. CAMERA_CAPTURE_STATUS is then sent at this interval in seconds (0: never)."""
+        """Register the start of a video. Send CAMERA_CAPTURE_STATUS now, and then at this interval (0: not again)."""
         self._recording_since = self._camera.host.now
         self._camera.host.send(self.status())
         if 0.0 < status_interval_s < math.inf:

@@ -192,7 +192,7 @@ class RunningCommands:
 
     A repeated transmission (COMMAND_LONG with a confirmation) never executes a command twice: it is answered by
     IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with the same MAV_CMD
-    is TEMPORARILY_REJECTED while the first command runs. So is every command above ``MAX_RUNNING_COMMANDS``.
+    is TEMPORARILY_REJECTED while the first command runs. So is any new command while ``MAX_RUNNING_COMMANDS`` run.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:

@@ -92,7 +92,7 @@ class CameraOrders:
         return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
-        """Key under which the arbiter keeps the orders to one function of this camera apart from all others.
+        """Return the key of the orders to one function of this camera. Orders with different keys are independent.
 
         ``subject`` names the function, such as ``"video"``. All objects of the same camera return the same key.
         """

@@ -406,12 +406,12 @@ class CommandArbiter:
         return bool(modes) and {mode.custom_mode for mode in modes} <= ending_numbers
 
     def _posted_modes(self) -> tuple[Mode, ...]:
-        """Modes that posted orders, including superseded ones, may still lead to."""
+        """Return the modes to which posted orders, including superseded ones, may still lead."""
         unconfirmed_orders = [order for order in self._posted if not order.is_confirmed]
         return tuple(mode for order in unconfirmed_orders for mode in order.modes)
 
     def _is_steering(self) -> bool:
-        """True while the vehicle is in a mode of the newest order and there was no takeover."""
+        """Return True while the vehicle is in a mode of the newest order and no takeover or failsafe has followed."""
         order, mode = self.newest, self._telemetry.mode.latest
         return (
             order is not None

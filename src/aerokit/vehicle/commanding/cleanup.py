@@ -283,7 +283,7 @@ class FlightCleanup:
             raise
 
     def end_flights(self) -> None:
-        """At the end of the vehicle's `async with` block, end the flights of other tasks, and hold the vehicle."""
+        """At the end of the vehicle's `async with` block, stop an open stream, and hold if a task awaits an order."""
         if self.stop_stream is not None:
             self.stop_stream("the async with block of its vehicle was left")
         if self._awaited_order is not None:

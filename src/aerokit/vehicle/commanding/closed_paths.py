@@ -74,7 +74,7 @@ class PathFlight:
 
     ``start_from_centre`` is the vehicle's position at the start, relative to the centre of the path (north, east,
     down). ``centre`` is the position of the centre in the local frame. ``heading`` returns the heading in degrees for a
-    place relative to the centre and a velocity; None leaves it to the autopilot.
+    place relative to the centre and a velocity; if it returns None, the autopilot chooses the heading.
     """
 
     def __init__(

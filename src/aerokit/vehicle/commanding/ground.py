@@ -154,7 +154,7 @@ class GroundCheck:
 
     @property
     def is_pending(self) -> bool:
-        """True while the vehicle is reported on the ground."""
+        """True while the vehicle is reported on the ground, whether or not `confirms` has already returned True."""
         return self._reported_at is not None
 
     def confirms(self, is_reported: bool) -> bool:

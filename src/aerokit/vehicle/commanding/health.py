@@ -165,7 +165,7 @@ class Health:
         return text if arming_mode is None else f"{text}; arm() changes to {arming_mode.name} {when}"
 
     def _modes_to_leave(self) -> frozenset[str]:
-        """Return the names of the modes that `arm` changes to another mode before arming, or after a refusal."""
+        """Return the names of the modes that `arm` leaves, either before it arms or after a refusal."""
         return self._autopilot.unarmable_modes.union(self._autopilot.armable_by_option)
 
     async def _refresh(self) -> None:
@@ -201,7 +201,7 @@ class Health:
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
-        """Return one text for each missing estimate; the first one is a missing GPS fix, the probable cause."""
+        """Return one text for each missing estimate, after the probable cause if no GPS receiver has a fix."""
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []

@@ -282,7 +282,7 @@ class Order:
         self._mode_now = number
 
     def on_system_status(self, state: int) -> None:
-        """Record a failsafe if MAV_STATE has become worse since the last report; at first, since the order was given.
+        """Record a failsafe if MAV_STATE is worse than in the last report, which may be from before the order.
 
         An order to land, to return or to disarm is not ended by any failsafe.
         """

@@ -249,7 +249,7 @@ class OrderSender:
             raise self._session.with_reasons(error, started) from None
 
     async def ensure_mode(self, mode: Mode, order: Order) -> None:
-        """Change the mode unless a recent HEARTBEAT already reports it."""
+        """Change the mode, unless a recent HEARTBEAT reports it and no earlier mode change is in doubt."""
         is_reported = self._session.telemetry.is_in(mode) and self._session.telemetry.mode.age <= MODE_MAX_AGE_S
         if self._arbiter.mode_is_in_doubt or not is_reported:
             await self.change_mode(mode, order)
@@ -361,7 +361,7 @@ class OrderSender:
 
     @contextmanager
     def _raw_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
-        """Register a raw command as an order. A command that steers supersedes actions."""
+        """Register a raw command as an order. A command that steers supersedes the previous steering order."""
         subjects = CHANGED_BY_COMMAND.get(command, ())
         if subjects and subjects != ARM_ALONE:
             yield self._arbiter.raw_order(subjects, modes=modes)

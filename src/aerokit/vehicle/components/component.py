@@ -52,8 +52,8 @@ class ComponentStatus(Snapshot):
 
     ``kind`` is ``"autopilot"``, ``"camera"``, ``"gimbal"``, ``"onboard_controller"``, ``"adsb"``, ``"parachute"`` …:
     MAV_TYPE in lower case or, if that is generic, MAV_COMPONENT. ``device_id`` is 1 to 6 for a camera or gimbal without
-    a component id of its own, and ``component_id`` is then the component that it is attached to; otherwise 0.
-    ``received_at`` is the loop time of the component's last message.
+    a component id of its own, otherwise 0. If it is not 0, ``component_id`` is the component to which the device is
+    attached. ``received_at`` is the loop time of the component's last message.
     """
 
     component_id: int

@@ -60,7 +60,7 @@ class GimbalOrders:
 
     @property
     def public_device(self) -> GimbalDevice:
-        """The device whose state values are public. For the first gimbal, it is always the same object."""
+        """The device whose state cells the program reads. For the first gimbal, it is always the placeholder."""
         return self.registry.placeholder if self._device is None else self._device
 
     @property
@@ -189,7 +189,7 @@ class GimbalOrders:
         return False
 
     def _send_unanswered(self, order: Order, message: Message) -> None:
-        """Send a message without an acknowledgement. Raises OperationRejected if a newer order was given meanwhile."""
+        """Send a message that has no acknowledgement. Raises OperationRejected if a newer order was given meanwhile."""
         with self.context.arbiter.auxiliary_order(order):
             self.session.send(message)
 
@@ -236,7 +236,7 @@ class GimbalOrders:
         self.session.background.start(ask, "aerokit gimbal")
 
     async def ask(self, message_id: int, component_id: int, *, attempts: int = 3) -> None:
-        """Request a message from a component once."""
+        """Request one copy of a message from a component. The request is sent at most ``attempts`` times."""
         await self.session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )

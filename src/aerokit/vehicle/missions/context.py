@@ -204,7 +204,7 @@ class MissionTracker:
 
     @property
     def last_item(self) -> int | None:
-        """Index of the last item; None while the number of items is unknown."""
+        """Index of the last item; None if the mission is empty, or while the number of items is unknown."""
         count = self.count.latest
         return count - 1 if count else None
 

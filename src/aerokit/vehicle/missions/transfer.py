@@ -40,7 +40,7 @@ REFUSAL_TEXT_DELAY_S = 0.3
 class PlanChannel:
     """Transfers plans of one MAV_MISSION_TYPE. Items are numbered as the vehicle numbers them.
 
-    Errors have the item numbers of the program and the vehicle's status texts, and say which items the vehicle has now.
+    Errors use the program's item numbers, contain the vehicle's status texts, and say which items the vehicle has now.
     """
 
     def __init__(
@@ -307,7 +307,10 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Transfer no files from now on. Raise the error if the caller chose files, or if files have worked."""
+        """Transfer no files from now on. Raise the error instead if ``method`` is "ftp".
+
+        If files have worked before, only a FileError ends their use, and any other error is raised.
+        """
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False

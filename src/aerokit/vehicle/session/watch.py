@@ -198,7 +198,7 @@ class VehicleWatch:
             self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Read the vehicle's time in answers to TIMESYNC requests, which a vehicle sends even without streams."""
+        """Read the vehicle's time in its answers to TIMESYNC requests. It answers even if no streams are requested."""
         frame = message.received_frame
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._record_time(frame, "TIMESYNC", message.tc1 // 1_000_000)

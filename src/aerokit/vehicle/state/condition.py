@@ -75,7 +75,7 @@ class SensorHealth(Snapshot):
 
     @property
     def blocks_arming(self) -> tuple[str, ...]:
-        """The failing sensors that block arming; empty if the pre-arm checks pass."""
+        """The failing sensors, which may block arming; empty if the pre-arm checks pass."""
         return () if self.prearm_checks_pass else self.failing
 
 

@@ -184,7 +184,7 @@ class Telemetry(States):
         return self._cells[name]
 
     def _time_of_arrival(self) -> float:
-        """Return when the message that is being processed arrived; the present time if it has no frame."""
+        """Return the arrival time of the message that is being processed; the present time if it has no frame."""
         return self._clock() if self._arrived_at is None else self._arrived_at
 
     def _source(self, class_name: str) -> Source:
