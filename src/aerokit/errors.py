@@ -206,9 +206,9 @@ class NotSupported(OperationRejected):
 
 
 class GimbalTaken(OperationRejected):
-    """Another system took control of a gimbal.
+    """Control of a gimbal was lost: another system took it, or no system has it any longer.
 
-    ``system_id`` and ``component_id`` identify the system now in control; both are 0 if no system is in control.
+    ``system_id`` and ``component_id`` identify the system now in control; both are 0 if there is none.
     """
 
     def __init__(self, message: str, *, system_id: int, component_id: int) -> None:

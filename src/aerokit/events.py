@@ -151,7 +151,7 @@ class OrderRefused(Event):
     """The program that serves the vehicle on the network did not forward a message of this program (docs/network.md).
 
     ``message`` is the name of the MAVLink message, and ``reason`` a clause that explains the refusal. ``lease_holder``
-    is the client that controls the vehicle if the message was refused for this reason, otherwise None. Published at
+    is the client that controls the vehicle, if its control is the reason of the refusal; otherwise None. Published at
     most twice a second for each message name.
     """
 
@@ -201,9 +201,9 @@ class MissionFinished(Event):
 
 
 class GimbalControlLost(Event):
-    """Another system took control of a gimbal from a ``gimbal.control()`` block (GIMBAL_MANAGER_STATUS).
+    """A ``gimbal.control()`` block lost control: another system has it, or none (GIMBAL_MANAGER_STATUS).
 
-    ``to_system_id`` and ``to_component_id`` identify the system now in control; both are 0 if no system is in control.
+    ``to_system_id`` and ``to_component_id`` identify the system now in control; both are 0 if there is none.
     ``is_primary`` is True for primary control, False for secondary control.
     """
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
-    """Raise InvalidArgument if the metadata does not allow a value; the text lists all these values.
+    """Raise InvalidArgument if the metadata does not allow some of the values; the text lists those values.
 
     Names without metadata are accepted. The text also names ``force``, the option that sets the values nevertheless.
     """
@@ -44,7 +44,7 @@ def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: s
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return why the value is not allowed, with the name and unit that the user gave; None if it is allowed."""
+    """Return why a value is not allowed, after the user's name and value if the metadata has another name; or None."""
     entry, convert = metadata_entry(metadata, name)
     problem = None if entry is None else entry.problem(convert(value))
     if problem is None or entry is None or entry.name == name:

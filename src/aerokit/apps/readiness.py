@@ -195,7 +195,7 @@ MIN_CHECK_INTERVAL_S = 5.0
 
 
 class ArmingCheckRequests:
-    """Decides when to request the arming checks of vehicles: when a check begins to fail, or other sensors fail."""
+    """Decides when to request arming checks: when they begin to fail, and when the set of failing sensors changes."""
 
     def __init__(self) -> None:
         self._failing: dict[Vehicle, tuple[str, ...]] = {}

@@ -124,7 +124,7 @@ class StickRules(Snapshot):
 class GimbalRules(Snapshot):
     """Support of the gimbal protocol v2 by the autopilot's gimbal manager. The defaults follow the standard.
 
-    - ``has_secondary``: the manager has secondary control.
+    - ``has_secondary``: the manager supports secondary control by another system.
     - ``supports_retract``: the manager executes GIMBAL_MANAGER_FLAGS_RETRACT.
     - ``supports_pitchyaw``: the manager accepts rates by GIMBAL_MANAGER_SET_PITCHYAW; otherwise by
       GIMBAL_MANAGER_SET_ATTITUDE.
@@ -175,7 +175,7 @@ def mode_numbers(params: Sequence[float]) -> list[int]:
 class Autopilot:
     """Description of an autopilot and vehicle type. The base class describes unknown autopilots.
 
-    An object describes one vehicle, from its first HEARTBEAT. It has no state and does no IO.
+    An object is created from the first HEARTBEAT of one vehicle, and describes it. It has no state and does no IO.
     """
 
     name = "unknown autopilot"
@@ -366,7 +366,7 @@ class Autopilot:
         return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name to store for an entry of AVAILABLE_MODES; None if the name is already known."""
+        """Return the name to store for an entry of AVAILABLE_MODES; None if it is empty or the mode is known."""
         return name if name and custom_mode not in self.modes.numbers else None
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:

@@ -557,7 +557,7 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
-        """Write a frame to the peers of its target. If ``message`` is None, the target is unknown: all peers get it."""
+        """Write a frame to the peers of system ``to``, or of the target of ``message``; without both, to all peers."""
         system_id = getattr(message, "target_system", 0) if to is None else to
         for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
             self.link.write(data, peer)

@@ -54,9 +54,9 @@ class LoopWatch:
 
     Data may arrive during a pause and wait. Until all of this data has been read, its receive time is the time at which
     the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
-    ages may be too small by up to this time. ``on_blocked`` gets the length of pauses above ``BLOCKED_THRESHOLD_S``, or
-    up to ``CHECK_INTERVAL_S`` more. ``on_slept`` gets the time that the computer was suspended. ``on_caught_up`` gets
-    the length of a pause, and of the time after it in which waiting data was read, once all of this data was read.
+    ages may be too small by up to this time. ``on_blocked`` gets the maximum length of each pause that delays the timer
+    by more than ``BLOCKED_THRESHOLD_S``. ``on_slept`` gets the time that the computer was suspended. ``on_caught_up``
+    gets the length of a pause, and of the time after it in which waiting data was read, once all of it was read.
     """
 
     def __init__(

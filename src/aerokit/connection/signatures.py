@@ -155,7 +155,7 @@ def _is_signed_with_a_key(frame: Frame) -> bool:
 
 
 class _Handover:
-    """Change of one component to another key, or to no key."""
+    """A key handover in progress: one component is changing to another signing key, or to none."""
 
     def __init__(self, signing: Signing | None, source: tuple[int, int], switched: asyncio.Event) -> None:
         self.signing, self.switched = signing, switched

@@ -133,7 +133,7 @@ class ClassicConnection:
         )
 
     def match_mavlink_version(self, heartbeat: Message) -> None:
-        """Switch to the MAVLink version that the vehicle uses, because old firmware does not support version 2."""
+        """Use MAVLink 2 if the vehicle is known to support it, else its HEARTBEAT's version (1 for old firmware)."""
         frame = heartbeat.received_frame
         if frame is not None:
             version = 2 if self.supports_mavlink_2 else frame.version
@@ -199,7 +199,10 @@ class BackgroundCalls:
             self._loop.call_soon(self._cancel, call)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function on the loop after all earlier calls. The function must neither block nor raise."""
+        """Call a function on the loop: at once if this is the loop's thread, otherwise after all earlier calls.
+
+        The function must neither block nor raise.
+        """
         if self._loop.is_current:
             function(*args)
         else:

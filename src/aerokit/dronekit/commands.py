@@ -21,7 +21,7 @@ from aerokit.errors import AerokitError, InvalidArgument, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission
 from aerokit.missions.item import MissionItem, canonical_frame
-from aerokit.missions.wire import convert_from_ardupilot, from_degrees, in_degrees, shift_jumps, to_wire_float
+from aerokit.missions.wire import convert_from_ardupilot, from_degrees, shift_jumps, to_wire_float, unscaled_xy
 from aerokit.sync.thread_future import when_done
 
 if TYPE_CHECKING:
@@ -358,7 +358,7 @@ def _command_from(cmd: Any) -> Command:
     except AttributeError:
         raise TypeError(f"{cmd!r} is not a Command") from None
     if hasattr(cmd, "get_type") and cmd.get_type() == "MISSION_ITEM_INT":
-        fields["x"], fields["y"] = in_degrees(MissionItem(cmd.command, cmd.frame, x=cmd.x, y=cmd.y))
+        fields["x"], fields["y"] = unscaled_xy(MissionItem(cmd.command, cmd.frame, x=cmd.x, y=cmd.y))
     return Command(**fields)
 
 

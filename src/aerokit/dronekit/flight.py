@@ -262,7 +262,7 @@ class FlightMethods(VehicleAttributes):
         order.add_done_callback(self._dk_on_home_answer)
 
     def _dk_on_home_answer(self, order: Future[None]) -> None:
-        """Restore the reported home if the vehicle has rejected the new home."""
+        """Restore the reported home if the vehicle has rejected the new home, or has not answered."""
         if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_reported_home
 

@@ -179,7 +179,7 @@ class ParameterValues:
         return None if parameter is None else float(parameter.value)
 
     def store(self, parameter: Parameter) -> bool:
-        """Store a parameter; return True if it is new or changed."""
+        """Store a parameter, unless it is new and the store is full; return True if a value was added or changed."""
         name, previous = parameter.name, self._parameters.get(parameter.name)
         if previous is None and len(self._parameters) >= MAX_PARAMETERS:
             return False  # A sender can make up names, so their number is limited.

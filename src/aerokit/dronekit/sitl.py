@@ -215,7 +215,7 @@ def version_list() -> dict[str, dict[str, str]]:
 
 
 def parse_home(text: str) -> tuple[float, float, float]:
-    """Parse ``LAT,LON,ALT`` or SITL's ``LAT,LON,ALT,HEADING``; InvalidArgument for anything else."""
+    """Parse ``LAT,LON,ALT``; InvalidArgument unless these are numbers. Ignore further parts, such as SITL's heading."""
     try:
         latitude, longitude, altitude = (float(part) for part in text.split(",")[:3])
     except ValueError:

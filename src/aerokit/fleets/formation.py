@@ -191,7 +191,7 @@ class Following:
 
     @property
     def is_running(self) -> bool:
-        """True until following has stopped."""
+        """True from the entry of the block until following has stopped."""
         return self._was_entered and not self._stopped.is_set()
 
     @property

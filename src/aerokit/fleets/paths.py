@@ -144,7 +144,7 @@ def min_path_distance(path: Path, other: Path, *, slack_s: float = math.inf, bel
 
 
 def horizontal_distance(line: tuple[LocalPoint, LocalPoint], other: tuple[LocalPoint, LocalPoint]) -> float:
-    """Return the horizontal distance in metres between two straight lines, regardless of time and altitude."""
+    """Return the smallest horizontal distance in metres between two line segments, given by their end points."""
     approach = _closest(_flat_leg(*line), _flat_leg(*other), math.inf)
     assert approach is not None
     return approach.distance_m

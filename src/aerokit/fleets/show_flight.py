@@ -228,8 +228,8 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 class TrackRecorder:
     """Records a vehicle's positions (GLOBAL_POSITION_INT) in its ``with`` block, in seconds and metres of the show.
 
-    Times are from the vehicle's clock (``time_boot_ms``). If TIMESYNC has measured another clock of the vehicle, they
-    are the times of arrival.
+    Times are ``time_boot_ms``, converted by the clock offset that TIMESYNC has measured. If this is the offset of
+    another clock of the vehicle, they are the times of arrival.
     """
 
     def __init__(

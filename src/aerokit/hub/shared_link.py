@@ -76,7 +76,7 @@ class SharedLink(Link):
 
     @property
     def unsent_bytes(self) -> int:
-        """See `Link.unsent_bytes`; includes data of this program."""
+        """See `Link.unsent_bytes`; includes bytes that this program itself has sent over the connection."""
         return self._connection.unsent_bytes
 
     def close(self) -> None:

@@ -54,7 +54,7 @@ class FieldDefinition:
 
     @property
     def attribute(self) -> str:
-        """Name in Python: the standard's name. A Python keyword gets a trailing underscore."""
+        """Name in Python: the standard's name. A keyword or a name that `Message` uses gets a trailing underscore."""
         reserved = keyword.iskeyword(self.name) or self.name in _RESERVED
         return self.name + "_" if reserved else self.name
 

@@ -192,7 +192,7 @@ class PythonFramer:
         self._rest = b""
 
     def close(self) -> None:
-        """Release the framer's senders in a shared `SourceLimit`. Do not use the framer afterwards."""
+        """Free the places of this framer's senders in a shared `SourceLimit`. Do not use the framer afterwards."""
         self._limit.leave(self.statistics)
 
     def counters_of(self, frame: Frame) -> SourceStatistics | None:

@@ -80,7 +80,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin of the two that is first in `STANDARD_FILES`, and any added remarks."""
+    """Return ``existing`` with the origin that `STANDARD_FILES` lists first, and the remarks of ``added``, if any."""
     origin = min(
         existing.origin,
         added.origin,

@@ -38,7 +38,7 @@ class MessageFactory(_MAVLink):
     """Number of messages sent, modulo 256. The link has its own sequence numbers."""
 
     def __init__(self, connection_send: Callable[[Any], object], source_system: int, source_component: int) -> None:
-        """Create a factory that passes messages to ``connection_send(message)``. Programs may read the ids."""
+        """Create a factory that passes messages to ``connection_send(message)``. The ids are kept as attributes."""
         super().__init__(None, source_system, source_component)
         self._connection_send = connection_send
 

@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    Two senders with the same ids are detected by their sequence numbers: two streams advance independently. The stream
-    with more frames counts as that of the sender, until it has been silent for 1.5 s.
+    Two senders with the same ids are detected by their sequence numbers: two streams advance independently. Lost
+    frames are then counted only in the stream with more frames; once it has been silent for 1.5 s, in the other one.
     """
 
     expected: int
@@ -149,7 +149,7 @@ class SourceStatistics(SourceFields):
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _consume_missing(self, behind: int) -> bool:
-        """Return True if the frame ``behind`` numbers before `expected` counted as lost, and no longer count it so."""
+        """No longer count the frame ``behind`` numbers before `expected` as lost. Return True if it was counted so."""
         self._missing, self._missing_base = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)
@@ -264,7 +264,7 @@ class SourceLimit:
         self._statistics.add(statistics)
 
     def leave(self, statistics: FramerStatistics) -> None:
-        """Release the senders of these statistics."""
+        """Exclude the senders of these statistics from the limit, which frees their places."""
         self._statistics.discard(statistics)
         self.free += len(statistics.sources)
 

@@ -17,7 +17,7 @@ from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import MissionItem, canonical_frame
 from aerokit.missions.mission import Fence, FenceCircle, FencePolygon, Mission, Plan, RallyPoints
 from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries
-from aerokit.missions.wire import in_degrees
+from aerokit.missions.wire import unscaled_xy
 from aerokit.position import Position
 
 if TYPE_CHECKING:
@@ -353,7 +353,7 @@ def _fence_members(fence: Fence) -> dict[str, Any]:
 def _rally_point(item: MissionItem, index: int) -> list[int | float | None]:
     if canonical_frame(item.frame) != MavFrame.GLOBAL_RELATIVE_ALT:
         raise InvalidArgument(f"rally[{index}]: frame = {item.frame!r}: a .plan file stores only altitudes above home")
-    return [json_number(number) for number in (*in_degrees(item), item.z)]
+    return [json_number(number) for number in (*unscaled_xy(item), item.z)]
 
 
 def _place(position: Position) -> list[int | float | None]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.errors import FileFormatError
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import DEGREE_SCALE, MissionItem, canonical_frame, has_place, xy_scale
-from aerokit.missions.wire import from_degrees, in_degrees
+from aerokit.missions.wire import from_degrees, unscaled_xy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -147,7 +147,7 @@ def merged_entries(
 
 def simple_entry(item: MissionItem) -> dict[str, Any]:
     """Create a SimpleItem. The caller sets its doJumpId and the target of a jump."""
-    x, y = in_degrees(item)
+    x, y = unscaled_xy(item)
     numbers = (item.param1, item.param2, item.param3, item.param4, x, y, item.z)
     entry: dict[str, Any] = {}
     mode = _MODE_OF_FRAME.get(canonical_frame(item.frame))
@@ -242,7 +242,7 @@ def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
 
 
 def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
-    """Return True if the items are equal. Jump targets are ignored, because they are always rewritten."""
+    """Return True if the items are equal. For two single jumps, the targets are ignored: they are always rewritten."""
     if len(group) == len(items) == 1:
         old, new = group[0], items[0]
         if old.command == new.command == MavCmd.DO_JUMP:

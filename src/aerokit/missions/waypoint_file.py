@@ -17,7 +17,7 @@ from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import DEGREE_SCALE, DESTINATIONS, MissionItem, canonical_frame, xy_scale
 from aerokit.missions.mission import Mission
-from aerokit.missions.wire import from_degrees, in_degrees, shift_jumps
+from aerokit.missions.wire import from_degrees, shift_jumps, unscaled_xy
 from aerokit.position import Position
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class _Row:
         self._integer("current", 0xFF)  # Raises for an invalid number. The value is not used.
 
     def is_home(self) -> bool:
-        """Return True if this line can be home, because it is a waypoint above mean sea level.
+        """Return True if this line can be home: a waypoint whose altitude is relative to mean sea level.
 
         Mission Planner used to write command 0 for home.
         """
@@ -181,7 +181,7 @@ def _home_row(home: Position | None) -> str:
 def _item_row(item: MissionItem, index: int) -> str:
     """Return the line for one item. InvalidArgument for numbers that the file cannot store."""
     integers = (index, 0, int(item.frame), int(item.command))
-    numbers = (item.param1, item.param2, item.param3, item.param4, *in_degrees(item))
+    numbers = (item.param1, item.param2, item.param3, item.param4, *unscaled_xy(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):
         raise InvalidArgument(f"{item!r} has an infinite number, which a waypoint file cannot store")
     if math.isnan(item.z) and (item.command in DESTINATIONS or item.position is not None):

@@ -65,7 +65,7 @@ def to_wire_float(
 
     https://mavlink.io/en/messages/common.html#MISSION_ITEM
     """
-    x, y = in_degrees(item) if place is None else place
+    x, y = unscaled_xy(item) if place is None else place
     return messages.MissionItem(
         target_system=target_system,
         target_component=target_component,
@@ -105,15 +105,15 @@ def from_wire(message: messages.MissionItemInt | messages.MissionItem) -> Missio
     )
 
 
-def in_degrees(item: MissionItem) -> tuple[float, float]:
-    """Return x and y in the form of MISSION_ITEM and files: degrees or metres for places, NaN for "not given"."""
+def unscaled_xy(item: MissionItem) -> tuple[float, float]:
+    """Return x and y as in MISSION_ITEM and files: degrees, metres or parameters; NaN for "not given"."""
     scale = xy_scale(item.command, item.frame)
     x, y = (math.nan if value == DEFAULT_XY else value / scale for value in (item.x, item.y))
     return x, y
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Convert one coordinate from degrees or metres to ``x`` or ``y``; the inverse of :func:`in_degrees`.
+    """Convert one coordinate from degrees or metres to ``x`` or ``y``; the inverse of :func:`unscaled_xy`.
 
     Positions are rounded to integers; other values keep their fraction.
     """

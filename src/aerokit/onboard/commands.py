@@ -190,7 +190,7 @@ class ComponentCommands:
         return await result if inspect.isawaitable(result) else result
 
     def add_raw(self, command: int, function: Callable[[ReceivedCommand], Awaitable[int]]) -> None:
-        """Register a coroutine function of a protocol server, which checks the parameters itself."""
+        """Register a coroutine function of a protocol server. Parameters are passed to it unchecked."""
 
         async def run(request: CommandRequest) -> int:
             return await function(request._command)

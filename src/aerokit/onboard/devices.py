@@ -100,7 +100,7 @@ STATUS_HZ = 5.0
 
 
 def _check_instance(services: ComponentServices, instance: float | None) -> None:
-    """Refuse a command for another winch or gripper. Several components get a command that is sent to all components.
+    """Refuse a command for another component's device. It arrives here too if it was sent to all components.
 
     A component has one device. Its number is 1 or the component id; 0 means all devices (DO_GRIPPER in common.xml).
     """

@@ -60,7 +60,7 @@ class Following(BlockTwin["AsyncFollowing"]):
 
     @property
     def is_running(self) -> bool:
-        """True until following has stopped."""
+        """True from the entry of the block until following has stopped."""
         return self.aio.is_running
 
     @property

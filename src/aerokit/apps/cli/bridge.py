@@ -151,7 +151,7 @@ async def _foxglove(options: argparse.Namespace) -> int:
 
 
 def _rates(options: argparse.Namespace) -> dict[type[Message], float] | None:
-    """Return the rates to request: none for ``--listen-only``, otherwise None for the usual rates."""
+    """Return the rates to request: an empty dict for ``--listen-only``; otherwise None, which means the usual rates."""
     return {} if options.listen_only else None
 
 

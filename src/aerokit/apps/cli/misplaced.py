@@ -33,7 +33,10 @@ def is_address(word: str) -> bool:
 
 
 def misplaced_file(word: str) -> str | None:
-    """Return an error text, with the right command, if a word given as an address is a file; otherwise None."""
+    """Return an error text if a word given as an address is a file other than a recording, or has such a file's suffix.
+
+    The text has the right command if the suffix is known. The result is None for other words.
+    """
     path = Path(word)
     suffix = path.suffix.lower()
     advice = _COMMANDS_BY_SUFFIX.get(suffix)

@@ -29,7 +29,7 @@ _PX4_FILE = "FILE is parameters.json, which `make parameters_metadata` writes in
 
 
 def metadata_source(vehicle: Vehicle) -> str:
-    """Return one sentence that says where the file of ``--metadata`` comes from."""
+    """Return a note that ranges were not checked, and where to get the file for ``--metadata``, which checks them."""
     if vehicle.autopilot.name == "PX4":
         file = _PX4_FILE
     else:
@@ -107,7 +107,7 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
 
 
 def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
-    """Raise InvalidArgument if the metadata does not allow a value; the text lists all these values."""
+    """Raise InvalidArgument if the metadata does not allow some of the values; the text lists those values."""
     check_values(metadata, values, "--force")
 
 

@@ -108,7 +108,7 @@ class SupervisedFlight(ABC):
 
     @abstractmethod
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        """Return the purposes of modes that show that this program still has control."""
+        """Return purposes. While the vehicle is in the mode for one of them, this program still has control."""
 
     def _check_disarmed(self) -> None:
         now = self._vehicle.describe_now()
@@ -298,7 +298,7 @@ class FlightReport:
                 await asyncio.wait(tasks)  # asyncio itself logs the error of a task that has failed
 
     def record_impact(self) -> None:
-        """Record that the vehicle has just hit the ground, so that the summary distinguishes the time before."""
+        """Record when the vehicle hit the ground, so that the summary can state how long it was armed until then."""
         if self._impact_s is None and self._armed_at is not None:
             # The impact is detected only later, because the vehicle must first lie still for some time.
             impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at
@@ -391,7 +391,7 @@ class FlightReport:
                     self.print_line(f"  {'! ' if is_warning else ''}{event.text}")
 
     def _is_about_mode(self, text: str) -> bool:
-        """Return True for "Arm: AUTO mode not armable", after which `Vehicle.arm` changes the mode and arms there."""
+        """Return True for "Arm: AUTO mode not armable", after which `Vehicle.arm` arms in another mode."""
         autopilot = self._vehicle.autopilot
         mode = self._vehicle.mode_name
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"

@@ -257,7 +257,10 @@ def _log_unexpected(error: Exception) -> None:
 
 
 def _thin_out(track: list[tuple[Position, bool]]) -> None:
-    """Remove every second point, except the first point and the last one. The mark of a gap moves to the next point."""
+    """Remove the third point of a full track, the fifth, and so on. The mark of a gap moves to the next point.
+
+    A full track has an even number of points, so the first and the last one stay.
+    """
     pairs = zip(track[2::2], track[3::2], strict=False)
     track[2:] = [(position, is_after_gap or removed[1]) for removed, (position, is_after_gap) in pairs]
 
@@ -268,6 +271,6 @@ async def _read_return_altitude(vehicle: Vehicle) -> None:
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:
-    """Return True if the vehicle is armed and in its mission mode, which ``mission.pause`` requires."""
+    """Return True if the vehicle is in its mission mode, which ``mission.pause`` requires, and may be armed."""
     mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
     return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed

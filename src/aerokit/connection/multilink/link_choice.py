@@ -108,7 +108,7 @@ class Candidate:
             self.is_proven, self.is_doubted = True, False
 
     def reset_proof(self) -> None:
-        """Forget all evidence after the vehicle rebooted."""
+        """Discard the proof and all evidence for it after the vehicle rebooted. `was_proven` keeps an earlier proof."""
         self.was_proven = self.was_proven or self.is_proven
         self.is_proven = self.is_other_hardware = False
         self.hardware = None
@@ -277,7 +277,10 @@ class LinkChoice:
                 compared.record_hardware(is_other=self.hardware.contradicts(compared.hardware))
 
     def may_be_used(self, candidate: Candidate) -> bool:
-        """Return True if frames and commands may use the link: it is in use, is proven, or needs no proof."""
+        """Return True if frames and commands may use the link.
+
+        It must not lead to other hardware. If another link is in use, this one must be proven or need no proof.
+        """
         if candidate.is_other_hardware:
             return False
         return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof

@@ -379,7 +379,7 @@ class MultiLinkRoutes:
         self._states.set_cell(now)
 
     def _probe(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
-        """Send the probes that are due to the system's autopilot over one link."""
+        """Send the probes that are now due on one link to the system's autopilot."""
         if choice.needs_proof and candidate.is_available and not candidate.is_stalled:
             is_attached = system_id in self._attached
             for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):

@@ -420,7 +420,7 @@ def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 
 def configured_by(flight: FlightLog, kind: str) -> list[str]:
-    """Return the names of the autopilot's parameters for this kind of failsafe; empty if none are known."""
+    """Return the names of the parameters for this kind of failsafe, for every autopilot if the flight's is unknown."""
     names = _LIMIT_PARAMETERS.get(kind, ())
     if flight.autopilot == "PX4":
         return [name for name in names if name.startswith(_PX4_PREFIXES)]

@@ -47,7 +47,7 @@ class TimeSeries:
         return f"<TimeSeries {', '.join(self.names)}: {len(self)} rows>"
 
     def add(self, time_s: float, *values: float) -> None:
-        """Add a row with one value for each column. If its time is before that of the last row, it gets that time."""
+        """Add a row with one value for each column. A time before that of the previous row is replaced by it."""
         times = self.times
         if times and time_s < times[-1]:
             time_s = times[-1]
@@ -263,7 +263,7 @@ class FlightLog:
 
     @property
     def duration_s(self) -> float:
-        """Seconds from the first entry to the last."""
+        """Seconds from the first entry to the last; simulated seconds if `speed` is not 1."""
         return max(self.ends_at - self.begins_at, 0.0) * self.speed
 
     def battery(self, number: int) -> TimeSeries:

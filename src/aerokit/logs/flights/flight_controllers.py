@@ -223,7 +223,7 @@ class _BinText(Snapshot):
 
 
 class _Mode:
-    """A flight mode of a ``.bin``, as the state ``mode``."""
+    """A flight mode from a ``.bin``, in the form of the state ``mode``."""
 
     def __init__(self, name: str, number: int) -> None:
         self.name, self.custom_mode = str(name), int(number)

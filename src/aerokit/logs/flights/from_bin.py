@@ -83,7 +83,7 @@ class _Tables:
         return {"TimeUS", *columns} <= set(self._reader.formats[number].columns)
 
     def rows(self, table: str, *columns: str) -> Iterator[tuple[Any, ...]]:
-        """Yield the values of these columns for each row, after the time in seconds since the start of the log.
+        """Yield a tuple for each row: the seconds since the start of the log, then the values of these columns.
 
         Yields nothing if a column is missing. Texts are ``str``; numbers have the unit of the table.
         """
@@ -91,7 +91,7 @@ class _Tables:
             yield from zip(*chunk, strict=True)
 
     def columns(self, table: str, *columns: str) -> list[list[Any]]:
-        """Like :meth:`rows`, but return one list for each column."""
+        """Like :meth:`rows`, but return a list of the times, then one list for each column."""
         times_and_columns: list[list[Any]] = [[] for _ in range(len(columns) + 1)]
         for chunk in self._chunks(table, columns):
             for column, part in zip(times_and_columns, chunk, strict=True):

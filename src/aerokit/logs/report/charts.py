@@ -119,7 +119,7 @@ def mode_colours(flight: FlightLog) -> dict[str, str]:
 
 
 def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
-    """Return a line for a timeline; None if all values are unknown."""
+    """Return one column as a line of a chart over time; None if all of its values are unknown."""
     if not columns.has(column):
         return None
     x, y = points(columns, column, digits)

@@ -347,7 +347,7 @@ def _mission(flight: FlightLog) -> Section | None:
 
 
 def _has_altitude(item: Waypoint) -> bool:
-    """Return False for items such as RTL. An item without a position may have an altitude, such as a take-off."""
+    """Return True if an item has an altitude. Items without a position may have one (take-off) or not (RTL)."""
     has_position = not math.isnan(item.latitude_deg)
     return math.isfinite(item.altitude_m) and (has_position or item.altitude_m != 0)
 

@@ -247,7 +247,7 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
 
 
 def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _DescentValues]:
-    """Return the currents of the batteries in a descent. The keys are names for the text."""
+    """Return the currents of the batteries in a descent by their names in the report, such as "battery 1 current"."""
     currents = {}
     for index, battery in sorted(flight.batteries.items()):
         current = _descent_values(battery, "current_a", begin_s, end_s)
@@ -375,7 +375,7 @@ def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
 
 
 def _until_impact(flight: FlightLog, armed_s: float) -> str:
-    """Return a note on the armed time until the first fall, if the vehicle was armed for a while after it."""
+    """Return a note on the armed time until a fall's impact; empty unless the vehicle was armed for 1 s after it."""
     impact_s = next((fall.time_s for fall in falls(flight) if fall.has_impact and not fall.is_hard_landing), math.inf)
     armed_before_s = sum(max(min(end, impact_s) - begin, 0.0) for begin, end in flight.armed)
     return f" ({span(armed_before_s)} until the impact)" if armed_s - armed_before_s >= 1.0 else ""
