@@ -201,7 +201,7 @@ class Health:
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
-        """Return one text for each missing estimate; the first one is a missing GPS fix, the probable cause."""
+        """Return one text for each missing estimate, after the probable cause if no GPS receiver has a fix."""
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []
