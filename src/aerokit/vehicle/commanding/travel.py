@@ -89,8 +89,9 @@ class TravelActions(VehicleBase):
         vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
-                present altitude if the target has none, or is ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, as the
+                position of another vehicle, the one above home counts, and is taken as above this vehicle's home. The
+                vehicle keeps its present altitude if the target has none, or is ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
