@@ -214,6 +214,23 @@ async def test_copies_prove_only_links_with_frames_of_link_in_use(order: tuple[i
         assert proven == [[]] * (MIN_COPIES - 1) + [[1, 2] if 0 in order else []]
 
 
+@pytest.mark.parametrize("component", [1, 191])
+async def test_only_autopilot_answer_counts_as_vehicle_clock(component: int) -> None:
+    """A companion computer that answers a probe has another clock, which would seem to show a reboot."""
+    radios = Radios(2)
+    received = ReceivedMessages(radios)
+    await opened(radios)
+    async with open_connection(radios.together()) as connection:
+        for far in radios.far:
+            far.write(FrameEncoder(1, 1).encode(AUTOPILOT))
+        await anyio.sleep(1)
+        probe = next(message for index, message in received.of(m.Timesync) if index == 0)
+        assert isinstance(probe, m.Timesync)
+        radios.far[0].write(FrameEncoder(1, component).encode(m.Timesync(tc1=5, ts1=probe.ts1)))
+        await anyio.sleep(0.1)
+        assert (candidates_of(connection)[0].round_trip_s is not None) is (component == 1)
+
+
 async def test_copies_over_link_to_other_hardware_prove_nothing() -> None:
     radios = Radios(2)
     await opened(radios)

@@ -159,8 +159,8 @@ class Connection:
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
-        goes to every peer. With several links, a message for a vehicle is not sent at all while the link in use leads
-        to another vehicle with the same id, which :class:`DuplicateSender` reports, and no other link works.
+        goes to every peer. With several links, a message for a vehicle is not sent at all if the link in use leads to
+        another vehicle with the same id (:class:`DuplicateSender` reports this) and no other link works.
 
         ``to`` is the id of the system whose peers get the message; None: the message's ``target_system``. The message
         itself is not changed.
@@ -394,7 +394,8 @@ class Connection:
         """Return why signatures block communication with a component, for error texts; "" if they do not.
 
         With a key, the reason is that this program has refused frames, of any sender. Without a key, it is that the
-        last heartbeat of the component is signed. ``component_id`` 0 means all components of the system.
+        last heartbeat of the component is signed. ``component_id`` 0 means all components of the system. Without a
+        ``system_id``, only the reason with a key is given.
         """
         return self._gate.describe(
             heartbeat

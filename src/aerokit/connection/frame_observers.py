@@ -52,7 +52,7 @@ class Recording:
     def __init__(self, path: str | os.PathLike[str], now: float) -> None:
         self._path = os.fspath(path)
         self._unix_epoch_s = time.time() - now  # seconds since 1970 at time 0 of the clock
-        self._writer: TlogWriter | None = None  # None before the first received frame and after the end
+        self._writer: TlogWriter | None = None  # None while frames wait (see `_waiting`) and after the end
         self._file: BinaryIO | None = None  # the file of the writer
         # The last MAX_WAITING sent frames, until a frame is received and the existing file is renamed. None if no frame
         # must wait.

@@ -81,7 +81,8 @@ class LoopWatch:
         """Earliest possible receive time of data that is read now; infinite while no data can have waited."""
         # The last times at which the computer woke, with the seconds for which it was suspended.
         self._sleeps: deque[tuple[float, float]] = deque(maxlen=MAX_SLEEPS)
-        self._check_sleep_at = -math.inf  # The clocks are not read again before this time, because reading is slow.
+        # While data may have waited, `arrival` does not read the clocks before this time, because reading is slow.
+        self._check_sleep_at = -math.inf
         self._has_read = False  # True if data was read since the last call of `_end_assumption_when_idle`
         self._idle_iterations = 0  # number of consecutive loop iterations in which nothing was read
 

@@ -398,8 +398,8 @@ class Connection(ConnectionTwin):
 
         A message for one component goes to the peer from which that component was last received. A message for a
         whole system goes to every peer with components of that system, and a message for all or for an unknown target
-        goes to every peer. With several links, a message for a vehicle is not sent at all while the link in use leads
-        to another vehicle with the same id, which :class:`DuplicateSender` reports, and no other link works.
+        goes to every peer. With several links, a message for a vehicle is not sent at all if the link in use leads to
+        another vehicle with the same id (:class:`DuplicateSender` reports this) and no other link works.
 
         ``to`` is the id of the system whose peers get the message; None: the message's ``target_system``. The message
         itself is not changed.
@@ -537,8 +537,8 @@ class Guided(TwinOf["AsyncGuided"]):
     ) -> SetpointStream[BodyVelocitySetpoint]:
         """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
 
-        With ``yaw_deg`` on ArduPilot, the direction is that of the vehicle's nose at the time of ``set``. Supply a new
-        set-point often while the vehicle turns.
+        With ``yaw_deg`` on ArduPilot, "forward" is the direction of the vehicle's nose at the time of ``set``, and
+        stays so while the vehicle turns. Supply a new set-point often meanwhile.
         """
         return SetpointStream(
             self._loop,
@@ -2321,8 +2321,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     ) -> dict[str, ParameterWrite]:
         """Set the vehicle's parameters to those of a table, a dict or a parameter file.
 
-        Values that equal those in ``table`` are not sent, and get the outcome ``"unchanged"``. If another station may
-        have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
+        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. If another
+        station may have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
@@ -2539,9 +2539,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
-                vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
-                if the vehicle supports that.
+            only_changes: compare ``plan`` with the vehicle's plan: by PX4's checksum; on ArduPilot by reading it again,
+                if an earlier transfer makes few differences likely. Send nothing if both are equal. Send only the
+                items that differ if the vehicle supports that.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2641,13 +2641,15 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Args:
             item: number of the item.
-            timeout: seconds to wait for MISSION_CURRENT; without effect if the vehicle supports the command.
+            timeout: seconds to wait for the end of a running transfer, and then again for MISSION_CURRENT; without
+                effect if the vehicle supports the command.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-            OperationTimeout: MISSION_CURRENT did not confirm the item, or the vehicle fell silent before it was sent.
+            OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
+                fell silent before it was sent.
         """
         self._loop.run(self.aio.set_current, item, timeout=timeout)
 
@@ -2665,7 +2667,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
             InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: the vehicle accepted the command but stayed in another mode.
+            OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
+                was busy with a transfer of plans.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._loop.run(self.aio.start, item, timeout=timeout)
@@ -2745,9 +2748,9 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
-                vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
-                if the vehicle supports that.
+            only_changes: compare ``plan`` with the vehicle's plan: by PX4's checksum; on ArduPilot by reading it again,
+                if an earlier transfer makes few differences likely. Send nothing if both are equal. Send only the
+                items that differ if the vehicle supports that.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2854,9 +2857,9 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare ``plan`` with the vehicle's plan, if that is known from an earlier transfer and the
-                vehicle confirms that it is unchanged. Send nothing if both are equal. Send only the items that differ
-                if the vehicle supports that.
+            only_changes: compare ``plan`` with the vehicle's plan: by PX4's checksum; on ArduPilot by reading it again,
+                if an earlier transfer makes few differences likely. Send nothing if both are equal. Send only the
+                items that differ if the vehicle supports that.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -4161,8 +4164,9 @@ class Vehicle(VehicleTwin):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
-        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
-        ``frame`` must then be 0. Other arguments and errors are those of :meth:`command`.
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees, which
+        has no frame; ``frame`` must then be 0, and the command one whose altitude is always above mean sea level. Other
+        arguments and errors are those of :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -4207,12 +4211,12 @@ class Vehicle(VehicleTwin):
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
         or their effect is reported. The retries also end when a newer order about the first subject is given, when the
         vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
-        the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
+        the first subject is motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
         vehicle hold nor monitors late arming; use the actions for that.
 
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``. An order ends each earlier order whose first subject is one
-                of its own subjects. An order about mode or motion also ends the action in progress.
+                of its own subjects. If its first subject is mode or motion, it also ends the action in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
@@ -4361,7 +4365,7 @@ class Vehicle(VehicleTwin):
             CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses the command while
                 disarmed.
             CommandTimeout: there was no acknowledgement; the flight may still have been terminated.
-            HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
+            HeartbeatTimeout: the vehicle accepted the command, but its last HEARTBEAT is ten seconds old.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
         self._loop.run(self.aio.terminate, intent=intent, timeout=timeout)
@@ -4767,8 +4771,8 @@ class Vehicle(VehicleTwin):
         Args:
             target: another vehicle, of any connection; an asynchronous iterable of positions; or a function that
                 returns the latest position or None. aerokit calls the function on the event loop ten times a second.
-                The velocity is computed from two different positions; a speed above 100 m/s counts as a jump, with
-                velocity 0.
+                A vehicle reports its velocity. Otherwise the velocity is computed from two different positions; a speed
+                above 100 m/s counts as a jump, with velocity 0.
             distance_m: distance along the ground to keep, 0 to 1000.
             bearing_deg: direction from the target to the vehicle, 0–360 clockwise from north. None: the direction at
                 the beginning.
@@ -4864,8 +4868,9 @@ class Vehicle(VehicleTwin):
         vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
-                present altitude if the target has none, or is ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, as the
+                position of another vehicle, the one above home counts, and is taken as above this vehicle's home. The
+                vehicle keeps its present altitude if the target has none, or is ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -4897,12 +4902,14 @@ class Vehicle(VehicleTwin):
     def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
-        sets the speed when the vehicle is on its way.
+        Returns at the acknowledgement, because no message reports the setting. ArduPilot applies the speed only while
+        the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)`` sets the speed when the vehicle is on its
+        way.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
         """
         self._loop.run(self.aio.set_speed, speed_m_s)
 
@@ -4970,9 +4977,9 @@ class Vehicle(VehicleTwin):
         self._loop.run(self.aio.set_home, place, timeout=timeout)
 
     def distance_to(self, target: Position | Home) -> float:
-        """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
+        """Return the distance to ``target`` in metres; infinite while the position is unknown.
 
-        Infinite while the position is unknown.
+        It is three-dimensional if both have an altitude of the same kind, otherwise along the ground.
         """
         return self.aio.distance_to(target)
 

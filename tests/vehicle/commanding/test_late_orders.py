@@ -441,7 +441,7 @@ async def test_item_is_not_set_after_transfer_and_silence() -> None:
         items = [waypoint(47.4, 8.55, altitude_relative_m=20.0), waypoint(47.41, 8.55, altitude_relative_m=20.0)]
         await flight.vehicle.mission.upload(Mission(items), max_distance_m=1e8)
         await flight.vehicle.mission._context.lock.acquire()
-        setting = asyncio.ensure_future(flight.vehicle.mission.set_current(1))
+        setting = asyncio.ensure_future(flight.vehicle.mission.set_current(1, timeout=10.0))
         await anyio.sleep(1.0)
         flight.px4.faults.silent = True
         await anyio.sleep(4.0)

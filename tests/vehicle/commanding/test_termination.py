@@ -7,8 +7,9 @@ import pytest
 from flight_harness import Wire, in_the_air, open_flight
 
 import aerokit
-from aerokit.errors import CommandTimeout, InvalidArgument, NotSupported, OperationRejected
-from aerokit.mavlink.enums import MavCmd
+from aerokit.connection.cells import Source
+from aerokit.errors import CommandTimeout, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
+from aerokit.mavlink.enums import MavCmd, MavResult, MavState
 from aerokit.sim import SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -41,6 +42,15 @@ async def test_terminate_other_intent_sends_nothing(intent: str) -> None:
         with pytest.raises(InvalidArgument, match=r"intent = .* is not allowed: it must be one of terminate flight"):
             await flight.vehicle.terminate(intent=intent)  # type: ignore[arg-type]
         assert flight.wire.commands(TERMINATE) == []
+
+
+async def test_terminate_ignores_states_before_the_command() -> None:
+    async with in_the_air() as flight:
+        flight.copter.faults.refuse(TERMINATE, MavResult.ACCEPTED)  # It answers ACCEPTED, and executes nothing.
+        state = flight.vehicle.telemetry.system_status
+        state.set(MavState.FLIGHT_TERMINATION, Source(1, 1, "HEARTBEAT"))
+        with pytest.raises(OperationTimeout, match="still armed"):
+            await flight.vehicle.terminate(intent="terminate flight", timeout=3.0)
 
 
 async def test_terminate_unanswered_is_sent_once() -> None:

@@ -54,3 +54,16 @@ async def test_set_current_is_not_resent_into_silence() -> None:
         with pytest.raises(OperationTimeout, match="1 attempts"):
             await flight.vehicle.mission.set_current(2)
         assert len(flight.wire.all(m.MissionSetCurrent)) == 1
+
+
+async def test_start_waits_for_running_transfer_until_timeout() -> None:
+    """The transfer of another task uses the vehicle's state machine for plans."""
+    async with open_px4() as flight:
+        await _start_mission(flight)
+        mission, began = flight.vehicle.mission, anyio.current_time()
+        async with mission._context.lock:
+            with anyio.fail_after(60), pytest.raises(OperationTimeout, match="not done within 3 s"):
+                await mission.start(1, timeout=3.0)
+        assert anyio.current_time() - began == pytest.approx(3.0, abs=0.5)
+        assert not flight.wire.all(m.MissionSetCurrent)
+        await mission.set_current(2)

@@ -543,6 +543,16 @@ async def test_upload_sends_only_differences(method: Any, tmp_path: Path) -> Non
         assert set(sent_writes(flight)) == (set(changed) if method == "set" else set())
 
 
+async def test_upload_by_file_without_changes_sends_no_file() -> None:
+    async with open_flight(copter()) as flight:
+        parameters = flight.vehicle.parameters
+        value = (await parameters.download())["RTL_ALT"].value
+        flight.wire.clear()
+        results = await parameters.upload({"RTL_ALT": value}, method="ftp")
+        assert results["RTL_ALT"].outcome == "unchanged"
+        assert not flight.wire.all(messages.FileTransferProtocol)
+
+
 async def test_upload_by_file_is_verified(tmp_path: Path) -> None:
     path = tmp_path / "copter.param"
     path.write_text("RTL_ALT,2500\nLAND_SPEED,50\nNO_SUCH_ONE,1\n")
@@ -709,6 +719,15 @@ PDEF = """<?xml version="1.0"?><paramfile><vehicles><parameters name="ArduCopter
 <param humanName="RTL Altitude" name="ArduCopter:RTL_ALT" documentation="How high" user="Standard">
 <field name="Range">30 300000</field><field name="Units">cm</field><field name="RebootRequired">True</field></param>
 </parameters></vehicles></paramfile>"""
+
+
+async def test_metadata_without_defaults_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "apm.pdef.xml"
+    path.write_text(PDEF)
+    async with open_px4(px4()) as flight:
+        flight.vehicle.parameters.load_metadata(path)
+        with pytest.raises(NotSupported, match="the loaded metadata has none either"):
+            await flight.vehicle.parameters.changed_from_default()
 
 
 async def test_metadata_only_adds_notes(tmp_path: Path) -> None:

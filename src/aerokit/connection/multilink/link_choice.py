@@ -88,8 +88,8 @@ class Candidate:
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        `MIN_CLOCK_MATCHES` matches in a row prove the link, as many mismatches make it doubted. ``may_prove`` is False
-        while the hardware id, which is stronger evidence, may still be received.
+        `MIN_CLOCK_MATCHES` matches in a row prove the link; the same number of mismatches in a row makes it doubted.
+        ``may_prove`` is False while the hardware id, which is stronger evidence, may still be received.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0

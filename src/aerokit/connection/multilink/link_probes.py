@@ -103,11 +103,13 @@ class LinkProbes:
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes over any link, and record the answer."""
+        """Return True if this TIMESYNC answers one of our probes over any link; record the answer of an autopilot."""
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
         if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:
             return False
+        if frame.component_id != _AUTOPILOT:
+            return True  # A companion computer may answer, too; its clock is not the vehicle's.
         now = frame.received_at
         round_trip_s = self._round_trip_of(message, frame.system_id, link, now)
         choice = self._choices.get(frame.system_id)

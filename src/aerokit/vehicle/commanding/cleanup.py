@@ -164,8 +164,8 @@ class FlightCleanup:
         Return False if nothing is sent: the order cannot have moved the vehicle, no hold can be sent, the vehicle is
         disarmed, or the order has ended, for example because a pilot took over.
 
-        Otherwise return True. If the last HEARTBEAT is recent, one command is sent at once, unless the order has begun
-        to hold itself. If not, it is sent after the next HEARTBEAT, unless the order has ended or the vehicle is
+        Otherwise return True. One command is sent at once if the last HEARTBEAT is recent and the order has not begun
+        to hold itself. Otherwise it is sent after the next HEARTBEAT, unless the order has ended or the vehicle is
         disarmed by then. While the connection is open, a background task waits for the confirmation, and sends the hold
         again if there is none.
         """
@@ -261,8 +261,8 @@ class FlightCleanup:
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Create the order to change to ``mode``, which the caller sends after the `with` block.
 
-        The caller prepares a stream in the block, and may wait there. After any error, also after one of those below,
-        the vehicle is ordered to hold if an earlier order of the program may still move it; see `hold_in_background`.
+        The caller prepares a stream in the block, and may wait there. After any error but BusyError, the vehicle is
+        ordered to hold if an earlier order of the program may still move it; see `hold_in_background`.
 
         Raises:
             BusyError: another stream is open.
@@ -377,14 +377,14 @@ class ArmCleanup:
         """Return True if this order, and not a pilot, has armed the vehicle. Called when HEARTBEAT has reported armed.
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
-        acknowledgement, the order armed it if the next HEARTBEAT reports armed and there was no takeover.
+        acknowledgement, the order armed it if a HEARTBEAT within `ARM_HEARTBEAT_DELAY_S` reports armed and the order
+        has not ended.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
         if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
             return False
-        was_taken_over = bool(order.end)
-        if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
+        if not order.end and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)

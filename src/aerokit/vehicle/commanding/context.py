@@ -45,7 +45,7 @@ class VehicleContext:
     async def finish(self) -> bool:
         """At the end of the vehicle's `async with` block, hold the vehicle if a flight was abandoned.
 
-        Returns True if a flight was abandoned.
+        Returns True if a hold was still to be confirmed when the block ended.
         """
         for callback in tuple(self.on_finish):
             try:
@@ -53,10 +53,10 @@ class VehicleContext:
             except Exception:  # The vehicle must hold even if a device fails.
                 logger.exception("a callback at the end of the async with block of this vehicle failed")
         self.flight_cleanup.end_flights()
-        was_flight_abandoned = self.flight_cleanup.is_hold_pending
+        was_hold_pending = self.flight_cleanup.is_hold_pending
         await self.flight_cleanup.finish()
         await self.arm_cleanup.finish()
-        return was_flight_abandoned
+        return was_hold_pending
 
     def describe_now(self) -> str:
         """Return a clause about the vehicle's reported state, for warnings."""

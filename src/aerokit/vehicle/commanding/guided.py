@@ -90,8 +90,8 @@ class Guided:
     ) -> SetpointStream[BodyVelocitySetpoint]:
         """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
 
-        With ``yaw_deg`` on ArduPilot, the direction is that of the vehicle's nose at the time of ``set``. Supply a new
-        set-point often while the vehicle turns.
+        With ``yaw_deg`` on ArduPilot, "forward" is the direction of the vehicle's nose at the time of ``set``, and
+        stays so while the vehicle turns. Supply a new set-point often meanwhile.
         """
         return self._stream("velocity", self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
 

@@ -250,8 +250,8 @@ class ManeuverActions(VehicleBase):
         Args:
             target: another vehicle, of any connection; an asynchronous iterable of positions; or a function that
                 returns the latest position or None. aerokit calls the function on the event loop ten times a second.
-                The velocity is computed from two different positions; a speed above 100 m/s counts as a jump, with
-                velocity 0.
+                A vehicle reports its velocity. Otherwise the velocity is computed from two different positions; a speed
+                above 100 m/s counts as a jump, with velocity 0.
             distance_m: distance along the ground to keep, 0 to 1000.
             bearing_deg: direction from the target to the vehicle, 0–360 clockwise from north. None: the direction at
                 the beginning.

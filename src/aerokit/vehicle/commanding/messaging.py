@@ -220,8 +220,9 @@ class MessagingActions(VehicleBase):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
-        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees;
-        ``frame`` must then be 0. Other arguments and errors are those of :meth:`command`.
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees, which
+        has no frame; ``frame`` must then be 0, and the command one whose altitude is always above mean sea level. Other
+        arguments and errors are those of :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: it must be MAV_FRAME_GLOBAL (0)")
@@ -283,12 +284,12 @@ class MessagingActions(VehicleBase):
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
         or their effect is reported. The retries also end when a newer order about the first subject is given, when the
         vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
-        the order is about motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
+        the first subject is motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
         vehicle hold nor monitors late arming; use the actions for that.
 
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``. An order ends each earlier order whose first subject is one
-                of its own subjects. An order about mode or motion also ends the action in progress.
+                of its own subjects. If its first subject is mode or motion, it also ends the action in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 

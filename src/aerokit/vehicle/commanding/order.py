@@ -259,8 +259,8 @@ class Order:
         is_expected = number in self._expected_modes and number in self._accepted_modes
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
-            # Orders with `requires_mode_change` are posted ones, which are always settled. A change is therefore never
-            # reported before the order has settled.
+            # Orders with `requires_mode_change` are posted ones, which are always settled, so their change always gets
+            # to the first branch.
             has_taken_effect = is_change or not self._requires_mode_change
             if has_taken_effect and is_settled:
                 self._accepted_modes.clear()  # From now on, only the order's own modes are accepted.

@@ -249,9 +249,9 @@ class VehiclePosition:
         return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
 
     def distance_to(self, target: Position) -> float:
-        """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
+        """Return the distance to ``target`` in metres; infinite while the position is unknown.
 
-        Infinite while the position is unknown.
+        It is three-dimensional if both have an altitude of the same kind, otherwise along the ground.
         """
         here = self._telemetry.position.latest
         if here is None:
@@ -331,8 +331,9 @@ class VehiclePosition:
     def global_target(self, target: Position, name: str = "target") -> tuple[int, int, float, MavFrame]:
         """Return latitude and longitude in 1e-7 degrees, the altitude in metres, and the frame of the altitude.
 
-        The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT. A target without an altitude gets the
-        vehicle's present one. ``name`` is the caller's argument, for error texts.
+        The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT. If the target has both altitudes, the
+        relative one counts. A target without an altitude gets the vehicle's present one. ``name`` is the caller's
+        argument, for error texts.
 
         PX4 accepts only altitudes above mean sea level, so an altitude relative to home requires a known home.
         """

@@ -43,7 +43,7 @@ class TerminationActions(VehicleBase):
             CommandRejected: the vehicle refused; ``reasons`` has its status texts. PX4 refuses the command while
                 disarmed.
             CommandTimeout: there was no acknowledgement; the flight may still have been terminated.
-            HeartbeatTimeout: the vehicle was silent for ten seconds after its acknowledgement.
+            HeartbeatTimeout: the vehicle accepted the command, but its last HEARTBEAT is ten seconds old.
             OperationTimeout: the vehicle accepted the command, but HEARTBEAT does not report the termination.
         """
         # The decorator `checks_arguments` has refused every other intent.
@@ -58,8 +58,9 @@ class TerminationActions(VehicleBase):
         armed, state = self.telemetry.armed, self.telemetry.system_status
 
         def is_terminated() -> bool:
-            is_off = armed.latest is False and armed.updated_at > order.given_at
-            return is_off or state.latest == MavState.FLIGHT_TERMINATION or any(map(self.telemetry.is_in, modes))
+            is_off = armed.latest is False or state.latest == MavState.FLIGHT_TERMINATION
+            is_reported = is_off or any(map(self.telemetry.is_in, modes))
+            return is_reported and armed.updated_at > order.given_at  # HEARTBEAT reports all three.
 
         await await_progress(
             self._session,

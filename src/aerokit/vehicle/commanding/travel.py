@@ -89,8 +89,9 @@ class TravelActions(VehicleBase):
         vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. The vehicle keeps its
-                present altitude if the target has none, or is ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, as the
+                position of another vehicle, the one above home counts, and is taken as above this vehicle's home. The
+                vehicle keeps its present altitude if the target has none, or is ``vehicle.home.value``.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -238,12 +239,14 @@ class TravelActions(VehicleBase):
     async def set_speed(self, speed_m_s: float) -> None:
         """Change the ground speed in m/s, above 0 (MAV_CMD_DO_CHANGE_SPEED).
 
-        ArduPilot applies the speed only while the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)``
-        sets the speed when the vehicle is on its way.
+        Returns at the acknowledgement, because no message reports the setting. ArduPilot applies the speed only while
+        the vehicle is on its way in GUIDED or AUTO. ``go_to(speed_m_s=...)`` sets the speed when the vehicle is on its
+        way.
 
         Raises:
             InvalidArgument: an argument is out of range. Nothing was sent.
             CommandRejected: the vehicle refused.
+            CommandTimeout: there was no acknowledgement.
         """
         check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
         change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
@@ -377,9 +380,9 @@ class TravelActions(VehicleBase):
         await home.wait_until(lambda _: home.updated_at >= requested_at, timeout=timeout, description="set_home")
 
     def distance_to(self, target: Position | Home) -> float:
-        """Return the distance to ``target`` in metres, three-dimensional if ``target`` has an altitude.
+        """Return the distance to ``target`` in metres; infinite while the position is unknown.
 
-        Infinite while the position is unknown.
+        It is three-dimensional if both have an altitude of the same kind, otherwise along the ground.
         """
         return self._position.distance_to(position_with_altitude(target))
 

@@ -253,13 +253,15 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Args:
             item: number of the item.
-            timeout: seconds to wait for MISSION_CURRENT; without effect if the vehicle supports the command.
+            timeout: seconds to wait for the end of a running transfer, and then again for MISSION_CURRENT; without
+                effect if the vehicle supports the command.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
             CommandRejected: the vehicle refused.
             OperationRejected: a pilot took over, or a newer order was given, before the item was confirmed.
-            OperationTimeout: MISSION_CURRENT did not confirm the item, or the vehicle fell silent before it was sent.
+            OperationTimeout: a running transfer did not end, MISSION_CURRENT did not confirm the item, or the vehicle
+                fell silent before it was sent.
         """
         self._check_item(item)
         with self._vehicle_context.arbiter.auxiliary_order() as order:
@@ -279,7 +281,8 @@ class MissionControl(VehiclePlan["Mission"]):
             InvalidArgument: there is no such item. Nothing was sent.
             OperationRejected: the vehicle is not armed, or its mode changed meanwhile.
             CommandRejected: the vehicle refused: it has no mission, no position, …; see ``reasons``.
-            OperationTimeout: the vehicle accepted the command but stayed in another mode.
+            OperationTimeout: the vehicle accepted the command but stayed in another mode, did not confirm the item, or
+                was busy with a transfer of plans.
             NotSupported: this type of vehicle has no mission mode.
         """
         self._check_item(item)
@@ -456,7 +459,9 @@ class MissionControl(VehiclePlan["Mission"]):
 
         transfers = self._context.transfers
         target = (transfers.system_id, transfers.component_id)
-        async with self._context.lock:  # PX4 ignores MISSION_SET_CURRENT during a transfer.
+        with transfers.limit(timeout):
+            await self._context.lock.acquire()  # PX4 ignores MISSION_SET_CURRENT during a transfer.
+        try:
             if sent is not None:
                 self._vehicle_context.sender.raise_if_ended(sent.order)
                 await self._vehicle_context.sender.await_recent_state(sent.order)
@@ -470,6 +475,8 @@ class MissionControl(VehiclePlan["Mission"]):
                     idle_timeout_s=timeout,
                 )
             )
+        finally:
+            self._context.lock.release()
 
     @property
     def _current_seq(self) -> int | None:

@@ -70,7 +70,8 @@ class MissionStallDetector:
             return None
         should_move = self._should_move(current)
         standstill = self._stall()  # None unless the vehicle has stood still for 12 s
-        # After a fast descent, a standstill is a fall. On the ground, it is one at any item.
+        # After a fast descent, a standstill is a fall: on the ground at any item, in the air only at an item that
+        # requires movement.
         if standstill is not None and self._stall.follows_fast_descent and (should_move or self._is_on_ground):
             return standstill
         if not should_move or current != self._moving_item:  # The vehicle may stand still here, or has moved on.

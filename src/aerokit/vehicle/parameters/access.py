@@ -375,6 +375,8 @@ class ParameterAccess:
         would be overwritten, because it is not the one in the file.
         """
         parameters = tuple(parameters)
+        if not parameters:
+            return {}
         if method == "auto" and (len(parameters) < MIN_PACK_SIZE or not await self.has_pack()):
             method = "set"
         if method == "set":

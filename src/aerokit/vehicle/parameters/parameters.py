@@ -220,8 +220,8 @@ class Parameters(ReadOnly):
     ) -> dict[str, ParameterWrite]:
         """Set the vehicle's parameters to those of a table, a dict or a parameter file.
 
-        Values that equal those in ``table`` are not sent, and get the outcome ``"unchanged"``. If another station may
-        have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
+        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. If another
+        station may have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
@@ -312,9 +312,9 @@ class Parameters(ReadOnly):
         """Return the table with the defaults in the metadata; raise NotSupported if there are none."""
         defaults = {name: entry.default for name, entry in (self._metadata or {}).items() if name in table}
         if not any(default is not None for default in defaults.values()):
+            hint = "call load_metadata() first" if self._metadata is None else "the loaded metadata has none either"
             raise NotSupported(
-                "the defaults of this vehicle are unknown, because it did not send them by MAVFTP: call load_metadata()"
-                " first"
+                f"the defaults of this vehicle are unknown, because it did not send them by MAVFTP: {hint}"
             )
         return ParameterTable(param.replace(default=defaults.get(name)) for name, param in table.items())
 

@@ -135,6 +135,7 @@ class CommandSender:
         """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if the vehicle answers "unsupported".
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees; ``z`` is in metres above mean sea level.
+        COMMAND_LONG has no frame, so this is only for commands that always mean this altitude, such as DO_SET_HOME.
         """
         try:
             return await self.send_int(
@@ -195,7 +196,7 @@ class CommandSender:
         """Send a command and return its ACCEPTED ack. Waits until earlier calls with the same key have ended."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
-        self._abort_if_ended(key)
+        self._abort_run_of_ended_order(key)
         # If the order ends while this call waits for the lock, the command is not sent. An end before this call does
         # not prevent the command, because the caller already knew of it.
         earlier_end = "" if order_status is None else order_status.end
@@ -239,7 +240,7 @@ class CommandSender:
                 still_pending = pending_acks[exchange.answers :]
                 self._expect_acks(key, exchange.pending_answers, still_pending)
 
-    def _abort_if_ended(self, key: _Key) -> None:
+    def _abort_run_of_ended_order(self, key: _Key) -> None:
         """Abort the running command with this key if its order has ended, so that a newer command need not wait."""
         order_status = self._order_statuses.get(key)
         if order_status is not None and order_status.end:
@@ -277,7 +278,7 @@ class CommandSender:
             run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """Deliver an ack to the call that waits for it, or remove one from the acks still expected for earlier ones."""
+        """Deliver an ack to the call that waits for it; without such a call, count it as an ack of an earlier call."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)

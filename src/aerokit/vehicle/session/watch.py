@@ -79,7 +79,7 @@ class VehicleWatch:
         """Number of reboots detected."""
         # Maps each clock of the vehicle to its last reported time in milliseconds, and when the report was processed.
         self._last_times: dict[str, tuple[int, float]] = {}
-        # The first ``time_boot_ms`` after a boot, and when its message was processed.
+        # The first ``time_boot_ms`` that was received since the start or a reboot, and when it was processed.
         self._first_time: tuple[int, float] | None = None
         # By this clock, the connection recognises a vehicle that returns from a new address.
         connection.boot_clocks[system_id, component_id] = self.boot_time_ms
