@@ -40,7 +40,7 @@ class _SnapshotType(type):
         if own_fields:
             type.__setattr__(cls, "__init__", _lazy_init(cls))
         type.__setattr__(cls, "_defaults", defaults)
-        # attrgetter needs at least one name. For a class without fields, `__class__` makes all values equal.
+        # attrgetter needs at least one name. With `__class__`, all instances of a class without fields compare equal.
         type.__setattr__(cls, "_values", attrgetter(*(fields or ("__class__",))))
         return cls
 

@@ -134,7 +134,7 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     if estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which arming would change the mode"
         headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
-        # The vehicle may have a value that was not received, so it is no known reason.
+        # A value that was not received may exist on the vehicle, so its absence here is no known reason.
         return [headline, *(text for text in missing if not text.endswith(" not received)"))]
     return []
 

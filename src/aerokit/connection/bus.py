@@ -45,7 +45,8 @@ _Entry = tuple[int, Callable[..., None]]
 
 MESSAGE, FRAME, BOTH = range(3)
 
-# (kind, all sinks). The kind is FRAME or MESSAGE if that is the only argument of every sink, otherwise BOTH.
+# (kind, all sinks): MESSAGE if every sink takes only the message, FRAME if no sink needs the message decoded, otherwise
+# BOTH.
 _DeliveryPlan = tuple[int, tuple[Callable[..., None], ...]]
 
 EVERY_SYSTEM = 0
@@ -351,7 +352,7 @@ class Subscription(Generic[ItemT]):
         self._detachers: list[Detach] = []  # functions that end the subscription; empty before the `with` block
         self._capacity, self._overflow = capacity, overflow
         self._queue: deque[ItemT] = deque()
-        self._has_reader = False  # True until the reader has stopped waiting; a second one is refused
+        self._has_reader = False  # True from when a reader waits until it was resumed; a second reader is refused
         self._waiter: asyncio.Future[None] | None = None  # wakes the waiting reader; None once it was woken
         self._error: Exception | None = None  # raised in the reader once the queue is empty
         self._closed = False

@@ -42,7 +42,7 @@ class SignatureGate:
         self._handover: _Handover | None = None  # None before a handover, and after the switch to the new key
         self._is_handing_over = False  # True inside the `with` block of key_handover()
         self._logged_keep_error: OSError | None = None  # None if the file of ``Signing(keep=…)`` could be written
-        # The owner calls `set_signing`, which updates `is_open`, before the first frame.
+        # Before the first frame, the owner calls `set_signing`, and this call updates `is_open`.
         self.is_open: bool = True
         """True while all frames are admitted without a check."""
         self.on_change: Callable[[], object] = lambda: None

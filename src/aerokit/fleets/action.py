@@ -219,7 +219,9 @@ class FleetAction:
         if self._is_safe or self._context.is_closed:
             return
         self._undecided.append((member, error))
-        if len(self._undecided) > 1:  # `_apply_policy` below has called this, because it refreshes the other members.
+        # This is a nested call from `_apply_policy` below, which refreshes the other members. The outer call handles
+        # this failure, too.
+        if len(self._undecided) > 1:
             return
         while self._undecided:
             if self._policy_trigger is None:

@@ -224,8 +224,8 @@ class Router(Generic[PortT]):
             return self._duplicate
         elif self._is_echo(earlier, number, now):
             first_port, port_count, _ = earlier
-            # Too late for a copy: it returns in a slow loop, or it is equal by chance, as the first command of a
-            # restarted program may be. It is forwarded until several frames prove a loop.
+            # Too late for a copy: the frame returns in a slow loop, or equals an earlier one by chance, like the first
+            # command of a restarted program. It is forwarded until several frames prove a loop.
             if self._is_loop(node, source, first_port, now):
                 return self._loop
             recent.newer[identity] = first_port, port_count, now

@@ -215,7 +215,7 @@ class Message:
 
     if not TYPE_CHECKING:  # Type checkers take a slot for a class attribute of the same name.
         __slots__ = ("received_frame",)
-        __match_args__ = ()  # overridden by each class, and inferred by type checkers, for `match`
+        __match_args__ = ()  # The field names, for `match`. Each message class overrides this; type checkers infer it.
     __hash__: ClassVar[None]  # type: ignore[assignment]
 
     ID: ClassVar[int]

@@ -204,7 +204,8 @@ class SourceStatistics(SourceFields):
         if is_other_longer:
             self._returns += 1
         if is_over or self._returns >= _MIN_RETURNS:
-            # A shorter stream takes over only because the current one has ended. Its frames are then counted anew.
+            # A shorter stream takes over only because the current one has ended. The count of its frames then starts
+            # again at 0.
             other_count = self._other_count if is_other_longer else 0
             self._swap(sequence, now, current_count, other_count)
             return IN_ORDER
@@ -217,7 +218,8 @@ class SourceStatistics(SourceFields):
         self._other_at = now
         self._unreceived -= 1  # `received` counts the frame, although `expected` does not advance
         self._stream_start += 1  # The frame does not count as one of the current stream.
-        # The longer stream is the sender's own, so the frame was overtaken; a frame of the shorter one is a stranger's.
+        # The longer stream is the sender's own, so a frame of the longer stream was only overtaken. A frame of the
+        # shorter one is another sender's.
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:

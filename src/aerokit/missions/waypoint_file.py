@@ -149,7 +149,7 @@ class _Row:
     def _integer(self, column: str, high: int) -> int:
         """Return the number in a column. FileFormatError if it is not a whole number from 0 to ``high``."""
         text = self.texts[_COLUMNS.index(column)]
-        # Every number has at most five digits. int() would take long for a very long text.
+        # Valid numbers have at most five digits. Refuse very long texts here, because int() would take long for them.
         is_short_number = text.isascii() and text.isdigit() and len(text) < 9
         if not is_short_number or int(text) > high:
             raise FileFormatError(f"{self.where}: {column} = {text!r}: expected a whole number from 0 to {high}")

@@ -104,7 +104,8 @@ def _hint(function: Callable[..., Any], parameter: inspect.Parameter) -> Any:
         raise InvalidArgument(f"{short_repr(inner)} is not allowed as a handler: it must be a function or a method")
     closure = {}
     for name, cell in zip(inner.__code__.co_freevars, inner.__closure__ or ()):  # noqa: B905 - equal lengths
-        with suppress(ValueError):  # The variable has no value yet, e.g. the function itself.
+        # ValueError: the variable has no value yet. The function's own name has none while it is being decorated.
+        with suppress(ValueError):
             closure[name] = cell.cell_contents
     try:
         return get_type_hints(holder, inner.__globals__, closure, include_extras=True)["hint"]

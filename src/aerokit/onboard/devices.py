@@ -177,8 +177,8 @@ def add_arm_authorizer(services: ComponentServices, authorize: Authorize) -> Non
         except Exception as error:
             services.host.send_text(MavSeverity.WARNING, f"arming denied: {error_text(error)}")
             result = result_of(error)
-            # NONE means that the reason was sent as a status text. If the authorizer itself has failed, there is no
-            # reason (GENERIC).
+            # NONE: the authorizer denied, and its reason is in the status text. GENERIC: the authorizer failed, so it
+            # gave no reason.
             reason = MavArmAuthDeniedReason.NONE if result == MavResult.DENIED else MavArmAuthDeniedReason.GENERIC
             return CommandResult(MavResult.DENIED, detail=reason)
         if isinstance(answer, CommandResult):

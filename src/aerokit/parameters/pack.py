@@ -152,7 +152,7 @@ def pack_for_download(
             values.append(parameter.default)
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
-        # This many bytes at the end of the entry must not be split between two blocks.
+        # The last `unsplit_size` bytes of the entry, its value or values, must not be split between two blocks.
         _, value_format = _CODES[code]
         unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size

@@ -54,7 +54,8 @@ def _position_controller(prefix: str) -> tuple[tuple[int, str], ...]:
         _same(f"{prefix}ACCZ_", f"{prefix}D_ACC_", _VERTICAL_ACCELERATION),
         _prefixed(prefix, prefix, "POSXY_P>NE_POS_P POSZ_P>D_POS_P JERK_XY>NE_JERK JERK_Z>D_JERK"),
     )
-    return (  # pairs by the divisor of their values
+    # Each entry has the divisor from old to new units, and the pairs that it applies to.
+    return (
         (1, " ".join(moved)),
         (10, _same(f"{prefix}ACCZ_", f"{prefix}D_ACC_", "P I D")),
         (100, _prefixed(prefix, prefix, "VELXY_IMAX>NE_VEL_IMAX VELZ_IMAX>D_VEL_IMAX")),

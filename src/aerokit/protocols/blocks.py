@@ -110,7 +110,7 @@ class BlockRequests:
         self._in_flight: dict[int, _BlockRequest] = {}  # in the order in which they were sent
         self._sent_blocks: dict[int, _BlockRequest] = {}  # blocks that were requested and have not arrived
         self._sent_count = 0
-        self._timeouts = 0  # number of times that answers were overdue since the last answer
+        self._timeouts = 0  # number of timeouts since the last answer
         self._busy_until = float("-inf")  # until this time, the server is busy with a burst
         self._next_send_at = float("-inf")  # earliest time for the next request beyond the first `batch_size`
         self._must_wait_to_send = False  # True if a request fits into the window, but must wait until `_next_send_at`

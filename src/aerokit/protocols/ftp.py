@@ -236,7 +236,8 @@ class FtpClient:
         self.source_system: int = source_system
         self.source_component: int = source_component
         self._sequence = first_sequence
-        self._session = first_sequence  # `next_session` limits it to 8 bits; should differ between programs, too
+        # `next_session` limits this to 8 bits. Like the sequence number, it should differ between programs.
+        self._session = first_sequence
 
     def next_sequence(self, replies: int = 1) -> int:
         """Return the sequence number of a new request. The next ``replies`` numbers are reserved for its replies."""

@@ -128,8 +128,8 @@ class FtpDownload(FtpExchange[int]):
         self._highest_blocks: dict[int, int] = {}  # by sequence number of a burst: the highest received block number
         self._supports_bursts = True
         self._burst_active_at = 0.0  # time of the last block of a burst or, before any, of the request for the burst
-        # The burst to which the last received block belongs. Of this burst, the block with the highest number so far:
-        # its number, and the time when it arrived.
+        # The burst of the last received block, the highest block number of this burst so far, and the time at which
+        # that block arrived.
         self._last_burst: _Burst | None = None
         self._highest_number = -1
         self._highest_at = 0.0
@@ -235,8 +235,7 @@ class FtpDownload(FtpExchange[int]):
         self._requests.on_answer(offset, now, sent_at=sent.at)
         if reply.is_ack and reply.data and not self._is_past_size(offset):
             self._add(offset, reply.data, now)
-        # An ACK without data also means that the offset is not before the end of the file. Data after the known size
-        # means that the file has grown, so it is dropped.
+        # The end of the file is EOF, or an ACK without data. Data beyond the known size is dropped: the file has grown.
         elif reply.is_ack or reply.error_code == MavFtpErr.EOF or self._is_past_size(offset):
             self._end_at(offset)
         else:

@@ -213,7 +213,8 @@ class MissionUpload(MissionExchange[UploadResult]):
                 self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
         elif result == MavMissionResult.INVALID_SEQUENCE:
             if self._is_requesting:
-                # The vehicle already has the item that was sent, or an item before it was lost.
+                # Either the vehicle already has the item that was sent, or it has not received one of the preceding
+                # items.
                 self._send_window(now, ahead=1)
                 if self._outbox:  # If nothing was sent, the present deadline stays.
                     self._wait(now)
@@ -290,7 +291,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _time_out(self, now: float) -> None:
         """Cancel the upload and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
-        # Numbered as the caller does, without home.
+        # The caller's items have no home, so their numbers begin at 0 after it.
         missing = tuple(range(max(self._confirmed_end - self.offset, 0), self._end - self.offset))
         unconfirmed = f"items not confirmed: {format_ranges(missing) or 'home'}"
         details = unconfirmed if self.was_started else "no item was requested"

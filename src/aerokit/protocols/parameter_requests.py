@@ -75,7 +75,7 @@ class ParameterRequests(NamedRequests[Parameter]):
         """Process a value."""
 
     def _on_error(self, message: ParamError, now: float) -> None:
-        name = message.param_id  # PX4 does not initialise the ids and the index, so they are not used.
+        name = message.param_id  # The index and the target ids are not used, because PX4 does not initialise them.
         if name in self._names and name in self._window:
             self._window.on_answer(name, now)
             self._settle(name, rejection(name, message.error), now)

@@ -60,7 +60,7 @@ class StalledQueue:
         self._accepted: list[tuple[bytes, Peer]] = []
         self._outboxes: dict[Peer, Outbox] = {}
         self._stalled_peers: set[Peer] = set()  # Peers whose outbox has reported a stall.
-        self._is_stalled = True  # Of the whole connection, until `drain`.
+        self._is_stalled = True  # True until `drain`: the whole connection stalls, not single peers.
 
     @property
     def unsent_bytes(self) -> int:

@@ -244,7 +244,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._repeat = repeat
         self._next = 0  # index of the next frame in `recording.stream`
         self._began_at = 0.0  # the vehicle's time at which playing began
-        # Number of answers sent from each list of recorded answers, by `id()` of the first answer in the list.
+        # Number of answers sent from each list of recorded answers. The key has the `id()`s of the answers in the list.
         self._answered_counts: dict[tuple[int, ...], int] = {}
         self.parameters: RecordedParameters = RecordedParameters(self)
         """Current parameters."""

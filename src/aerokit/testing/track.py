@@ -280,8 +280,8 @@ class Track(Sequence[TrackPoint]):
         for point in self:
             up = 0.0 if altitude is None else point.altitude_m - altitude
             offset = (*offset_of(point), up)
-            # Measure the distance to the line from the previous point, because the vehicle also was between the points.
-            # The offsets are relative to `place`.
+            # Measure the distance from `place` to the line between the previous point and this one, because the vehicle
+            # was also between them.
             distance = _distance_of_origin(offset if previous_offset is None else previous_offset, offset)
             if distance < min_distance:
                 min_distance = distance

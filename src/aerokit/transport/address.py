@@ -324,7 +324,7 @@ class _Parser:
                     raise self.error(f"{key}= is empty")
             else:
                 options[key] = self.checked_option(key, value.strip().lower())
-        # Left out, so that equal links have equal addresses.
+        # Options with their default values are left out, so that equal links have equal addresses.
         defaults = (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 

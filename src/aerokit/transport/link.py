@@ -198,7 +198,7 @@ class BaseLink(Link):
         self._state = _State.NEW
         self._receiver: Receiver | None = None  # None before the opening and after the end, when no callback runs
         self._keeps_peers = False  # True if the receiver decides which peers are remembered; see `PeerKeeper`
-        self._stalled_at: float | None = None  # time at which the link stalled; None while it drains
+        self._stalled_at: float | None = None  # time at which the link stalled; None while it is not stalled
         self._released = asyncio.Event()  # set while no socket is open
         self._released.set()
 
@@ -370,7 +370,8 @@ class MemoryLink(BaseLink):
         was_open = self._loop is not None
         self._loop = None
         if was_open and self._far is not None:
-            self._far._post(None, self)  # The far end reports its loss after the data that was written before.
+            # The far end delivers the data written so far, and then reports that the link is lost.
+            self._far._post(None, self)
 
     def _post(self, data: bytes | None, sender: MemoryLink) -> None:
         """Schedule the arrival of data from ``sender``; None means that ``sender`` was closed."""

@@ -15,7 +15,7 @@ STALLED_AFTER_S = 1.0
 """A link counts as stalled if data waits, and none has left this machine for this many seconds."""
 
 _POLL_INTERVAL_S = 0.25
-_MAX_JOINED_BYTES = 1024  # Small frames that have waited are joined to writes of up to this size.
+_MAX_JOINED_BYTES = 1024  # Small frames that have waited are combined into writes of up to this size.
 
 
 class Outbox:

@@ -145,7 +145,8 @@ class TcpConnect(_TcpLink):
         except BaseException:
             self._stream = None  # Without this, closing the stream would count as the loss of an open link.
             stream.close()
-            # On uvloop, the socket would stay open until it is garbage-collected, and `connection_lost` is not called.
+            # After a failure, uvloop does not call `connection_lost`, and would leave the socket open until it is
+            # garbage-collected. So both are done here.
             sock.close()
             self._remove_stream(stream, None)
             raise

@@ -114,7 +114,7 @@ def fault(text: str) -> tuple[str, bool | float | list[str], float]:
     if name not in FAULTS:
         raise ArgumentTypeError(f"{name!r} is not a fault{suggestion(name, FAULTS)}; faults: {', '.join(FAULTS)}")
     at_s = number(0, 1e6)(begin_text) if begin_text else 0.0
-    if name == "rc_lost":  # ArduPilot ignores a transmitter that it never received
+    if name == "rc_lost":  # ArduPilot ignores the loss of a transmitter that it has never received
         at_s = max(at_s, TRANSMITTER_ON_S)
     if name in _SHARE_FAULTS:
         if not value:

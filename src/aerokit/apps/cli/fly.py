@@ -129,7 +129,7 @@ class PlanFlight(SupervisedFlight):
             distance = self._vehicle.distance_to(first_position)
             if distance > _MAX_START_DISTANCE_M:
                 warnings.append(f"the first waypoint is {distance / 1000:.1f} km away")
-        # The last item could also be DO_LAND_START, which does not land.
+        # Not just "LAND": the last item may be DO_LAND_START, which does not land.
         if not any(part in items[-1].name for part in ("NAV_LAND", "NAV_VTOL_LAND", "RETURN_TO_LAUNCH")):
             warnings.append(
                 "the mission does not end with a landing or return: the vehicle stays at its last waypoint, or returns"
@@ -298,7 +298,8 @@ async def _connect_and_fly(
             except AerokitError as flight_error:  # raised again below, after the summary
                 error = flight_error
                 code = FAILED
-                # A failsafe may still land the vehicle, even a simulated one. The recording should contain the landing.
+                # A failsafe may still land the vehicle, even if the vehicle is simulated. The recording should contain
+                # the landing.
                 continues_recording = True
             if continues_recording and flight.has_sent_arm_command and options.record is not None:
                 await record_to_end(vehicle, interrupts, report.print_line, report.speedup)

@@ -177,7 +177,7 @@ class FlightWatch:
         at = self._vehicle.velocity.updated_at
         down_m_s = velocity.down_m_s
         self._detector.update()
-        if down_m_s >= IMPACT_M_S:  # While the vehicle sinks fast, only the sink rate is stored.
+        if down_m_s >= IMPACT_M_S:  # While the vehicle sinks fast, only the sink rate and its time are stored.
             self._last_sink_at = at
             self._last_sink_m_s = down_m_s
         elif not self._detector.describe():
@@ -203,7 +203,8 @@ class FlightWatch:
         if self._crash is not None:
             self._moving_since = math.inf if is_still else min(self._moving_since, at)
             is_fast = max(ground_speed_m_s, vertical_speed_m_s) >= MOVING_M_S
-            # A slow vehicle must move for as long as it had to lie still to count as crashed.
+            # A slow vehicle counts as flying only after it has moved for CRASH_STILL_S, the time it had to lie still
+            # before it counted as crashed.
             is_moving = is_fast or at - self._moving_since >= CRASH_STILL_S
             if self._vehicle.armed.latest and (is_moving or self._has_climbed):
                 self._dismiss_impact()  # the vehicle flies again

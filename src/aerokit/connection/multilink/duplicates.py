@@ -235,8 +235,8 @@ class MergedStreams:
             is_repeated = stream.is_repeated(frame.payload, link)
             if is_repeated and link != choice.used.link:
                 return False
-        # An answer that another link delivers late must not make older telemetry of this link acceptable. The link in
-        # use always sets the number, because a rebooted vehicle begins again with any number.
+        # A late answer over an unused link must not lower `newest_sequence`, or older telemetry would be accepted. The
+        # link in use always sets it, because a rebooted vehicle begins with any number.
         if link == choice.used.link or not stream.has_newer(frame):
             stream.newest_sequence = frame.sequence
         self.copies.accept()

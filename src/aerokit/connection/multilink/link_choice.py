@@ -205,7 +205,8 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, which was received over the link in use at that time."""
-        # The next id over this link replaces `hardware`: it delivered `hardware`, or showed that the vehicle rebooted.
+        # Index of the link whose next id replaces `hardware`, because this link delivered `hardware`, or showed that
+        # the vehicle rebooted; -1: none.
         self._hardware_link = -1
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""

@@ -92,9 +92,9 @@ class LinkProbes:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = system_id, candidate.link, now
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
-        # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack), so this request may
-        # seem to answer another REQUEST_MESSAGE. No order is a REQUEST_MESSAGE, and `request_message` waits for the
-        # message itself.
+        # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack), so the ack of
+        # this request may be taken for that of another REQUEST_MESSAGE. No order is a REQUEST_MESSAGE, and
+        # `request_message` waits for the message itself.
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             request = m.CommandLong(
                 system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),

@@ -220,7 +220,7 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
         is_near = time_s - _EARLY_MODE_CHANGE_S <= change.time_s <= last_s + _REACTION_TIMEOUT_S
         # A mode change after disarming is no reaction to a failsafe: some autopilots then always change the mode.
         was_armed = any(begin <= change.time_s < end for begin, end in flight.armed)
-        was_commanded = change.by_autopilot is False  # None if the log does not contain the cause
+        was_commanded = change.by_autopilot is False  # `by_autopilot` is None if the log does not contain the cause
         previous_mode = flight.mode_at(change.time_s - 1e-6)
         if is_near and was_armed and not was_commanded and previous_mode:
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S

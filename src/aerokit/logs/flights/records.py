@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from aerokit.autopilots import Autopilot
     from aerokit.mavlink.message import Message
 
-_NO_FIELDS: Mapping[str, Any] = {}  # of a record that is a message
+# `fields` of a record that was made from a MAVLink message, whose values are in `message` instead.
+_NO_FIELDS: Mapping[str, Any] = {}
 _PARAMETER_IDS = frozenset((Heartbeat.ID, AutopilotVersion.ID, ParamSet.ID, ParamValue.ID))
 
 _COLUMN_KINDS = {"float": "float", "double": "float", "uint64_t": "uint"}

@@ -286,7 +286,7 @@ class FileTree:
         folder, name = self._parent(to)
         existing = folder.get(name)
         is_folder = isinstance(node, dict)
-        # An existing folder is only replaced by a folder, and only if it is empty.
+        # A folder can be replaced only if it is empty, and only by another folder.
         if isinstance(existing, dict) and (existing or not is_folder):
             raise FileFault(ENOTEMPTY if is_folder else EISDIR)
         if isinstance(existing, _File) and is_folder:

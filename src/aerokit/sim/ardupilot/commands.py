@@ -365,7 +365,8 @@ class GimbalCommands:
         if mode == MavMountMode.GPS_POINT and not has_place_in_params:
             altitude = float(to_int(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
             frame = MavFrame.GLOBAL_RELATIVE_ALT
-            # The firmware does not check the place. In the simulation, an invalid one ends the look at a place.
+            # The firmware does not check the place. In the simulation, an invalid place makes the gimbal stop looking
+            # at its present target.
             gimbal.look_at(self._vehicle.world_point(to_int(command.x), to_int(command.y), altitude, frame))
             return Result.ACCEPTED
         return Result.FAILED

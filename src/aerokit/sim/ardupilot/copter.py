@@ -289,7 +289,8 @@ class SimulatedCopter(CopterHost):
         if heading is None:
             return MavResult.FAILED
         direction = to_int(command.param3)
-        if command.param4 == 1.0:  # A relative turn of more than 180 degrees keeps its direction (autoyaw.cpp).
+        # A relative turn of more than 180 degrees must not take the shorter way (autoyaw.cpp). 0 then means clockwise.
+        if command.param4 == 1.0:
             direction = direction or 1
         self.yaw.turn_to(heading, math.radians(command.param2), direction)
         return MavResult.ACCEPTED

@@ -183,7 +183,8 @@ class CopterGuided(CopterModeBase):
             lifts_off = climb > 0 and copter.motors.can_lift
             copter.is_landed = not lifts_off
             return
-        copter.motion.seek_attitude(roll, pitch, -climb)  # The motion model takes a velocity down.
+        # The motion model expects the vertical velocity as positive downwards.
+        copter.motion.seek_attitude(roll, pitch, -climb)
 
     def _run_target(self) -> None:
         """Follow a target of position, velocity, acceleration, or position with velocity."""

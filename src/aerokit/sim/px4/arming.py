@@ -82,7 +82,8 @@ class Px4Calibration:
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] calibration failed: Disconnect battery and try again")
             return MavResult.DENIED
         elif sensor == "airspeed":
-            # Without wind, the calibration runs until it is cancelled. PX4 itself gives up after 90 s.
+            # The simulation blows no air at the sensor, so the calibration ends only when it is cancelled. Real PX4
+            # gives up after 90 s.
             self._start(sensor)
             self._px4.send_text(MavSeverity.CRITICAL, "[cal] Ensure sensor is not measuring wind")
         return MavResult.ACCEPTED

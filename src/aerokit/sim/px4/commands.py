@@ -314,7 +314,7 @@ class _Flight:
             return MavResult.DENIED
         if not px4.is_armed:
             self._tuning_since = math.nan
-        elif not self._tuning_since >= px4.arming.armed_at:  # not started (NaN), or before the last disarming
+        elif not self._tuning_since >= px4.arming.armed_at:  # not started (NaN), or before the last arming
             self._tuning_since = px4.now
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
         progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]

@@ -67,7 +67,7 @@ class Px4LogStream:
         # (system id, component id) of the client; None while no log is streamed.
         self._station: tuple[int, int] | None = None
         self._channel: Channel | None = None
-        self._stream_number = 0  # ends the calls of `_run` for an earlier stream
+        self._stream_number = 0  # number of this stream; scheduled calls of `_run` for an earlier number do nothing
         self._sequence = 0  # number of the next block
         self._tries = 0  # how often this block was sent
         self._acknowledged = 0  # number of definition blocks that were acknowledged

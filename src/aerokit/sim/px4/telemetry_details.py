@@ -159,7 +159,7 @@ def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
     cos_yaw, sin_yaw = math.cos(motion.yaw), math.sin(motion.yaw)
     forward = north * cos_yaw + east * sin_yaw
     right = east * cos_yaw - north * sin_yaw
-    # The products of roll and pitch are small, and are left out.
+    # Terms with sin(roll) * sin(pitch) or the like are small, and are left out.
     return (
         forward * math.cos(motion.pitch) - down * math.sin(motion.pitch),
         right * math.cos(motion.roll) + down * math.sin(motion.roll),

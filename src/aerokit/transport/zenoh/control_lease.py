@@ -114,7 +114,8 @@ class ControlLease:
     """
 
     def __init__(self) -> None:
-        self._holder: str | None = None  # None if the lease was released, or no client had it yet
+        # None if no client has the lease: none had it yet, or it was released or has expired.
+        self._holder: str | None = None
         self._received_at = 0.0  # time of the last data of the holder
 
     def holder(self, now: float) -> str | None:

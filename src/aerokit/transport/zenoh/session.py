@@ -105,7 +105,7 @@ _ENDPOINTS = re.compile(r"[a-z]+/[^\s,()\[\]]+")
 
 _TX = "transport/link/tx/queue"
 
-# By default, zenoh waits for a millisecond before it drops data of a put(), which would block the event loop.
+# By default, zenoh waits for a millisecond before it drops data of a put(). The wait would block the event loop.
 _DROP_AT_ONCE = (f"{_TX}/congestion_control/drop/wait_before_drop", 0)
 
 _DEFAULT_SETTINGS = (

@@ -54,7 +54,7 @@ class Calibration(AsyncIterator["CalibrationStep"]):
         # The event loop of the iteration; None before the first step.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_over = False
-        # Held while a task waits for the next step, and the scope in which it waits.
+        # `_lock` is held while a task waits for the next step. `_waiting` is the scope in which that task waits.
         self._lock = asyncio.Lock()
         self._waiting: anyio.CancelScope | None = None
 

@@ -51,7 +51,7 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
-    # When CALIBRATING was last seen as the latest state. Until the first report, the value is infinite, so that
+    # Time at which CALIBRATING was last seen as the latest state. It is infinite until the first report, so that
     # `has_ended_silently` returns False.
     calibrating_at = math.inf
     with ExitStack() as cleanup:
@@ -276,8 +276,8 @@ MIN_CHANNELS, MIN_TRAVEL_US = 4, 300
 CHANNELS_TIMEOUT_S = 5.0
 # RCn_MIN must be between the first two values, RCn_MAX between the last two (RC_Channel.cpp, PX4 rc_params).
 LOWEST_US, MIDDLE_US, HIGHEST_US = 800, 1500, 2200
-# PREFLIGHT_CALIBRATION with param4 = 1 makes ArduPilot refuse to arm until the next such command has param4 = 0. It
-# executes both commands, but answers UNSUPPORTED (GCS_Common.cpp, _handle_command_preflight_calibration).
+# After PREFLIGHT_CALIBRATION with param4 = 1, ArduPilot refuses to arm until it receives one with param4 = 0. ArduPilot
+# executes both, but answers UNSUPPORTED (GCS_Common.cpp, _handle_command_preflight_calibration).
 RESULTS_OF_RC_COMMAND = (MavResult.UNSUPPORTED,)
 
 

@@ -250,7 +250,8 @@ class CaptureLog:
         self._store(entry)
         self._update_highest(entry)
         if isinstance(message, m.CameraImageCaptured) and entry is self._highest:
-            # A CAMERA_CAPTURE_STATUS that was sent before this picture does not count it, so it is ignored.
+            # A CAMERA_CAPTURE_STATUS that was sent before this picture does not include it. This time stamp makes
+            # `_on_status` ignore such a status.
             self._count_boot_ms = message.time_boot_ms
         # Indices begin at 0, so `index` pictures were taken before this one; the camera may count this one later. An
         # index far above the count shows that the camera does not count as the standard says. The count is then left

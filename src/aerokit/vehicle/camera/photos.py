@@ -47,7 +47,7 @@ class Shutter:
         self._sequence_number = 0  # sequence number of the photo that was ordered last
         self._lock = anyio.Lock()
         self._reports_status = False  # True once the camera has sent CAMERA_CAPTURE_STATUS
-        self._never_answered = False  # True if all requests for CAMERA_CAPTURE_STATUS of an order were unanswered
+        self._never_answered = False  # True if, for some order, no request for CAMERA_CAPTURE_STATUS was answered
 
     async def request_status(self, timeout: float = CHECK_INTERVAL_S) -> CameraStatus | None:
         """Request CAMERA_CAPTURE_STATUS; None if the camera does not send it."""

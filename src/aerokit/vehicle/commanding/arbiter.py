@@ -73,8 +73,8 @@ class CommandArbiter:
         self._posted: list[Order] = []
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
-        # Open `changing_mode` blocks; and the numbers of the last mode change with an unknown result, and of the last
-        # one that was confirmed.
+        # Number of `changing_mode` blocks that are open. Then the numbers of two mode changes: of the last one with an
+        # unknown result, and of the last one that was confirmed.
         self._open_mode_changes = 0
         self._doubted_change = 0
         self._confirmed_change = 0
@@ -184,7 +184,8 @@ class CommandArbiter:
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
-        modes = () if self.newest is None else self.newest.modes  # The steering order may still lead to its modes.
+        # The vehicle may still change to the modes of the newest steering order.
+        modes = () if self.newest is None else self.newest.modes
         device_topics = () if device_order is None else device_order.ended_by
         order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
         self._orders.append(order)

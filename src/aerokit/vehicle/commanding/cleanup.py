@@ -382,7 +382,8 @@ class ArmCleanup:
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
-        if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
+        # While the computer slept, another party had time to arm the vehicle.
+        if self._arbiter.slept_since(order.given_at) > 0:
             return False
         if not order.end and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True

@@ -197,7 +197,8 @@ class GroundCheck:
         if abs(self._down_m_s()) >= SETTLED_M_S:
             self._settled_since = math.inf
             # The reported velocity may be wrong. If the height has not changed for STANDING_S, the vehicle stands on
-            # the ground although it reports a velocity. An old height would not change in a fall.
+            # the ground although it reports a velocity. `current_height` ignores old heights, because an outdated
+            # height would not change in a fall either.
             height_m = self._impact.current_height()
             is_known = height_m is not None and self._reported_height_m is not None
             is_still = is_known and not _has_changed(self._reported_height_m, height_m, STANDING_M)

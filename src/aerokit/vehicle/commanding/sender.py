@@ -339,8 +339,8 @@ class OrderSender:
         check_range("retries", retries, 0, 1000)
         options["attempts"] = 1 + retries
         if options["attempt_timeout"] is None and not retries:
-            # A command that is sent only once waits for its acknowledgement as long as all attempts of another command
-            # together.
+            # A command that is sent only once gets one long time-out: as long as the time-outs of all attempts of a
+            # repeated command together.
             options["attempt_timeout"] = MAX_ATTEMPTS * ATTEMPT_TIMEOUT_S
         try:
             if command in REQUEST_COMMANDS:

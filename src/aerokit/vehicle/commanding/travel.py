@@ -127,7 +127,8 @@ class TravelActions(VehicleBase):
                 # ArduPilot applies the speed only once the vehicle is on its way.
                 change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
                 await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, *change)
-            if heading_deg is not None and math.isnan(yaw):  # On this autopilot, MAV_CMD_DO_REPOSITION does not set it.
+            # On this autopilot, MAV_CMD_DO_REPOSITION does not set the heading.
+            if heading_deg is not None and math.isnan(yaw):
                 await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
             is_incomplete = False
             with self._flight_cleanup.flying(order):
@@ -145,8 +146,8 @@ class TravelActions(VehicleBase):
             self._flight_cleanup.hold_in_background(order)
             raise
         except OperationRejected:
-            # The vehicle is on its way, but has refused the speed or the heading, or the computer slept before it was
-            # sent. After a takeover, nothing is sent.
+            # The vehicle is on its way, but has refused the speed or the heading, or the computer slept before these
+            # were sent. After a takeover, nothing is sent.
             if is_incomplete:
                 self._flight_cleanup.hold_in_background(order)
             raise

@@ -22,7 +22,7 @@ __all__ = ["MeasurementEncoder"]
 
 NAN = math.nan
 UNKNOWN_VECTOR: Vector = (NAN, NAN, NAN)
-# Indexes of the diagonal elements in the upper triangle of a 6x6 matrix, row by row, and the number of its elements.
+# The upper triangle of a 6x6 matrix, row by row: indexes of its diagonal elements, and the number of all its elements.
 POSITION_DIAGONAL, ORIENTATION_DIAGONAL, TRIANGLE_SIZE = (0, 6, 11), (15, 18, 20), 21
 MAX_SECTORS, UNKNOWN_DISTANCE, UNKNOWN_OBSTACLE_ID = 72, 0xFFFF, 0xFFFF
 MAX_CENTIMETRES = 0xFFFE

@@ -162,8 +162,8 @@ class FileChannel:
             except FileError as error:
                 if may_be_own_session and request.attempts > 1 and error.code in SESSION_IN_USE:
                     # The file was requested more than once, and the reply to an earlier request may have been lost.
-                    # That request may then have opened the session that is now in use. On PX4, which has only one
-                    # session, it may also be another station's, whose transfer then opens its file again.
+                    # That request may then have opened the session that is now in use. PX4 has only one session, which
+                    # may also belong to another station; that station's transfer then opens its own file again.
                     may_be_own_session = False
                     for session in self._possible_sessions(request):
                         await self._close(session, path, idle_timeout_s)

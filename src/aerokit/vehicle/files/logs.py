@@ -395,7 +395,7 @@ async def log_path(
             return _numbered_path(directory, numbered, log, may_have_grown)
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
             logs = await _read_list_file(files, directory, idle_timeout_s)
-            # The sizes are those of the time at which PX4 wrote the list, as in the entry.
+            # Both sizes, in the list and in `log`, are from the time at which PX4 wrote the list.
             has_same_size = log.id < len(logs) and logs[log.id].size == log.size
             return logs[log.id].path if has_same_size else None
     return None

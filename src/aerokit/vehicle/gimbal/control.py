@@ -95,8 +95,8 @@ class ReleaseCommand:
                 except CommandTimeout:
                     if not self._is_target_silent():
                         raise
-                    # The target was silent, so it may not have received the command: send it once more at the
-                    # target's next HEARTBEAT, however late: a manager executes it only if this program has control.
+                    # The target was silent, and may have missed the command. Send it again at the target's next
+                    # HEARTBEAT. This may be late, because a manager executes it only if this program has control.
                     await self._wait_target_heartbeat()
                     if self._is_still_due():
                         self._send()

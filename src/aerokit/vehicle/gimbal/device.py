@@ -188,7 +188,7 @@ class GimbalDevice:
         )
         # False if the program has named this gimbal, but no message from it was received.
         self.is_discovered = False
-        self.pending_orders: int = 0  # number of calls that wait for an order to this gimbal
+        self.pending_orders: int = 0  # number of calls that are waiting for the end of an order to this gimbal
         # Rank of the known manager, and time stamp of its newest status; see `update_manager` and `update_status`.
         self._manager_rank = 0
         self._status_ms = 0

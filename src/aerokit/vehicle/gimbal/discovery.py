@@ -198,7 +198,8 @@ class GimbalRegistry:
             device = self._device_with_own_id(device_id, may_be_new=rank > RANK_STATUS)
         else:  # The device is the sender itself, or attached to it. `_device_of` records the reception.
             device = self._device_of(message, device_id)
-            rank = max(rank, RANK_INFORMATION)  # For its own gimbals, a status shows as much as an information.
+            # The sender's status about one of its own gimbals proves as much as GIMBAL_MANAGER_INFORMATION does.
+            rank = max(rank, RANK_INFORMATION)
         if device is None:
             return None
         is_old_gone = device.manager_id is not None and self._is_component_gone(device.manager_id)

@@ -35,7 +35,7 @@ PLAN_ID_MAX_AGE_S = 2.5
 # If the same item is reported as reached again within this time, the message is a duplicate.
 DUPLICATE_WINDOW_S = 0.3
 
-# If an item becomes the current one more than this many seconds after it was reached, the vehicle approaches it again.
+# An item that becomes current again later than this many seconds after it was reached is approached again.
 SECOND_APPROACH_S = 1.0
 
 # After a landing, a vehicle may report another item than the last one for up to this many seconds, until it disarms.

@@ -33,7 +33,7 @@ class ParameterStore:
 
     def __init__(self, transfers: Transfers, on_discarded: Callable[[str, float], None]) -> None:
         self._transfers = transfers
-        # Called with the name and the time from which on values are accepted, after a message was ignored.
+        # Called after a message was ignored, with the parameter's name and the time after which its values count again.
         self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table; None until it is built again after a change.

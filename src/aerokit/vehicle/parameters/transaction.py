@@ -79,8 +79,9 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # The answer may be a float that lacks the last bits of the store's value. Another value in the store is
-            # wrong: another station has just undone our last write, and the store took this for a delayed message.
+            # The answer may be a float that lacks the last bits of the store's value. If the store's value differs by
+            # more, it is wrong: another station has just undone our last write, and the store took its message for a
+            # delayed one.
             known = self._access.store.get(name) or answer
             current[name] = known if same_value(float(known.value), float(answer.value)) else answer
             if name not in self._saved:

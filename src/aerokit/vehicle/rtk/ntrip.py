@@ -47,7 +47,8 @@ MAX_SILENCE_S = 30.0
 POSITION_INTERVAL_S = 10.0
 POSITION_POLL_INTERVAL_S = 1.0
 POSITION_MAX_AGE_S = 10.0
-# Maps GPS_FIX_TYPE to the quality in GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
+# Maps GPS_FIX_TYPE to the quality in GGA. The qualities are: 1 autonomous (the default), 2 differential, 4 RTK fixed, 5
+# RTK float.
 QUALITIES = {4: 2, 5: 5, 6: 4}
 MAX_HEADER_LINES, MAX_CHUNK_SIZE, MAX_TABLE_SIZE = 100, 1 << 20, 4 << 20
 CLOSE_TIMEOUT_S = 1.0
@@ -294,7 +295,8 @@ class NtripClient:
         finally:
             if position_task is not None:
                 position_task.cancel()
-                # If sending the position failed, so did reading, which says why.
+                # If sending the position has failed, reading has failed, too. The reason comes from the reader, so the
+                # task's exception is ignored.
                 await asyncio.gather(position_task, return_exceptions=True)
             self._close()
         self._report(f"{self._name}: {reason} after {message_count} messages")

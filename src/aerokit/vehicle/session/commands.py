@@ -61,7 +61,8 @@ class CommandSender:
         self._runs: dict[_Key, ExchangeRun[CommandAck]] = {}
         # Maps each running command to the status of its order; None for a command without an order.
         self._order_statuses: dict[_Key, OrderStatus | None] = {}
-        # Acks of earlier commands that may still arrive, as the times at which they were recorded.
+        # For each key, one entry for each ack of an earlier command that may still arrive: the time at which the entry
+        # was added.
         self._pending_acks: dict[_Key, list[float]] = {}
         # The last MAV_RESULT of each command, and the time at which it was last accepted.
         self._results: dict[_Key, int] = {}

@@ -42,7 +42,7 @@ The interval doubles with each further request of the stream, up to ``MAX_RETRY_
 
 MAX_RETRY_INTERVAL_S = 60.0
 
-# The interval after requests without an ack is 2 seconds to the power of their number, which is limited to this one.
+# After n consecutive requests without an ack, the interval is 2**n seconds. This is the maximum of n.
 MAX_BACKOFF_EXPONENT = 10
 
 # This number in place of a rate in Hz restores the autopilot's own default rate.

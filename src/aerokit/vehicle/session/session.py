@@ -82,7 +82,7 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
         ):
             if not cell.is_known:
                 await _request(commands, message_id)
-        # Not again after a reboot, because the mode names are kept.
+        # The mode names are not requested again after a reboot, because they are kept.
         if mode_requests_left and not telemetry.has_available_modes:
             is_answered = await _request(commands, AvailableModes.ID)
             mode_requests_left -= is_answered

@@ -199,7 +199,8 @@ class StreamedMessage:
         self._cells = cells
         self._apply = apply
         self._lock = lock
-        # Offset in `Frame.body` instead of in the payload; None if there is only one instance.
+        # Offset of the instance byte in `Frame.body` (the argument is its offset in the payload); None if there is only
+        # one instance.
         self._instance_at = None if instance_at is None else instance_at + _HEADER_LENGTH
         # The first frame that arrives at or after this time is decoded at once.
         self._decode_from = -math.inf
@@ -217,7 +218,7 @@ class StreamedMessage:
             return
         if self._is_watched or frame.received_at >= self._decode_from:
             self._decode_from = frame.received_at + MAX_DECODE_DELAY_S
-            # The lock keeps a thread that reads a cell from applying older frames between `catch_up` and `_apply`.
+            # Without the lock, a thread that reads a cell could apply older frames between `catch_up` and `_apply`.
             with self._lock:
                 if self.pending:
                     self.catch_up()  # Frames that arrived earlier must be applied first.

@@ -66,7 +66,8 @@ class States:
     system_status: StateField[int] = StateField(MessageSource("Heartbeat", condition.system_status), eager=True)
     """MAV_STATE: 3 standby, 4 active, 5 critical, 6 emergency (HEARTBEAT)."""
 
-    # Declared after mode and system_status, so that these are up to date when observers of ``armed`` are called.
+    # `armed` is declared after `mode` and `system_status`, so that these are up to date when observers of `armed` are
+    # called.
     armed: StateField[bool] = StateField(MessageSource("Heartbeat", condition.armed), eager=True)
     """True if the motors are armed (HEARTBEAT)."""
 
