@@ -87,7 +87,7 @@ def test_attitude_is_streamed_and_sent_on_request(client: Client) -> None:
 # -------------------------------------------------------------------------------------- orders
 
 
-def test_initial_mode_follows_centred_sticks(client: Client) -> None:
+def test_initial_mode_follows_centered_sticks(client: Client) -> None:
     assert angles(client) == [0, -35, 0]
 
 

@@ -60,7 +60,7 @@ def test_arming_without_ground_station_disarms_immediately() -> None:
 
 
 @pytest.mark.parametrize("action", [0, 1, 2])
-def test_pilot_input_failsafe_centres_sticks_or_disarms(action: int) -> None:
+def test_pilot_input_failsafe_centers_sticks_or_disarms(action: int) -> None:
     sub, client = armed_sub(FS_PILOT_INPUT=float(action))
     sub.rc[4] = 1700
     sub.faults.rc_lost = True

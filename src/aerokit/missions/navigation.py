@@ -424,7 +424,7 @@ def loiter_time(
     """Stay at a place for 0 to 65,535 seconds. ArduPilot stores whole seconds, and only the sign of the radius.
 
     ``leave_tangentially`` makes a plane fly to the next item from the point at which it leaves its circle. Otherwise it
-    joins the line from the centre of the circle. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
+    joins the line from the center of the circle. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
     """
     return place_item(
         MavCmd.NAV_LOITER_TIME,

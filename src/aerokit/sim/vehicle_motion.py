@@ -93,11 +93,11 @@ class FixedWing(Motion):
         turn_sign = math.copysign(1.0, radius)
         radius = max(1.0, abs(radius))
         distance = math.hypot(north - self.north, east - self.east)
-        course_to_centre = math.atan2(east - self.east, north - self.north)
-        # Far away, the course points to the centre. On the circle, the course is the tangent. In between, the course
-        # changes gradually from the direction of the centre to the tangent.
-        share_to_centre = max(-1.0, min(1.0, (distance - radius) / radius))
-        course = course_to_centre - turn_sign * (math.pi / 2) * (1.0 - share_to_centre)
+        course_to_center = math.atan2(east - self.east, north - self.north)
+        # Far away, the course points to the center. On the circle, the course is the tangent. In between, the course
+        # changes gradually from the direction of the center to the tangent.
+        share_to_center = max(-1.0, min(1.0, (distance - radius) / radius))
+        course = course_to_center - turn_sign * (math.pi / 2) * (1.0 - share_to_center)
         is_near_circle = distance < 1.5 * radius
         turn_rate = turn_sign * self.ground_speed_m_s / radius if is_near_circle else 0.0
         self.head(course, airspeed, self.climb_to(down), turn_rate=turn_rate)

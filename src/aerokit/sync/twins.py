@@ -2496,7 +2496,7 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
         Two steps need a confirmation: one after all sticks and switches were moved to their ends, one after the sticks
-        were centred.
+        were centered.
         """
         return Calibration(self._loop, self._loop.call(self.aio.radio))
 
@@ -5104,7 +5104,7 @@ class Vehicle(VehicleTwin):
         """Fly by stick positions from your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
 
         Args:
-            initial: stick positions that are sent while the mode is entered; None centres all sticks.
+            initial: stick positions that are sent while the mode is entered; None centers all sticks.
             mode: the flight mode for the sticks. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane),
                 MANUAL (ArduPilot Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.

@@ -203,7 +203,7 @@ class _Axes:
         for value in _ticks(self.y_range, max_y_ticks):
             _, y = self.place(0.0, value)
             shapes.append(_GridLine((self.left, y), (right, y)))
-            # The text is 5 pixels left of the axis, and its baseline 4 pixels lower, so that it is centred on the line.
+            # The text is 5 pixels left of the axis, and its baseline 4 pixels lower, so that it is centered on it.
             shapes.append(_Text(self.left - 5, y + 4, f"{value:g} {y_unit}", "end"))
         return shapes
 
@@ -241,8 +241,8 @@ def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float
     offset_of = metres_from(origin)
     outlines = []
     if failure.circle is not None:
-        centre, radius = failure.circle
-        north, east = offset_of(centre)
+        center, radius = failure.circle
+        north, east = offset_of(center)
         angles = [2 * math.pi * number / _CORNERS for number in range(_CORNERS + 1)]
         outlines.append([(east + radius * math.sin(angle), north + radius * math.cos(angle)) for angle in angles])
     if failure.polygon:

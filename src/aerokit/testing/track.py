@@ -182,10 +182,10 @@ class Track(Sequence[TrackPoint]):
     def assert_stayed_within(self, radius_m: float, *, of: Position | None = None) -> None:
         """Assert that the horizontal distance from home, or from the position ``of``, was never above ``radius_m``."""
         __tracebackhide__ = True
-        centre = self.home if of is None else of
-        distance, point = self._farthest(centre)
+        center = self.home if of is None else of
+        distance, point = self._farthest(center)
         name = "home" if of is None else _text(of)
-        self._record_failure_unless(distance <= radius_m, TrackFailure(point, circle=(centre, radius_m)))
+        self._record_failure_unless(distance <= radius_m, TrackFailure(point, circle=(center, radius_m)))
         assert distance <= radius_m, f"the vehicle left the {radius_m:g} m around {name}: {distance:.1f} m away {point}"
 
     def assert_stayed_inside(self, polygon: Sequence[Position]) -> None:
@@ -259,10 +259,10 @@ class Track(Sequence[TrackPoint]):
         self._check_not_empty()
         return max(self, key=lambda point: point.speed_m_s)
 
-    def _farthest(self, centre: Position) -> tuple[float, TrackPoint]:
+    def _farthest(self, center: Position) -> tuple[float, TrackPoint]:
         """Return the maximum horizontal distance from a position in metres, and the point of the track."""
         self._check_not_empty()
-        offset_of = metres_from(centre)
+        offset_of = metres_from(center)
         farthest = max(self, key=lambda point: math.hypot(*offset_of(point)))
         return math.hypot(*offset_of(farthest)), farthest
 

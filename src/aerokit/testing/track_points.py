@@ -43,7 +43,7 @@ class TrackFailure:
 
     point: TrackPoint
     circle: tuple[Position, float] | None = None
-    """The allowed area of the assertion: its centre, and its radius in metres. None if the assertion has no circle."""
+    """The allowed area of the assertion: its center, and its radius in metres. None if the assertion has no circle."""
     polygon: Sequence[Position] | None = None
     altitude_m: float | None = None
     """Altitude above home."""

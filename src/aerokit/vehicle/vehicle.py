@@ -167,7 +167,7 @@ class Vehicle(
         """Fly by stick positions from your program (MANUAL_CONTROL): ``async with vehicle.sticks() as sticks: …``.
 
         Args:
-            initial: stick positions that are sent while the mode is entered; None centres all sticks.
+            initial: stick positions that are sent while the mode is entered; None centers all sticks.
             mode: the flight mode for the sticks. By default LOITER (ArduCopter), FBWA or QLOITER (ArduPlane),
                 MANUAL (ArduPilot Rover), ALT_HOLD (ArduSub), POSCTL (PX4).
             rate_hz: transmission rate of the latest positions, 2 to 400.

@@ -56,20 +56,20 @@ class _FlyLeg:
 class _CircleLeg:
     """Flight to the nearest point of a circle, and then around the circle. A negative radius is anticlockwise."""
 
-    def __init__(self, auto: CopterAuto, centre: Ned, *, turns: float, radius: float) -> None:
+    def __init__(self, auto: CopterAuto, center: Ned, *, turns: float, radius: float) -> None:
         self._copter = auto.vehicle
         self._turns = turns
-        self._centre_north, self._centre_east, self._centre_down = centre
+        self._center_north, self._center_east, self._center_down = center
         parameters, motion = self._copter.parameters, self._copter.motion
         self._radius = abs(radius) or parameters["CIRCLE_RADIUS"] / 100.0  # 0 selects the parameter.
         self._turn_rate = math.copysign(math.radians(parameters["CIRCLE_RATE"]), radius)
-        north, east = motion.north - self._centre_north, motion.east - self._centre_east
-        self._angle = math.atan2(east, north)  # bearing of the point to follow, seen from the centre
+        north, east = motion.north - self._center_north, motion.east - self._center_east
+        self._angle = math.atan2(east, north)  # bearing of the point to follow, seen from the center
         self._turned_rad = 0.0  # angle flown so far; positive in both directions
         self._reported_turns = -1  # Not even turn 0 is reported yet.
         self._approach: _FlyLeg | None = None  # None once the copter is on the circle
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
-        if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - self._centre_down) > _ON_CIRCLE_M:
+        if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - self._center_down) > _ON_CIRCLE_M:
             self._approach = _FlyLeg(auto, self._point(), stops=True)
 
     @property
@@ -101,9 +101,9 @@ class _CircleLeg:
 
     def _point(self) -> Ned:
         """Return the point of the circle at the bearing `_angle`."""
-        north = self._centre_north + self._radius * math.cos(self._angle)
-        east = self._centre_east + self._radius * math.sin(self._angle)
-        return (north, east, self._centre_down)
+        north = self._center_north + self._radius * math.cos(self._angle)
+        east = self._center_east + self._radius * math.sin(self._angle)
+        return (north, east, self._center_down)
 
     def _report_new_turn(self) -> None:
         number = int(self._turned_rad / math.tau)

@@ -12,11 +12,11 @@ from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ConditionTimer
 
-_STICK_CENTRE, _STICK_LOW, _DEADZONE = 1500, 1050, 100
+_STICK_CENTER, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """ArduCopter's arming checks. Only modes that use a position require one; the throttle must be low or centred."""
+    """ArduCopter's arming checks. Only modes that use a position require one; the throttle must be low or centered."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
@@ -57,8 +57,8 @@ class CopterArming(ArduPilotArming[CopterHost]):
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
-        # In modes without manual throttle, the stick sets a climb rate, and its centre holds the altitude.
-        max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTRE + _DEADZONE
+        # In modes without manual throttle, the stick sets a climb rate, and its center holds the altitude.
+        max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTER + _DEADZONE
         if not mode.arms_with_raised_throttle and self.vehicle.rc[RC_THROTTLE] > max_throttle:
             return ["Throttle too high"]
         return []

@@ -289,7 +289,7 @@ class CopterStabilize(CopterPilotedMode):
 
 
 class CopterLoiter(CopterPilotedMode):
-    """LOITER and similar modes: sticks set velocities, and centred sticks hold the position.
+    """LOITER and similar modes: sticks set velocities, and centered sticks hold the position.
 
     With a low throttle stick, the copter descends and lands.
     """

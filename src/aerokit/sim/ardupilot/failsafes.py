@@ -154,7 +154,7 @@ class ArduPilotFailsafes(Generic[HostT]):
 
 _CHECK_INTERVAL_S = 1.0
 _REPORT_INTERVAL_S, _MIN_REPORT_INTERVAL_S = 30.0, 4.0
-_CENTRED_STICKS = (("Roll", 1), ("Pitch", 2), ("Yaw", 4))
+_CENTERED_STICKS = (("Roll", 1), ("Pitch", 2), ("Yaw", 4))
 _CHECK_THROTTLE, _SKIP_STICKS = 1 << 5, 1 << 6
 _NOT_REQUIRED = 0
 
@@ -233,11 +233,11 @@ class ArduPilotArming(Generic[HostT]):
         return []
 
     def final_reasons(self) -> list[str]:
-        """Return the failures of the checks that run only on a request to arm: the sticks must be centred."""
+        """Return the failures of the checks that run only on a request to arm: the sticks must be centered."""
         options = int(self.vehicle.parameters["RC_OPTIONS"])
         if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
             return []
-        sticks = () if options & _SKIP_STICKS else _CENTRED_STICKS
+        sticks = () if options & _SKIP_STICKS else _CENTERED_STICKS
         if options & _CHECK_THROTTLE:
             sticks = (*sticks, ("Throttle", RC_THROTTLE + 1))  # The numbers of RC channels count from 1.
         return [f"{name} (RC{number}) is not neutral" for name, number in sticks if self._is_moved(number)]

@@ -62,13 +62,13 @@ class FenceZones:
 class CircleZone:
     """Circle with a radius in metres."""
 
-    def __init__(self, centre: Point, radius: float) -> None:
+    def __init__(self, center: Point, radius: float) -> None:
         self.radius = radius
-        self._centre = centre
+        self._center = center
 
     def outside_m(self, place: Point) -> float:
         """Return the distance from the border in metres; negative inside."""
-        return math.dist(place, self._centre) - self.radius
+        return math.dist(place, self._center) - self.radius
 
 
 class PolygonZone:

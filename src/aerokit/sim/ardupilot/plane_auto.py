@@ -39,7 +39,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self._landing: PlaneLanding | None = None  # set while `_manoeuvre` is `_LAND`
         self._on_circle_since = math.nan  # NaN before the plane has reached the circle
         self._turned_rad = 0.0  # angle flown around the circle
-        self._last_bearing = 0.0  # bearing from the centre of the circle at the last tick
+        self._last_bearing = 0.0  # bearing from the center of the circle at the last tick
         self._condition_started_at = 0.0
         self._leg_start: Ned = (0.0, 0.0, 0.0)  # start of the straight line to the current waypoint
         self.handlers: dict[int, Callable[[MissionItem], None]] = {

@@ -171,7 +171,7 @@ class PlaneLanding:
 
 
 _MID_STICK, _STICK_RANGE, _LOW_THROTTLE = 1500, 500, 1100
-_CENTRED_STICK = 0.05  # A stick with at most this deflection counts as centred.
+_CENTERED_STICK = 0.05  # A stick with at most this deflection counts as centered.
 _CIRCLE_BANK_SHARE = 1 / 3
 # A take-off is complete when the plane is this many metres below the target altitude.
 _TAKE_OFF_DONE_M = 5.0
@@ -244,7 +244,7 @@ class PlaneAltitudeMode(PlaneModeBase):
 
 
 class PlaneCruise(PlaneAltitudeMode):
-    """CRUISE: works like FBWB, and holds the course over ground while the roll stick is centred."""
+    """CRUISE: works like FBWB, and holds the course over ground while the roll stick is centered."""
 
     def __init__(self, plane: PlaneHost) -> None:
         super().__init__(plane)
@@ -253,7 +253,7 @@ class PlaneCruise(PlaneAltitudeMode):
     def steer(self, climb: float) -> None:
         """Hold the course, unless the pilot turns."""
         wing = self.vehicle.wing
-        if abs(self.stick(RC_ROLL)) > _CENTRED_STICK:  # The pilot turns, so no course is held.
+        if abs(self.stick(RC_ROLL)) > _CENTERED_STICK:  # The pilot turns, so no course is held.
             self._course = None
             super().steer(climb)
             return
@@ -284,7 +284,7 @@ class PlaneNavigatingMode(PlaneModeBase):
         super().__init__(plane)
         self.speed: float = 0.0  # Commanded airspeed in m/s; 0 selects AIRSPEED_CRUISE.
         self.radius: float = 0.0  # Radius of the circle in metres; 0 selects WP_LOITER_RAD.
-        self._place: Ned | None = None  # centre of the circle, or end of the line, that the plane flies
+        self._place: Ned | None = None  # center of the circle, or end of the line, that the plane flies
 
     def enter(self, *, force: bool) -> bool:
         self.speed = self.radius = 0.0

@@ -117,7 +117,7 @@ class ArduPilotRadio:
 
 
 _NO_VALUE = 0x7FFF
-_CENTRE, _SUB_MIN_PWM, _SUB_MAX_PWM, _SUB_SCALE = 1500, 1100, 1900, 0.4
+_CENTER, _SUB_MIN_PWM, _SUB_MAX_PWM, _SUB_SCALE = 1500, 1100, 1900, 0.4
 
 
 class ArduPilotJoystick:
@@ -185,13 +185,13 @@ class SubJoystick(ArduPilotJoystick):
         gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
         scale = _SUB_SCALE * gain
         throttle_scale = 2 * scale * self.setting("JS_THR_GAIN", 1.0)
-        throttle = axes.z * throttle_scale + _CENTRE - 500 * throttle_scale  # 500 is the middle of the axis z.
+        throttle = axes.z * throttle_scale + _CENTER - 500 * throttle_scale  # 500 is the middle of the axis z.
         # Like the firmware, do not scale pitch and roll, and use an axis without a value like any other (joystick.cpp).
         offsets = {
             SUB_PITCH: axes.s, SUB_ROLL: axes.t, RC_YAW: axes.r * scale, SUB_FORWARD: axes.x * scale,
             SUB_LATERAL: axes.y * scale,
         }  # fmt: skip
-        pulses = {channel: _CENTRE + offset for channel, offset in offsets.items()} | {RC_THROTTLE: throttle}
+        pulses = {channel: _CENTER + offset for channel, offset in offsets.items()} | {RC_THROTTLE: throttle}
         return {channel: int(max(_SUB_MIN_PWM, min(_SUB_MAX_PWM, pulse))) for channel, pulse in pulses.items()}
 
 

@@ -126,7 +126,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             return
         self.is_pilot_lost = True
         self.warn("Lost manual control", MavSeverity.CRITICAL)
-        for index in range(_STICKS):  # Centre the sticks, so that their last positions no longer move the vehicle.
+        for index in range(_STICKS):  # Center the sticks, so that their last positions no longer move the vehicle.
             sub.rc[index] = _STICK_MIDDLE
         if enabled == _PILOT_DISARM:
             sub.arming.disarm()

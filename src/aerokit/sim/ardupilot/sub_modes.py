@@ -85,7 +85,7 @@ class _Mode(ArduPilotMode):
 
 
 class _Manual(_Mode):
-    """MANUAL, STABILIZE and ACRO: sticks control the thrust. With a centred throttle stick the vehicle drifts up."""
+    """MANUAL, STABILIZE and ACRO: sticks control the thrust. With a centered throttle stick the vehicle drifts up."""
 
     needs_position = False
     has_manual_throttle = True

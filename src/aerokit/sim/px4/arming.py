@@ -150,7 +150,7 @@ def _sensor_of(command: ReceivedCommand) -> str:
     return next((sensor for sensor, is_requested in requests.items() if is_requested), "")
 
 
-_LOW_THROTTLE, _CENTRE_THROTTLE = -0.8, 0.2
+_LOW_THROTTLE, _CENTER_THROTTLE = -0.8, 0.2
 _CLIMB_MODES = frozenset({modes.ALTITUDE, modes.POSITION, modes.POSITION_SLOW})
 _MODES_ENDED_BY_DISARMING = frozenset({modes.TAKEOFF, modes.LAND, modes.PRECISION_LAND, modes.RTL})
 
@@ -231,8 +231,8 @@ class Px4Arming:
         px4 = self._px4
         if px4.mode not in modes.STICK_MODES:
             return True
-        if px4.mode in _CLIMB_MODES:  # A centred stick is safe where the throttle stick controls the climb rate.
-            return px4.sticks.throttle <= _CENTRE_THROTTLE
+        if px4.mode in _CLIMB_MODES:  # A centered stick is safe where the throttle stick controls the climb rate.
+            return px4.sticks.throttle <= _CENTER_THROTTLE
         return px4.sticks.throttle < _LOW_THROTTLE
 
     def disarm(self, by: str, *, force: bool = False) -> bool:

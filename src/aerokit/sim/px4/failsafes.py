@@ -100,8 +100,8 @@ class Px4Fence:
                 index += count
                 continue
             if item.command in _CIRCLES:
-                centre = self._place(item)
-                inside = math.dist(centre, (north, east)) <= item.param1
+                center = self._place(item)
+                inside = math.dist(center, (north, east)) <= item.param1
                 yield _CIRCLES[Cmd(item.command)], inside
             index += 1
 

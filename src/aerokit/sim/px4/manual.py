@@ -143,7 +143,7 @@ class Px4ManualFlight:
         px4.motion.seek_attitude(tilt * sticks.roll, pitch, down)
 
     def _fly_velocity(self) -> None:
-        """Fly with the velocity that the sticks command, or hold the place while they are centred."""
+        """Fly with the velocity that the sticks command, or hold the place while they are centered."""
         px4, sticks, motion = self._px4, self._px4.sticks, self._px4.motion
         max_speed = px4.parameters["MPC_VEL_MANUAL"] * (_SLOW_SHARE if px4.mode == POSITION_SLOW else 1.0)
         forward = max_speed * curved(sticks.pitch, _EXPO, _DEAD_ZONE)
@@ -167,7 +167,7 @@ class Px4ManualFlight:
         motion.seek_velocity(north - motion.north, east - motion.east, down)  # 1 m/s for each metre of distance
 
     def _height_velocity(self) -> float:
-        """Return the vertical velocity (m/s down) that the throttle stick commands. The centre holds the height."""
+        """Return the vertical velocity (m/s down) that the throttle stick commands. The center holds the height."""
         px4, motion = self._px4, self._px4.motion
         throttle = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
         if throttle > 0:
@@ -184,7 +184,7 @@ class Px4ManualFlight:
 
     @property
     def _thrust(self) -> float:
-        """Thrust divided by the thrust of hovering: 1 with a centred stick, least (MPC_MANTHR_MIN) with the lowest."""
+        """Thrust divided by the thrust of hovering: 1 with a centered stick, least (MPC_MANTHR_MIN) with the lowest."""
         parameters, throttle = self._px4.parameters, self._px4.sticks.throttle
         hover, min_thrust = parameters["MPC_THR_HOVER"], parameters["MPC_MANTHR_MIN"]
         thrust_range = 1.0 - hover if throttle > 0 else hover - min_thrust

@@ -4,7 +4,7 @@ MNT_MODE_IN 0 or 4 enables a gimbal on the AUX outputs (MNT_MODE_OUT 0) and its 
 
 Servos have no feedback, so telemetry reports the set-point. Only the component in control can command the gimbal, but
 every component can set a region of interest. There is no secondary control and no retracted position, and
-GIMBAL_MANAGER_SET_PITCHYAW is ignored. When a return starts, PX4 briefly takes control and centres the gimbal.
+GIMBAL_MANAGER_SET_PITCHYAW is ignored. When a return starts, PX4 briefly takes control and centers the gimbal.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Px4Gimbal:
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:
-        """Centre the gimbal and release control of it. Called at power-on."""
+        """Center the gimbal and release control of it. Called at power-on."""
         parameters = self._px4.parameters
         self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
         self.rest()
@@ -111,7 +111,7 @@ class Px4Gimbal:
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
         """Set the angles and the rates at which they change.
 
-        If any angle is NaN, all three angles stay. NEUTRAL centres the gimbal, RETRACT changes nothing.
+        If any angle is NaN, all three angles stay. NEUTRAL centers the gimbal, RETRACT changes nothing.
         """
         if flags & Flags.RETRACT:
             return

@@ -162,7 +162,7 @@ class CalibrationControl:
         """Calibrate the remote control: write RCn_MIN, RCn_MAX and RCn_TRIM of each channel that was moved.
 
         Two steps need a confirmation: one after all sticks and switches were moved to their ends, one after the sticks
-        were centred.
+        were centered.
         """
         return self._prepare("radio", procedures.radio_by_channels, px4=procedures.radio_by_channels)
 

@@ -316,7 +316,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
             0.0, "move all sticks and switches to all their ends, then continue", needs_confirmation=True
         )
         yield run.new_step(
-            0.5, "centre the sticks, with the throttle at its lowest, then continue", needs_confirmation=True
+            0.5, "center the sticks, with the throttle at its lowest, then continue", needs_confirmation=True
         )
         await wait_channels()
         trims = _pulses(channels.latest)
@@ -329,7 +329,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         low, high, trim = lows[number], highs[number], trims.get(number, 0)
         if not LOWEST_US <= low <= trim <= high <= HIGHEST_US or not low < MIDDLE_US < high:
             raise run.failure(
-                f"channel {number} ranges from {low} to {high} µs with a centre of {trim} µs, which is implausible;"
+                f"channel {number} ranges from {low} to {high} µs with a center of {trim} µs, which is implausible;"
                 " nothing was written"
             )
         values |= {f"RC{number}_MIN": low, f"RC{number}_MAX": high, f"RC{number}_TRIM": trim}

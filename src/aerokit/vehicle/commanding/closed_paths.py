@@ -23,9 +23,9 @@ Vector = tuple[float, float]
 
 
 class ClosedPath:
-    """A closed curve around a centre, with a phase that increases by 2π each round.
+    """A closed curve around a center, with a phase that increases by 2π each round.
 
-    ``at(phase)`` returns the place relative to the centre, and its first and second derivative by the phase.
+    ``at(phase)`` returns the place relative to the center, and its first and second derivative by the phase.
     """
 
     first_phase: float = 0.0
@@ -35,7 +35,7 @@ class ClosedPath:
 
 
 class Circle(ClosedPath):
-    """A circle; the phase is the bearing from its centre in radians."""
+    """A circle; the phase is the bearing from its center in radians."""
 
     def __init__(self, radius_m: float, *, clockwise: bool, first_phase: float) -> None:
         self._radius_m = radius_m
@@ -49,7 +49,7 @@ class Circle(ClosedPath):
 
 
 class Eight(ClosedPath):
-    """A lemniscate along an axis; it begins and ends at its centre."""
+    """A lemniscate along an axis; it begins and ends at its center."""
 
     def __init__(self, major_m: float, minor_m: float, axis_deg: float, *, clockwise: bool) -> None:
         self._major_m, self._axis = major_m, math.radians(axis_deg)
@@ -72,9 +72,9 @@ class Eight(ClosedPath):
 class PathFlight:
     """Moves a set-point straight to the start of a path, stops it there, and then moves it along the path to its end.
 
-    ``start_from_centre`` is the vehicle's position at the start, relative to the centre of the path (north, east,
-    down). ``centre`` is the position of the centre in the local frame. ``heading`` returns the heading in degrees for a
-    place relative to the centre and a velocity; if it returns None, the autopilot chooses the heading.
+    ``start_from_center`` is the vehicle's position at the start, relative to the center of the path (north, east,
+    down). ``center`` is the position of the center in the local frame. ``heading`` returns the heading in degrees for a
+    place relative to the center and a velocity; if it returns None, the autopilot chooses the heading.
     """
 
     def __init__(
@@ -82,15 +82,15 @@ class PathFlight:
         path: ClosedPath,
         rounds: float,
         speed_m_s: float,
-        start_from_centre: tuple[float, float, float],
-        centre: tuple[float, float, float],
+        start_from_center: tuple[float, float, float],
+        center: tuple[float, float, float],
         heading: Callable[[Vector, Vector], float | None],
     ) -> None:
         self._path = path
         self._speed_m_s = speed_m_s
-        self._centre = centre
+        self._center = center
         self._heading = heading
-        self._start_from_centre = start_from_centre
+        self._start_from_center = start_from_center
         # Phase of the set-point, and phase at the end of the path.
         self._phase = path.first_phase
         self._last_phase = path.first_phase + 2 * math.pi * rounds
@@ -112,7 +112,7 @@ class PathFlight:
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
         """Move the set-point along the straight line to the first point of the path."""
         (path_north, path_east), _, _ = self._path.at(self._path.first_phase)
-        start_north, start_east, start_down = self._start_from_centre
+        start_north, start_east, start_down = self._start_from_center
         to_path = (path_north - start_north, path_east - start_east, -start_down)  # The path is at down = 0.
         length_m = math.hypot(*to_path)
         self._change_speed(seconds, length_m - self._flown_m)
@@ -124,7 +124,7 @@ class PathFlight:
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
             coordinate + fraction * component
-            for coordinate, component in zip(self._start_from_centre, to_path, strict=True)
+            for coordinate, component in zip(self._start_from_center, to_path, strict=True)
         )
         speed = self._present_speed_m_s
         north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)
@@ -161,16 +161,16 @@ class PathFlight:
     def _setpoint(
         self, place: Vector, down: float, velocity: tuple[float, float, float], acceleration: Vector
     ) -> TrajectorySetpoint:
-        """Return the set-point for a place relative to the centre, in the local frame."""
-        centre_north, centre_east, centre_down = self._centre
+        """Return the set-point for a place relative to the center, in the local frame."""
+        center_north, center_east, center_down = self._center
         north, east = place
-        position = (centre_north + north, centre_east + east, centre_down + down)
+        position = (center_north + north, center_east + east, center_down + down)
         yaw_deg = self._heading(place, velocity[:2])
         return TrajectorySetpoint(*position, *velocity, *acceleration, yaw_deg=yaw_deg)
 
 
 class TurnCounter:
-    """Counts turns around a centre while the vehicle is near the circle.
+    """Counts turns around a center while the vehicle is near the circle.
 
     Turns in the wrong direction are subtracted.
     """
@@ -179,14 +179,14 @@ class TurnCounter:
         self._radius_m = radius_m
         self._direction = 1 if clockwise else -1
         self._tolerance_m = max(MIN_TOLERANCE_M, TOLERANCE_SHARE * radius_m)
-        # Bearing from the centre to the vehicle in radians; None while the vehicle is not near the circle.
+        # Bearing from the center to the vehicle in radians; None while the vehicle is not near the circle.
         self._bearing: float | None = None
         self.rounds: float = 0.0
         self.is_on_path: bool = False
         """True while the vehicle is near the circle."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Add the part of a turn since the previous report. The position is in metres from the centre."""
+        """Add the part of a turn since the previous report. The position is in metres from the center."""
         self.is_on_path = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
         bearing_before = self._bearing
         self._bearing = math.atan2(east_m, north_m) if self.is_on_path else None
@@ -199,7 +199,7 @@ class LobeCounter:
     """Counts figure eights: two different lobes in a row are one figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
-        # A vehicle is in a lobe if it is farther than this from the centre along the axis.
+        # A vehicle is in a lobe if it is farther than this from the center along the axis.
         self._min_along_m = major_m / 2
         self._axis = math.radians(axis_deg)
         self._lobe = 0  # Number of the lobe in which the vehicle was last, 1 or -1; 0 if it was in none yet
@@ -208,7 +208,7 @@ class LobeCounter:
         """True while the vehicle is in one of the lobes, far enough from the crossing to tell them apart."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a position of the vehicle, in metres from the centre.
+        """Process a position of the vehicle, in metres from the center.
 
         Each arrival in another lobe than the previous one counts as half a figure, and so does the first arrival.
         """

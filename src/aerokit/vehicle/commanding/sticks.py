@@ -38,7 +38,7 @@ IGNORE_OVERRIDES = 1 << 1
 
 
 class StickInput(Snapshot):
-    """Stick positions from −1 to 1; 0 is the centre.
+    """Stick positions from −1 to 1; 0 is the center.
 
     ``forward`` is the pitch stick, ``right`` the roll stick; positive ``yaw`` turns clockwise. ``throttle`` −1 is the
     lowest position: a multicopter in a mode that holds altitude descends, a plane has no thrust, a rover reverses.

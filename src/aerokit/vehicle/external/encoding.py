@@ -290,7 +290,7 @@ class MeasurementEncoder:
                 time_usec=self._time_us(value.measured_at),
                 target_num=value.number,
                 frame=frame,
-                # Angles of the target from the centre of the picture, for a camera that looks straight down.
+                # Angles of the target from the center of the picture, for a camera that looks straight down.
                 angle_x=math.atan2(value.right_m, value.down_m),
                 angle_y=-math.atan2(value.forward_m, value.down_m),
                 distance=distance,

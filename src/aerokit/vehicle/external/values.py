@@ -113,7 +113,7 @@ class GpsMeasurement(Snapshot):
 class ObstacleSectors(Snapshot):
     """Distances in metres to obstacles around the vehicle, in at most 72 sectors (OBSTACLE_DISTANCE).
 
-    The first sector is centred on ``first_deg`` clockwise from the nose, each following sector ``step_deg`` further
+    The first sector is centered on ``first_deg`` clockwise from the nose, each following sector ``step_deg`` further
     clockwise. None means that the distance is unknown; infinity means that there is no obstacle within ``max_m``.
     """
 

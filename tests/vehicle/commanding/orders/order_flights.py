@@ -85,7 +85,7 @@ async def go_to_place(place: str, vehicle: Simulated, program: aerokit.Vehicle) 
 
 
 def take_over(vehicle: Simulated) -> None:
-    """Turn the pilot's mode switch, with centred sticks."""
+    """Turn the pilot's mode switch, with centered sticks."""
     if isinstance(vehicle, SimulatedCopter):
         vehicle.rc[2] = 1500
     turn_switch(vehicle)

@@ -195,8 +195,8 @@ export class MapView {
 
   // Lines in steps of 1, 2 or 5 times a power of ten metres, at least 80 pixels apart.
   drawGrid() {
-    const view = this.leaflet.getBounds(), centre = this.leaflet.getSize().divideBy(2);
-    const metres = this.leaflet.containerPointToLatLng(centre).distanceTo(this.leaflet.containerPointToLatLng(centre.add([80, 0])));
+    const view = this.leaflet.getBounds(), center = this.leaflet.getSize().divideBy(2);
+    const metres = this.leaflet.containerPointToLatLng(center).distanceTo(this.leaflet.containerPointToLatLng(center.add([80, 0])));
     const power = 10 ** Math.floor(Math.log10(metres)), step = power * [1, 2, 5, 10].find((each) => each * power >= metres);
     const { lat } = view.getCenter();
     this.put("grid", [view.toBBoxString()], () => {
