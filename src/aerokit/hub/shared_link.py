@@ -138,7 +138,7 @@ class SharedLink(Link):
 
 
 def _frames(data: bytes) -> Iterator[bytes]:
-    """Split data that a hub writes into its frames."""
+    """Yield the single frames of data that a hub writes."""
     begin = 0
     while begin < len(data):
         payload_length = data[begin + 1]

@@ -82,8 +82,8 @@ class LogDownload(Transfer[int]):
         self._requested_blocks = 0  # number of requested blocks of the current range
         self._received_blocks = 0
         self._early_ends = 0  # number of short blocks before the end of the log
-        # False while the last range, or an earlier download into the same `Reassembly`, may have left long gaps.
-        self._has_checked_gaps = not into.gaps
+        # True if the previous range, or an earlier download into the same `Reassembly`, may have left long gaps.
+        self._may_have_long_gaps = bool(into.gaps)
 
     def start(self, now: float) -> None:
         self._start_clock(now)
@@ -168,13 +168,13 @@ class LogDownload(Transfer[int]):
 
     def _request_gaps(self, now: float) -> None:
         """After the end of a range, request its long gaps one after the other, then all other missing blocks."""
-        if not self._has_checked_gaps:
+        if self._may_have_long_gaps:
             gap = self._first_long_gap()
             if gap is not None:
                 start, end = gap
                 self._stream_range(start, end, now)
                 return
-            self._has_checked_gaps = True
+            self._may_have_long_gaps = False
             for offset in self._reassembly.gaps:
                 self._requests.request(offset)
         for offset in self._requests.take_due(now):
@@ -201,7 +201,7 @@ class LogDownload(Transfer[int]):
         self._latest_offset = start - LOG_BLOCK
         self._received_blocks = 0
         self._is_streaming = True
-        self._has_checked_gaps = False
+        self._may_have_long_gaps = True
         self._stream.on_request(now)
         self._request(start, self._range_end - start)
 

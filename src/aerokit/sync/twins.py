@@ -3018,7 +3018,7 @@ class CameraBlock(BlockTwin["AsyncCameraBlock"]):
     """An operation of a camera for the duration of an ``async with`` block.
 
     The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. If the vehicle's block exits first, the command is sent then. The command does not undo a newer order.
+    acknowledged. If the vehicle's block exits first, the command is sent then. It is not sent after a newer order.
     """
 
 
@@ -4164,9 +4164,9 @@ class Vehicle(VehicleTwin):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
-        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees, which
-        has no frame; ``frame`` must then be 0, and the command one whose altitude is always above mean sea level. Other
-        arguments and errors are those of :meth:`command`.
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with ``x`` and ``y``
+        in degrees. COMMAND_LONG has no frame, so ``frame`` must be 0 then, and the altitude of this command must always
+        be above mean sea level. Other arguments and errors are those of :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,

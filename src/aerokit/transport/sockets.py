@@ -84,7 +84,7 @@ def discard_on_close(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
-def readable_check(sock: socket.socket) -> Callable[[], object]:
+def make_readable_check(sock: socket.socket) -> Callable[[], object]:
     """Return a function that tells whether data can be read. It takes a third of the time of a failed read."""
     if sys.platform == "win32":  # Windows has no poll(), so a read is always attempted.
         return lambda: True

@@ -22,7 +22,7 @@ from aerokit.transport.sockets import (
     SocketAddress,
     bind_to,
     bound_socket,
-    readable_check,
+    make_readable_check,
     resolve,
 )
 
@@ -77,7 +77,7 @@ class _UdpLink(BaseLink):
         self._transport_owns_socket = False
         self._burst_listener = self._receiver if isinstance(self._receiver, BurstListener) else None
         self._socket = sock = await self._make_socket()
-        self._has_more = readable_check(sock)
+        self._has_more = make_readable_check(sock)
         _enlarge_buffer(sock)
         try:
             self._loop.add_reader(sock, self._on_readable)

@@ -395,9 +395,9 @@ class CopterAuto(MissionMode):
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
-        """Start a leg to the place of an item, and stop there.
+        """Start a leg to the place of an item.
 
-        The copter does not stop at a waypoint without a delay if one of `_NO_STOP_IF_FOLLOWED_BY` follows.
+        The copter stops there, except at a waypoint with no delay that one of `_NO_STOP_IF_FOLLOWED_BY` follows.
         """
         run = self.vehicle.mission
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0

@@ -65,7 +65,7 @@ class CalibrationRun:
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
         # Holds the order that cancels the calibration. The arbiter keeps this order until the stack is closed.
         self._cancel_order_stack = ExitStack()
-        self._sent_cancel: SentCommand | None = None
+        self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
         self._is_abandoned = False
         # True from the first cancel command on, until the vehicle has confirmed the cancellation.
@@ -158,7 +158,7 @@ class CalibrationRun:
         # When another party takes over, the arbiter ends this order, and `_confirm_cancel` then sends no more cancel
         # commands.
         order = self._cancel_order_stack.enter_context(arbiter.auxiliary_order())
-        self._sent_cancel = self._cancel_order_stack.enter_context(arbiter.sending(order))
+        self._cancel_command_status = self._cancel_order_stack.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel_command)
         self._is_unconfirmed = True
@@ -187,7 +187,10 @@ class CalibrationRun:
         self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
-        """Send the cancel command if it was not sent yet; repeat it until the vehicle confirms the cancellation."""
+        """Send the cancel command if it was not sent yet; repeat it until the vehicle confirms the cancellation.
+
+        It is sent at most `MAX_CANCEL_ATTEMPTS` times, and not after a reboot or a takeover.
+        """
         assert self._cancel_command is not None
         command = self._cancel_command[0]
         must_send = self._cancel_sent_at is None  # `abandon` has sent the first command, unless the vehicle was silent.
@@ -196,7 +199,7 @@ class CalibrationRun:
                 if must_send:
                     # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                     await self.session.wait_for_heartbeat(self._cancel_sent_at)
-                    is_taken_over = self._sent_cancel is not None and bool(self._sent_cancel.end)
+                    is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
                     if self._has_rebooted or is_taken_over:
                         # A reboot has ended the calibration. After a takeover, the command might disturb the other
                         # party.

@@ -182,9 +182,10 @@ class CaptureLog:
         """Store ArduPilot's report of a picture. Its index has 16 bits, so it may return to 0."""
         number = message.cam_idx + 1
         highest = self._highest
-        has_wrapped = highest is not None and highest.capture.index > HALF_RANGE
-        # Before the first picture, ArduPilot sends a message of zeros, which is not a capture.
-        if (message.img_idx > 0 or has_wrapped) and number == self._link.number:
+        # Before the first picture, ArduPilot sends a message of zeros, which is not a capture. An index of 0 belongs to
+        # a picture only if the indices may have returned to 0.
+        may_have_wrapped = highest is not None and highest.capture.index > HALF_RANGE
+        if (message.img_idx > 0 or may_have_wrapped) and number == self._link.number:
             self._add(message, from_feedback(message, number, self._link.now()))
 
     def _on_trigger(self, message: m.CameraTrigger) -> None:

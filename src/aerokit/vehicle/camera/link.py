@@ -350,7 +350,7 @@ class CameraBlock:
     """An operation of a camera for the duration of an ``async with`` block.
 
     The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. If the vehicle's block exits first, the command is sent then. The command does not undo a newer order.
+    acknowledged. If the vehicle's block exits first, the command is sent then. It is not sent after a newer order.
     """
 
     def __init__(

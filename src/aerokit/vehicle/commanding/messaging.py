@@ -220,9 +220,9 @@ class MessagingActions(VehicleBase):
         """Send any MAV_CMD as COMMAND_INT: param1 to param4, ``x``, ``y``, ``z`` in ``frame`` (MAV_FRAME).
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
-        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with degrees, which
-        has no frame; ``frame`` must then be 0, and the command one whose altitude is always above mean sea level. Other
-        arguments and errors are those of :meth:`command`.
+        ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with ``x`` and ``y``
+        in degrees. COMMAND_LONG has no frame, so ``frame`` must be 0 then, and the altitude of this command must always
+        be above mean sea level. Other arguments and errors are those of :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: it must be MAV_FRAME_GLOBAL (0)")

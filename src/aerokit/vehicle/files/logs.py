@@ -436,9 +436,10 @@ async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -
 
 
 async def _have_numbers_wrapped(files: Files, directory: str, highest: int, idle_timeout_s: float) -> bool:
-    """Return True if ArduPilot has begun to number its files from 1 again, so that log 1 is not the lowest number.
+    """Return True if ArduPilot has begun to number its files from 1 again.
 
-    LASTLOG.TXT contains the number of the newest log. ``highest`` is the highest number of a file.
+    The file with the lowest number is then not the oldest. LASTLOG.TXT contains the number of the newest log.
+    ``highest`` is the highest number of a file.
     """
     try:
         text = await files.read(f"{directory}/LASTLOG.TXT", idle_timeout_s=idle_timeout_s)
