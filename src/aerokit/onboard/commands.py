@@ -10,9 +10,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.mavlink.messages import CommandAck
 from aerokit.missions.item import command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
@@ -94,14 +96,23 @@ class CommandRequest:
 
 
 def outcome_of(value: object) -> Outcome:
-    """Convert the return value of a handler: None and True mean ACCEPTED, False FAILED, a number is a MAV_RESULT."""
+    """Convert the return value of a handler: None and True mean ACCEPTED, False FAILED, a number is a MAV_RESULT.
+
+    Raises:
+        TypeError: COMMAND_ACK cannot carry the value.
+    """
     if value is None or value is True:
         return Outcome(MavResult.ACCEPTED)
+    outcome = Outcome(MavResult.FAILED)
     if isinstance(value, CommandResult):
-        return Outcome(value.result, progress=value.progress, detail=value.detail)
-    if isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
-        return Outcome(int(value))
-    return Outcome(MavResult.FAILED)
+        outcome = Outcome(value.result, progress=value.progress, detail=value.detail)
+    elif isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
+        outcome = Outcome(int(value))
+    try:
+        CommandAck(0, *outcome).encode()
+    except InvalidArgument as error:
+        raise TypeError(f"the function returned {short_repr(value)}, which is no result: {error}") from None
+    return outcome
 
 
 def overrides(driver: object, base: type, name: str) -> bool:
@@ -237,11 +248,12 @@ class ComponentCommands:
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
             returned = self.begin(function, request, *values)
+            outcome = None if inspect.isawaitable(returned) else outcome_of(returned)
         except Exception as error:
             self._finish_with_error(running, function, error)
             return
-        if not inspect.isawaitable(returned):
-            self._running.finish(running, outcome_of(returned))
+        if outcome is not None:
+            self._running.finish(running, outcome)
             return
 
         async def run() -> None:
@@ -251,7 +263,8 @@ class ComponentCommands:
             task = asyncio.current_task()
             await self._finish_when_done(running, function, returned)
 
-        self._tasks.start(run, f"aerokit {command_name(command.command)}")
+        if self._tasks.start(run, f"aerokit {command_name(command.command)}") is None:  # The component is closing.
+            cancel()
 
     async def _finish_when_done(
         self, running: RunningCommand, function: Callable[..., Any], returned: Awaitable[Any]
