@@ -401,6 +401,27 @@ async def test_winch_pays_out_and_retracts() -> None:
     assert spool.length_m == 0.0
 
 
+async def test_hold_stops_winch_that_pays_out() -> None:
+    class Holding(Spool):
+        is_held = False
+
+        async def hold(self) -> None:
+            self.is_held = True
+
+    spool = Holding()
+    pay_out, hold = WinchActions.RELATIVE_LENGTH_CONTROL, WinchActions.HOLD
+    async with payload_and_station(component_id=169, type=MavType.WINCH) as (component, station):
+        component.add_winch(spool)
+        station.connection.send(station.command_long(MavCmd.DO_WINCH, 1, pay_out, 50, 1))
+        await asyncio.sleep(0.05)
+        with station.collecting(m.CommandAck) as acks:
+            station.connection.send(station.command_long(MavCmd.DO_WINCH, 1, pay_out, 20, 1))
+            station.connection.send_as(FrameEncoder(200, 190), station.command_long(MavCmd.DO_WINCH, 1, hold))
+            await asyncio.sleep(60.0)
+    assert [ack.result for ack in acks] == [MavResult.TEMPORARILY_REJECTED, MavResult.CANCELLED, MavResult.ACCEPTED]
+    assert (spool.is_held, spool.length_m) == (True, 0.0)
+
+
 class Model(AutopilotDriver):
     def __init__(self) -> None:
         self.calls: list[object] = []
@@ -436,6 +457,27 @@ async def test_autopilot_executes_commands_and_reports_them_in_heartbeat() -> No
     assert model.calls == ["arm", 7, 12.5, "disarm"]
     assert heartbeat.base_mode & MavModeFlag.SAFETY_ARMED
     assert raised.value.result == MavResult.UNSUPPORTED
+
+
+async def test_disarm_ends_arming_that_takes_long() -> None:
+    class Slow(Model):
+        async def arm(self, force: bool) -> None:
+            await asyncio.sleep(5.0)
+            self.calls.append("arm")
+
+    model = Slow()
+    async with payload_and_station(component_id=1, type=MavType.QUADROTOR) as (component, station):
+        component.add_autopilot(model)
+        station.connection.send(station.command_long(MavCmd.COMPONENT_ARM_DISARM, 1))
+        await asyncio.sleep(0.05)
+        with station.collecting(m.CommandAck) as acks, station.connection.subscribe(m.Heartbeat) as heartbeats:
+            station.connection.send(station.command_long(MavCmd.COMPONENT_ARM_DISARM, 0))
+            await asyncio.sleep(10.0)
+            heartbeat = heartbeats.get_nowait()
+    assert [ack.result for ack in acks] == [MavResult.ACCEPTED]
+    assert model.calls == ["disarm"]
+    assert heartbeat is not None
+    assert not heartbeat.base_mode & MavModeFlag.SAFETY_ARMED
 
 
 @pytest.mark.parametrize(

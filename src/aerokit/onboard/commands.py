@@ -146,13 +146,24 @@ class ComponentCommands:
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
         host.knows_command = self.handlers.__contains__
 
-    def add(self, command: int, function: Callable[..., Any]) -> None:
-        """Register a handler.
+    def add(
+        self,
+        command: int,
+        function: Callable[..., Any],
+        *,
+        is_stop: Callable[[ReceivedCommand], bool] = lambda _: False,
+    ) -> None:
+        """Register a handler. A command for which ``is_stop`` returns True cancels the one that the handler executes.
 
         Raises:
             InvalidArgument: the command already has a handler, or an annotation of the function is not supported.
         """
-        self.add_handlers({command: partial(self._execute, function, arguments_of(function))})
+
+        def execute(received: ReceivedCommand) -> None:
+            self._execute(function, arguments, received, is_stop=is_stop(received))
+
+        arguments = arguments_of(function)
+        self.add_handlers({command: execute})
 
     def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
         """Register handlers of a protocol server, which check the parameters themselves.
@@ -212,18 +223,23 @@ class ComponentCommands:
         self._running.cancel_all()
 
     def _execute(
-        self, function: Callable[..., Any], arguments: tuple[CommandArgument, ...], command: ReceivedCommand
+        self,
+        function: Callable[..., Any],
+        arguments: tuple[CommandArgument, ...],
+        command: ReceivedCommand,
+        *,
+        is_stop: bool = False,
     ) -> None:
         """Call a handler, and acknowledge the command when the handler returns, raises or is cancelled."""
         task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
         # `cancel` is called after this method has returned, when `returned` and `running` below are set.
-        def cancel() -> None:
+        def cancel() -> bool:
             """Cancel the handler, because the sender of the command or the end of the component requires it."""
             nonlocal is_cancelled
             if task in self._tasks_in_threads:
-                return  # The command cannot be cancelled. Its sender gets the result.
+                return False  # The command cannot be cancelled. Its sender gets the result.
             if task is not None:
                 task.cancel()
             elif not is_cancelled:  # The task has not started yet.
@@ -231,8 +247,9 @@ class ComponentCommands:
                 if inspect.iscoroutine(returned):
                     returned.close()
                 self._running.finish(running, Outcome(MavResult.CANCELLED))
+            return True
 
-        started = self._running.start(command, cancel)
+        started = self._running.start(command, cancel, is_stop=is_stop)
         if started is None:  # start() has answered already: the command is a repetition, or another command is running.
             return
         running = started  # Unlike `started`, this is never None, which type checkers require in the closures.
