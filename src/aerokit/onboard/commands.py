@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import inspect
 import math
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +20,7 @@ from aerokit.mavlink.messages import CommandAck
 from aerokit.missions.item import command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
-from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
+from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, Outcome, RunningCommands
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
 _AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
+MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # One takes a picture of a series, another one checks a mission.
 RELATIVE_FRAMES: frozenset[int] = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
 
 
@@ -144,6 +147,8 @@ class ComponentCommands:
         self._host, self._tasks = host, tasks
         # Tasks that wait for a handler in a thread. They cannot be cancelled, because a thread cannot be stopped.
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
+        # The loop has only a few threads of its own. Handlers that wait there would keep parameters from being saved.
+        self._threads: ThreadPoolExecutor | None = None  # None before the first call in a thread
         host.knows_command = self.handlers.__contains__
 
     def add(
@@ -205,8 +210,11 @@ class ComponentCommands:
     async def _call_in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         task = asyncio.current_task()
         self._tasks_in_threads.add(task)
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="aerokit command")
+        call = partial(contextvars.copy_context().run, function, *arguments)
         try:
-            result = await asyncio.to_thread(function, *arguments)
+            result = await asyncio.get_running_loop().run_in_executor(self._threads, call)
         finally:
             self._tasks_in_threads.discard(task)
         return await result if inspect.isawaitable(result) else result
@@ -221,6 +229,11 @@ class ComponentCommands:
 
     def cancel_all(self) -> None:
         self._running.cancel_all()
+
+    def close(self) -> None:
+        """End the threads that run no handler."""
+        if self._threads is not None:
+            self._threads.shutdown(wait=False)
 
     def _execute(
         self,

@@ -104,6 +104,7 @@ class OnboardComponent:
             try:
                 await run_shielded(self.parameters.aclose())  # A cancelled program must save its parameters too.
             finally:
+                self._commands.close()
                 self._ftp.close()
                 self._host.close()
 
