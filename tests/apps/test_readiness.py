@@ -9,7 +9,8 @@ from flight_harness import in_the_air, open_flight, open_px4
 from aerokit.apps.cli.status import _vehicle_lines
 from aerokit.apps.monitor.lines import VehicleText
 from aerokit.apps.readiness import active_failsafe, not_armable, readiness, run_arming_checks
-from aerokit.mavlink.enums import MavState
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavSeverity, MavState
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 
 pytestmark = pytest.mark.anyio
@@ -89,10 +90,19 @@ async def test_radio_failsafe_is_named_until_it_ends() -> None:
         ]
         assert VehicleText(vehicle).row(is_selected=True, more=True).plain.endswith("failsafe: Radio Failsafe ")
         assert "  failsafe Radio Failsafe" in _vehicle_lines(vehicle, readiness(vehicle))
+        for number in range(100):
+            flight.copter.send_text(MavSeverity.INFO, f"SmartRTL point {number}")
+        await vehicle.status_text.wait_until(lambda text: text.text == "SmartRTL point 99")
+        assert active_failsafe(vehicle) == ["Radio Failsafe"]
         flight.copter.faults.rc_lost = False
         await system_status.wait_until(lambda state: state == MavState.ACTIVE)
         assert active_failsafe(vehicle) is None
         assert dict(VehicleText(vehicle).rows())["missing"].plain == "nothing"
+        await anyio.sleep(3)
+        flight.copter.faults.lose(m.Statustext, times=1000)
+        flight.copter.faults.rc_lost = True
+        await system_status.wait_until(lambda state: state == MavState.CRITICAL)
+        assert active_failsafe(vehicle) == ["no text about its cause was received"]
 
 
 async def test_battery_and_estimator_failsafes_show_newest_texts() -> None:

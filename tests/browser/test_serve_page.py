@@ -71,6 +71,8 @@ def test_page_commands_flight(browser: Any, copters: tuple[list[SimulatedCopter]
         wait_done(page, "land")
         page.get_by_role("tab", name="Orders").click()
         page.locator("#panel .text", has_text="go to: latitude -35.").wait_for()  # it is drawn with the next frame
+        from_to = re.compile(r"^\d+:\d\d:\d\d– \d+:\d\d:\d\dvehicle 1: land: done")
+        page.locator("#panel .text", has_text=from_to).wait_for()
         picture(page, "orders")
         with page.expect_response("**/api/vehicles/1/track") as track:
             page.reload()

@@ -13,6 +13,7 @@ from page_stage import CHROMIUM, check_contrast, opened, order, picture, serving
 from served_copter import served
 
 import aerokit
+from aerokit.mavlink.messages import MissionAck
 from aerokit.missions import Fence, FencePolygon, Mission, Plan, format_plan, take_off, waypoint
 from aerokit.sim import SimulatedCopter
 from aerokit.testing.track import true_point
@@ -236,6 +237,8 @@ SHOWS_ITEMS = """(wanted) => {
     return JSON.stringify(items.sort()) === JSON.stringify(wanted);
 }"""
 
+PLACE_OF_ITEM = "() => document.querySelector('#map .item').getBoundingClientRect().y"
+
 
 def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
     with page_of(browser) as (copter, page):
@@ -251,8 +254,13 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         page.locator("dialog .detail", has_text="It keeps its rally points, because the file has none.").wait_for()
         page.wait_for_function(SHOWS_ITEMS, arg=["1", "2"])
         picture(page, "preview")
-        cancel(page)
+        place_before = page.evaluate(PLACE_OF_ITEM)
+        page.click("#zoom-in")
+        page.wait_for_function(f"before => ({PLACE_OF_ITEM})() !== before", arg=place_before)
+        assert page.locator("#orders").evaluate("orders => orders.inert")
+        page.keyboard.press("Escape")
         page.locator("dialog[open]").wait_for(state="detached")
+        assert not page.locator("#orders").evaluate("orders => orders.inert")
         page.wait_for_function(SHOWS_ITEMS, arg=[])
         far = here.offset(east_m=25_000)
         plan = Plan(Mission([waypoint(far.latitude_deg, far.longitude_deg, altitude_relative_m=15)]))
@@ -260,6 +268,22 @@ def test_upload_dialog_previews_plan_on_map(browser: Any) -> None:
         text = re.compile(r"Its first place is 24\.9 km east of the vehicle: is this the plan for this vehicle\?")
         page.locator("dialog .facts", has_text=text).wait_for()
         picture(page, "far-plan")
+
+
+def test_mission_of_another_station_replaces_shown_mission(browser: Any) -> None:
+    with page_of(browser) as (copter, page):
+        place = true_point(copter)
+        at = place.latitude_deg, place.longitude_deg
+        missions = [Mission([waypoint(*at, altitude_relative_m=height)]) for height in (11, 22)]
+        page.evaluate(DROP, ["first.plan", format_plan(Plan(missions[0]))])
+        page.locator("dialog[open]").wait_for()
+        page.click("dialog .yes")
+        wait_done(page, "upload first.plan")
+        page.get_by_role("tab", name="Mission").click()
+        page.locator("#panel tr", has_text="11.0 m").wait_for()
+        copter.missions.replace(0, missions[1].to_items(home_is_item_0=True))
+        copter.send(MissionAck(254, 190, 0))
+        page.locator("#panel tr", has_text="22.0 m").wait_for()
 
 
 def test_orders_tell_when_mission_finished(browser: Any) -> None:

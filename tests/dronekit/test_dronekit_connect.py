@@ -84,8 +84,8 @@ def test_connect_failure_has_short_traceback(failing: object, monkeypatch: pytes
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
 def test_ctrl_c_during_connect_has_short_traceback() -> None:
     before = threading.enumerate()
-    timer = interrupt_soon()
     with pytest.raises(KeyboardInterrupt) as caught:
+        timer = interrupt_soon()
         dronekit.connect("udpin:127.0.0.1:0")
     timer.join()
     assert len(caught.traceback) <= 3

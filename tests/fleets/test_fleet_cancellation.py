@@ -11,8 +11,11 @@ from fleet_stage import open_stage
 from flight_harness import attached_sinks, now, waiting_on_cells
 
 from aerokit.errors import OperationRejected
+from aerokit.fleets.events import PolicyCompleted
 from aerokit.fleets.formation import Formation
 from aerokit.fleets.members import Member, MemberState
+from aerokit.mavlink.enums import MavCmd
+from aerokit.missions import Mission, land, take_off
 from aerokit.sim import SimulatedCopter
 
 pytestmark = pytest.mark.anyio
@@ -171,3 +174,32 @@ async def test_following_entered_twice_raises() -> None:
         await anyio.sleep(2)
         with pytest.raises(OperationRejected, match="the leader north/1 is taken over"):
             stage.fleet.following(Formation.line(["north/2"], 8.0), leader="north/1")
+
+
+async def test_program_error_in_upload_orders_no_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        broken = stage.fleet.vehicles["north/2"]
+
+        async def upload(*_: Any, **__: Any) -> None:
+            await anyio.sleep(5)
+            raise ZeroDivisionError
+
+        monkeypatch.setattr(broken.mission, "upload", upload)
+        with pytest.raises(ZeroDivisionError):
+            await stage.fleet.upload(dict.fromkeys(stage.copters, Mission([take_off(altitude_relative_m=8), land()])))
+        await anyio.sleep(3)
+        assert not stage.orders_to("north/1")
+
+
+async def test_policy_orders_cancelled_by_fleet_exit_are_errors() -> None:
+    completed: list[PolicyCompleted] = []
+    async with open_stage(2, on_error="land_others") as stage:
+        await stage.take_off()
+        stage.fleet._context.bus.attach_event(PolicyCompleted, completed.append)
+        stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
+        flying = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(3)
+        assert stage.mode_of("north/2") == "LAND"
+    assert [list(event.errors) for event in completed] == [["north/2"]]
+    await asyncio.wait([flying], timeout=1)

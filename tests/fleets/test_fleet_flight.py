@@ -23,7 +23,8 @@ from aerokit.fleets.events import (
 )
 from aerokit.fleets.members import Member, MemberState
 from aerokit.fleets.policy import MemberFailure, PolicyName, PolicyOrder
-from aerokit.mavlink.enums import MavCmd
+from aerokit.mavlink.enums import MavCmd, MavState
+from aerokit.mavlink.messages import GlobalPositionInt
 from aerokit.position import Position
 
 pytestmark = pytest.mark.anyio
@@ -362,3 +363,68 @@ async def test_failed_landing_does_not_stop_other_landings() -> None:
         assert stage.copters["north/1"].motion.is_on_ground
         assert stage.copters["north/3"].motion.is_on_ground
         assert not stage.events(PolicyApplied)
+
+
+async def test_failure_during_policy_of_another_is_decided_too() -> None:
+    """Both members of a lost link fail at once; only the second one's group has a policy with orders."""
+    async with open_stage(
+        2,
+        networks=("north", "south"),
+        groups={"camera": ["south/1"]},
+        on_error_by_group={"camera": "continue_others"},
+    ) as stage:
+        await stage.take_off()
+        flying = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(3)
+        stage.wires["south"].lose()
+        result = await flying
+        assert set(result.failed) == {"south/1", "south/2"}
+        assert set(result.stopped) == {"north/1", "north/2"}
+        assert stage.modes["north/1"] == stage.modes["north/2"] == "BRAKE"
+
+
+async def test_function_named_like_safe_action_has_policy() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        stage.copters["north/1"].faults.refuse(MavCmd.DO_REPOSITION)
+
+        async def land(member: Member) -> None:
+            await member.vehicle.go_to(member.vehicle.position.value.offset(north_m=300))
+
+        result = await stage.fleet.do(land)
+        assert (list(result.failed), list(result.stopped)) == (["north/1"], ["north/2"])
+        assert stage.mode_of("north/2") == "BRAKE"
+
+
+async def test_barrier_named_like_safe_action_has_policy() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        with pytest.raises(FleetError, match="hold"):
+            await stage.fleet.barrier(lambda member: member.name == "north/2", timeout=1, description="hold")
+        assert stage.modes_ordered("north/2") == ["BRAKE"]
+
+
+async def test_wait_at_altitude_rejects_old_position() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        stage.copters["north/2"].faults.lost_messages[GlobalPositionInt.ID] = 10_000
+        await anyio.sleep(3)
+        with pytest.raises(FleetError, match="wait_at_altitude") as caught:
+            await stage.fleet.wait_at_altitude(10, tolerance_m=2, timeout=2)
+        assert "within 2 s by north/2" in str(caught.value.errors["north/2"])
+
+
+async def test_member_repeated_failsafe_counts_after_end_while_disarmed() -> None:
+    async with open_stage(2) as stage:
+        copter, member = stage.copters["north/2"], stage.fleet.members["north/2"]
+        await stage.take_off()
+        cell = member.vehicle.system_status
+        copter.faults.rc_lost = True
+        await cell.wait_until(lambda state: state == MavState.CRITICAL, timeout=10)
+        stage.fleet.reclaim("north/2")
+        assert member._ignored_failsafe == MavState.CRITICAL
+        (await stage.fleet.land()).raise_for_errors()
+        copter.faults.rc_lost = False
+        await cell.wait_until(lambda state: state == MavState.STANDBY, timeout=10)
+        await anyio.sleep(1)
+        assert member._ignored_failsafe is None

@@ -18,7 +18,7 @@ from aerokit.errors import (
     OperationRejected,
     SubscriptionOverflow,
 )
-from aerokit.fleets.events import FleetEvent, MemberEvent, MemberTakenOver, StateUpdate
+from aerokit.fleets.events import FleetEvent, MemberEvent, MemberReclaimed, MemberTakenOver, StateUpdate
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.policy import FleetResult, MemberFailure, PolicyRules
 from aerokit.missions import Mission
@@ -65,6 +65,17 @@ async def test_fleet_numbers_unnamed_networks_and_selects_system_ids() -> None:
         aerokit.fleet(one, two, system_ids={"1": [3, 1]}) as fleet,
     ):
         assert list(fleet.members) == ["1/1", "1/3", "2/2"]
+
+
+async def test_fleet_keeps_number_as_name_of_vehicle() -> None:
+    async with (
+        simulated_link(copters(1)) as one,
+        simulated_link(copters(2)) as two,
+        aerokit.connect(one) as named,
+        aerokit.connect(two) as unnamed,
+        aerokit.fleet({"7": named}, unnamed) as fleet,
+    ):
+        assert list(fleet.members) == ["7", "2/2"]
 
 
 async def test_fleet_vehicle_already_connected_is_not_duplicated() -> None:
@@ -293,3 +304,15 @@ def test_blocking_twin_flies_fleet() -> None:
 
 def test_fleet_twins_match_generator_output() -> None:
     assert FILES["fleet_twins"].read_text(encoding="utf-8") == generate("fleet_twins")
+
+
+async def test_events_of_base_class_has_events_of_fleet_and_vehicles() -> None:
+    async with open_stage(1) as stage:
+        with stage.fleet.events(events.Event) as received:
+            stage.fleet.release("north/1")
+            stage.fleet.reclaim("north/1")
+            await stage.fleet.set_mode("GUIDED")
+            found = set()
+            while (event := received.get_nowait()) is not None:
+                found.add(type(event))
+            assert found == {MemberReclaimed, MemberEvent}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from typing import Any
 
 import anyio
 import pytest
@@ -13,6 +14,7 @@ from aerokit import messages as m
 from aerokit.errors import (
     FleetError,
     InvalidArgument,
+    LinkLost,
     OperationRejected,
     SetpointStreamStopped,
     ValueUnknownError,
@@ -22,7 +24,7 @@ from aerokit.fleets.formation import Formation, Offset, follow_velocity
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
-from aerokit.missions import Mission, land, return_to_launch, take_off, waypoint
+from aerokit.missions import Mission, land, region_of_interest, return_to_launch, take_off, waypoint
 from aerokit.position import Position
 from aerokit.protocols.rtcm import crc24q
 from aerokit.sim import SimulatedPx4, simulated_link
@@ -502,3 +504,110 @@ async def test_target_or_mission_too_far_away_is_rejected() -> None:
         with pytest.raises(InvalidArgument, match=r"missions\['north/2'\], item 0 = .*max_distance_m"):
             await stage.fleet.upload({"north/2": mission})
         assert stage.orders_to("north/1") == stage.orders_to("north/2") == []
+
+
+async def test_send_corrections_reaches_other_links_after_loss_of_one() -> None:
+    async with open_stage(1, networks=("north", "south")) as stage:
+        stage.clear()
+        stage.wires["north"].lose()
+        body = b"\xd3\x00\x04" + bytes(4)
+        with pytest.raises(LinkLost, match="unplugged"):
+            stage.fleet.send_corrections(body + crc24q(body).to_bytes(3, "big"))
+        assert len(stage.wires["south"].all(m.GpsRtcmData)) == 1
+
+
+async def test_wait_missions_finished_without_missions_is_rejected() -> None:
+    async with open_stage(1) as stage:
+        with pytest.raises(OperationRejected, match="had no mission for these members"):
+            await stage.fleet.wait_missions_finished()
+
+
+async def test_go_to_with_outdated_plan_sends_nothing() -> None:
+    async with open_stage(3, spacing_m=20) as stage:
+        await stage.take_off()
+        fleet = stage.fleet
+        here = {name: vehicle.position.value for name, vehicle in fleet.vehicles.items()}
+        targets = {name: here[name].offset(north_m=10) for name in ("north/1", "north/2")}
+        plan = fleet.plan_separation(targets, min_distance_m=5)
+        assert plan.decision == "clear"
+        await fleet.vehicles["north/1"].go_to(here["north/1"].offset(up_m=8))
+        stage.clear()
+        others = {**targets, "north/3": here["north/3"].offset(north_m=10)}
+        elsewhere = {**targets, "north/2": here["north/2"].offset(north_m=14)}
+        for wrong, match in (
+            (targets, "north/1 has moved"),
+            (others, "north/1 has moved"),
+            ({"north/2": targets["north/2"]}, "north/1 became unavailable"),
+        ):
+            with pytest.raises(OperationRejected, match=f"go_to: {match}.*; nothing was sent"):
+                await fleet.go_to(wrong, separation=plan)
+        plan = fleet.plan_separation(targets, min_distance_m=5)
+        for wrong, match in (
+            (others, "the separation was planned without north/3"),
+            (elsewhere, "the separation was planned for another target of north/2"),
+        ):
+            with pytest.raises(OperationRejected, match=f"go_to: {match}; nothing was sent"):
+                await fleet.go_to(wrong, separation=plan)
+        assert not any(map(stage.orders_to, stage.copters))
+
+
+async def test_go_to_in_layers_staggers_starts() -> None:
+    async with open_stage(2, spacing_m=40, min_distance_m=5.0) as stage:
+        await stage.take_off()
+        (await stage.fleet.go_to(swapped(stage), stagger_s=3)).raise_for_errors()
+        first, second = (stage.orders_to(name)[0][0] for name in stage.copters)
+        assert second - first == pytest.approx(3, abs=0.3)
+
+
+async def test_formation_needs_recent_heading_of_leader(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        leader = stage.copters["north/1"]
+        send = leader.send
+
+        def send_without_heading(message: Any, *arguments: Any) -> None:
+            if isinstance(message, m.GlobalPositionInt):
+                message.hdg = 2**16 - 1
+            send(message, *arguments)
+
+        monkeypatch.setattr(leader, "send", send_without_heading)
+        leader.faults.lost_messages[m.VfrHud.ID] = 10_000
+        line = Formation.line(["north/2"], 8.0)
+        with pytest.raises(SetpointStreamStopped, match="north/1: heading_deg is"):
+            async with stage.fleet.following(line, leader="north/1") as following:
+                with anyio.fail_after(3):
+                    await following.wait_stopped()
+        await anyio.sleep(1)
+        with pytest.raises(ValueUnknownError, match="north/1: heading_deg is"):
+            await stage.fleet.form(line, leader="north/1")
+        assert stage.mode_of("north/2") == "BRAKE"
+
+
+async def test_compare_missions_includes_way_to_first_item() -> None:
+    """Two copters side by side whose first waypoints are swapped."""
+    async with open_stage(2, spacing_m=20, min_distance_m=5.0) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        here = [vehicle.position.value for vehicle in stage.fleet.vehicles.values()]
+
+        def mission_to(place: Position) -> Mission:
+            first = place.offset(north_m=40)
+            return Mission([take_off(8), waypoint(first.latitude_deg, first.longitude_deg, altitude_relative_m=8)])
+
+        straight = dict(zip(stage.copters, map(mission_to, here), strict=True))
+        assert stage.fleet.compare_missions(straight).decision == "clear"
+        crossing = dict(zip(stage.copters, map(mission_to, reversed(here)), strict=True))
+        plan = stage.fleet.compare_missions(crossing)
+        assert plan.decision == "refused"
+        assert plan.conflicts[0].distance_m == pytest.approx(0, abs=0.2)
+        # A copter on the ground climbs before it flies, so it passes above its neighbour.
+        above = stage.fleet.compare_missions({"north/1": mission_to(here[1]), "north/2": Mission([take_off(20)])})
+        assert above.decision == "clear"
+
+
+async def test_compare_missions_ignores_regions_of_interest() -> None:
+    async with open_stage(2, spacing_m=20, min_distance_m=5.0) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        other = stage.fleet.vehicles["north/2"].position.value
+        looking = Mission([take_off(8), region_of_interest(other, altitude_relative_m=8)])
+        there = Mission([take_off(8), waypoint(other, altitude_relative_m=8)])
+        assert stage.fleet.compare_missions({"north/1": looking, "north/2": there}).decision == "clear"

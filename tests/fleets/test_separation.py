@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit.errors import InvalidArgument
-from aerokit.fleets.paths import LocalPoint, Path, PathPoint, horizontal_distance, min_path_distance
+from aerokit.fleets.paths import (
+    TOLERANCE,
+    LocalPoint,
+    Path,
+    PathPoint,
+    _clip,
+    horizontal_distance,
+    min_path_distance,
+)
 from aerokit.fleets.separation import (
     Route,
     find_conflicts,
@@ -202,3 +210,9 @@ def test_invalid_paths_and_distances_are_rejected() -> None:
         Path("a", [])
     with pytest.raises(InvalidArgument, match="finite"):
         PathPoint(math.nan, 0, 0, 0)
+
+
+def test_clip_corners_stay_inside_within_tolerance() -> None:
+    square = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+    clipped = _clip(square, lambda s, t: (0.9 + 0.2 * s) * TOLERANCE)
+    assert all(0 <= s <= 1 and 0 <= t <= 1 for s, t in clipped)

@@ -18,9 +18,11 @@ from aerokit.errors import FileFormatError, FleetError, InvalidArgument, Operati
 from aerokit.fleets.opening import fleet
 from aerokit.fleets.paths import LocalPoint, Path, PathPoint
 from aerokit.fleets.show import Show, state_at
-from aerokit.fleets.show_flight import max_relative_error, track_deviation
+from aerokit.fleets.show_flight import max_relative_error, measure_clock, track_deviation
+from aerokit.mavlink import FrameEncoder
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.transport.link import Peer
 
 pytestmark = pytest.mark.anyio
 
@@ -192,11 +194,13 @@ def test_show_file_round_trip(tmp_path: FilePath) -> None:
         ("name,t_s,north_m,east_m,up_m\na,0,nan,2,3\n", "finite"),
         ("name,t_s,north_m,east_m,up_m\na,1,1,2,3\na,1,5,2,3\n", "two positions"),
         ("name,t_s,north_m,east_m,up_m\n", "a show needs at least one"),
+        ("name,t_s,north_m,east_m,up_m\na,0,1,2,3\n" + "a" * 200_000, "line 3: field larger than field limit"),
         ("{", "not JSON"),
         ('{"format": "other"}', "not a show"),
         ('{"format": "aerokit show", "version": 1}', 'the "tracks" of the show must be a JSON object'),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": [[0, 1]]}}', "track 'a'"),
         ('{"format": "aerokit show", "version": 1, "tracks": {"a": 5}}', "track 'a'"),
+        (f'{{"format": "aerokit show", "version": 1, "tracks": {{"a": [[1{"0" * 400}, 0, 0, 0]]}}}}', "track 'a'"),
     ],
 )
 def test_show_damaged_file_error_has_location(text: str, match: str, tmp_path: FilePath) -> None:
@@ -246,3 +250,22 @@ def test_max_relative_error_compares_vectors_between_vehicles() -> None:
     assert max_relative_error(paths, {"a": shifted(1), "b": shifted(-0.5)}, 20) == pytest.approx(1.5)
     assert max_relative_error(paths, {"a": shifted(1)}, 20) is None
     assert all(one < after for one, after in pairwise(times))
+
+
+async def test_clock_is_measured_beside_component_that_answers_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = FrameEncoder(1, 100)
+    async with open_stage(1) as stage:
+        wire, vehicle = stage.wires["north"], stage.fleet.vehicles["north/1"]
+        sent_before = wire.write
+
+        def write(data: bytes, peer: Peer = None) -> None:
+            sent_before(data, peer)
+            requests = wire.all(m.Timesync)
+            wire.clear()
+            for request in requests:
+                wire.deliver(camera.encode(m.Timesync(5, request.ts1)))
+
+        monkeypatch.setattr(wire, "write", write)
+        offset = await measure_clock(vehicle)
+        assert offset.answers == 8
+        assert offset.offset_s == pytest.approx(stage.copters["north/1"].uptime - vehicle.connection.now(), abs=0.1)

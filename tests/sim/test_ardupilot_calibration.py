@@ -42,6 +42,13 @@ def test_compass_calibration_reports_progress() -> None:
     assert not client.all(m.MagCalReport)
 
 
+def test_calibration_of_missing_compass_fails() -> None:
+    copter, client = ready_copter()
+    assert client.command(MavCmd.DO_START_MAG_CAL, 8) == FAILED
+    assert client.command(MavCmd.DO_START_MAG_CAL, 9) == ACCEPTED
+    assert copter.calibrations.compasses.is_running
+
+
 def test_compass_calibration_without_rotation_makes_no_progress() -> None:
     copter, client = streaming_copter()
     copter.calibrations.compasses.turning_time_s = math.inf

@@ -213,6 +213,12 @@ def test_plane_attitude_target_expires_after_three_seconds() -> None:
     assert abs(math.degrees(vehicle.motion.roll)) < 5.0
 
 
+def test_plane_nan_thrust_is_half_throttle() -> None:
+    vehicle, client = plane()
+    keep(client, attitude(RATES, LEVEL, thrust=math.nan), 20.0)
+    assert vehicle.wing.airspeed_m_s == pytest.approx(vehicle.cruise_m_s, abs=0.5)
+
+
 def test_plane_guided_commands_change_course_speed_altitude() -> None:
     vehicle, client = plane()
     assert client.command(MavCmd.GUIDED_CHANGE_HEADING, 0, 90, 2) == ACCEPTED

@@ -182,3 +182,14 @@ def test_gps_loss_affects_receiver_first_and_estimator_later() -> None:
     copter.faults.gps_lost = False
     client.run(1.0)
     assert client.last(m.EkfStatusReport).flags == 831
+
+
+def test_gps_that_comes_late_is_reported_once() -> None:
+    copter, client = booting(10.0)
+    client.run_until(lambda: "EKF3 IMU0 origin set" in client.texts)
+    copter.faults.gps_lost = True
+    client.run(10.0)
+    assert "EKF3 IMU0 is using GPS" not in client.texts
+    copter.faults.gps_lost = False
+    client.run(5.0)
+    assert client.texts.count("EKF3 IMU0 is using GPS") == 1

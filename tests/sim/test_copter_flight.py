@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from simulated_client import Client, flying_copter, ready_copter, set_mode
@@ -291,6 +292,45 @@ def test_condition_yaw_direction_can_turn_long_way() -> None:
     assert copter.motion.yaw_rate < -0.3
     client.run(15.0)
     assert math.degrees(copter.motion.yaw) == pytest.approx(90, abs=1)
+
+
+def test_relative_turn_over_180_degrees_keeps_direction() -> None:
+    copter, client = flying_copter(heading_deg=0.0)
+    client.command(MavCmd.CONDITION_YAW, 270, 30, 1, 1)
+    client.run(1.0)
+    assert copter.motion.yaw_rate > 0.3
+    client.run(15.0)
+    assert math.degrees(copter.motion.yaw) == pytest.approx(-90, abs=1)
+
+
+def test_condition_yaw_without_direction_is_accepted() -> None:
+    _, client = flying_copter()
+    assert client.command(MavCmd.CONDITION_YAW, 90, 0, math.nan, 0) == MavResult.ACCEPTED
+
+
+def test_attitude_target_with_nan_thrust_holds_altitude() -> None:
+    copter, client = flying_copter()
+    for _ in range(20):
+        client.send(m.SetAttitudeTarget(0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, math.nan))
+        client.run(0.1)
+    assert copter.motion.velocity_down == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"angle_x": math.atan(0.3), "angle_y": math.atan(-0.3), "distance": 12.0}, math.pi / 4),
+        ({"x": 3.0, "y": 3.0, "z": 10.0, "distance": 11.0, "position_valid": 1}, math.pi / 4),
+        ({"x": 3.0, "y": 3.0, "z": 10.0, "distance": 0.0, "position_valid": 1}, None),
+    ],
+)
+def test_landing_target_needs_angles_or_position_with_distance(fields: dict[str, Any], expected: float | None) -> None:
+    copter, client = flying_copter(10.0, heading_deg=0.0, parameters={"PLND_ENABLED": 1.0, "PLND_TYPE": 1.0})
+    values = {"angle_x": 0.0, "angle_y": 0.0, "size_x": 0.0, "size_y": 0.0, **fields}
+    client.send(m.LandingTarget(0, 0, MavFrame.BODY_FRD, **values))
+    north, east = copter.external.velocity_to_target()
+    bearing = math.atan2(east, north) if (north, east) != (0.0, 0.0) else None
+    assert bearing == (expected if expected is None else pytest.approx(expected, abs=0.01))
 
 
 def test_yaw_rate_target_turns_and_expires() -> None:

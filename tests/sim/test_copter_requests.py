@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from simulated_client import Client, flying_copter, ready_copter
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult
+from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult, ParachuteAction, WinchActions
 
 STREAMED_BY_A_REAL_COPTER = {
     "AHRS", "AHRS2", "ATTITUDE", "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESC_TELEMETRY_1_TO_4",
@@ -243,3 +245,39 @@ def test_flight_parameter_takes_effect() -> None:
     client.send(m.SetPositionTargetLocalNed(0, 1, 1, 1, 3576, 100, 0, -10, 0, 0, 0, 0, 0, 0, 0, 0))
     client.run(5.0)
     assert copter.motion.ground_speed_m_s == pytest.approx(2.0, abs=0.05)
+
+
+def test_winch_restarted_within_step_keeps_its_rate() -> None:
+    copter, client = ready_copter(parameters={"WINCH_TYPE": 1.0})
+    for _ in range(3):
+        client.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 0.5)
+        client.command(MavCmd.DO_WINCH, 1, WinchActions.RELAXED)
+    client.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 0.5)
+    client.run(10.0)
+    assert copter.devices.line_m == pytest.approx(5.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("action", "length_m", "rate_m_s", "expected_m"),
+    [
+        (WinchActions.RELATIVE_LENGTH_CONTROL, 0.25, 0.0, 0.25),
+        (WinchActions.RELATIVE_LENGTH_CONTROL, 0.0, 0.0, 0.0),
+        (WinchActions.RELATIVE_LENGTH_CONTROL, math.nan, 0.0, 0.0),
+        (WinchActions.RATE_CONTROL, 0.0, math.nan, 0.0),
+    ],
+)
+def test_winch_stops_at_its_goal(action: int, length_m: float, rate_m_s: float, expected_m: float) -> None:
+    copter, client = ready_copter(parameters={"WINCH_TYPE": 1.0})
+    client.command(MavCmd.DO_WINCH, 1, action, length_m, rate_m_s)
+    client.run(3.0)
+    assert copter.devices.line_m == expected_m
+
+
+def test_parachute_altitude_is_above_home() -> None:
+    copter, client = flying_copter(20.0, parameters={"CHUTE_ENABLED": 1.0})
+    north, east, down = copter.motion.place
+    copter.navigation.set_home((north, east, down + 5.0), lock=True)
+    assert client.command(MavCmd.DO_PARACHUTE, ParachuteAction.RELEASE) == MavResult.ACCEPTED
+    client.run(0.1)
+    assert client.texts[-1] == "Parachute: Too low"
+    assert copter.is_armed

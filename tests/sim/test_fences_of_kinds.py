@@ -103,6 +103,8 @@ def test_plane_return_place_depends_on_parameters() -> None:
     assert plane.missions.fence.store([point], lambda _: None) == 0
     assert plane.fence.return_place() == pytest.approx((300.0, 100.0, home[2] - 70.0), abs=0.1)
     plane.parameters["FENCE_RET_RALLY"] = 1.0
+    plane.parameters["RTL_ALTITUDE"] = -1.0
+    assert plane.fence.return_place() == pytest.approx((home[0], home[1], plane.motion.down), abs=0.1)
     rally_points(plane, (500.0, 0.0, 60.0))
     assert plane.fence.return_place() == pytest.approx((500.0, 0.0, home[2] - 60.0), abs=0.1)
 

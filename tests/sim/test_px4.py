@@ -245,6 +245,15 @@ def test_return_climbs_lands_and_disarms_at_home() -> None:
     assert [(c.target_system, c.target_component, c.command) for c in own] == [(1, 0, MavCmd.NAV_RETURN_TO_LAUNCH)]
 
 
+def test_disarming_after_landing_can_be_turned_off() -> None:
+    px4, client = flying_px4(5.0)
+    px4.parameters["COM_DISARM_LAND"] = 0.0
+    client.command(MavCmd.NAV_LAND)
+    client.run_until(lambda: px4.is_landed, 30.0)
+    client.run(20.0)
+    assert px4.is_armed
+
+
 def test_landing() -> None:
     px4, client = flying_px4(5.0)
     assert client.command(MavCmd.NAV_LAND) == MavResult.ACCEPTED

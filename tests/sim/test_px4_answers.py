@@ -9,7 +9,15 @@ import pytest
 from simulated_client import PX4_HOME, Client
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavState
+from aerokit.mavlink.enums import (
+    MavCmd,
+    MavFrame,
+    MavResult,
+    MavState,
+    MavVtolState,
+    SerialControlDev,
+    SerialControlFlag,
+)
 from aerokit.missions import MissionItem
 from aerokit.sim import SimulatedPx4
 from aerokit.sim.px4.telemetry import BUILDERS
@@ -112,6 +120,47 @@ def test_orbit() -> None:
     assert px4.motion.ground_speed_m_s == pytest.approx(4.0, abs=0.5)
     assert client.last(m.OrbitExecutionStatus).radius == 15.0
     assert client.last(m.Heartbeat).base_mode == 145
+
+
+def test_reversed_transition_is_not_ended_by_first_timer() -> None:
+    px4, client = flying()
+    px4.vtol_state = MavVtolState.MC
+    client.command(MavCmd.DO_VTOL_TRANSITION, MavVtolState.FW)
+    client.run(2.0)
+    client.command(MavCmd.DO_VTOL_TRANSITION, MavVtolState.MC)
+    states = []
+    for seconds in (3.0, 2.0):
+        client.run(seconds)
+        states.append(px4.vtol_state)
+    assert states == [MavVtolState.TRANSITION_TO_MC, MavVtolState.MC]
+
+
+def test_tuning_starts_again_after_disarming() -> None:
+    px4, client = flying()
+    client.command(MavCmd.DO_AUTOTUNE_ENABLE, 1)
+    client.run(9.0)
+    client.command(ARM, 0, 21196)
+    client.run(5.0)
+    client.command(ARM, 1)
+    assert px4.is_armed
+    client.command(MavCmd.DO_AUTOTUNE_ENABLE, 1)
+    assert client.last(m.CommandAck).progress == 0
+
+
+def test_shell_line_without_respond_is_forgotten() -> None:
+    _, client = ready()
+    for flags, data in ((0, b"reboot\n"), (SerialControlFlag.RESPOND, b"echo a\n")):
+        client.send(m.SerialControl(SerialControlDev.DEV_SHELL, flags, 0, 0, len(data), data.ljust(70, b"\0")))
+    reply = client.last(m.SerialControl)
+    assert bytes(reply.data[: reply.count]) == b"echo a\na\npxh> "
+
+
+def test_restarted_log_stream_sends_one_stream() -> None:
+    _, client = ready()
+    for command in (MavCmd.LOGGING_START, MavCmd.LOGGING_STOP, MavCmd.LOGGING_START):
+        assert client.command(command) == MavResult.ACCEPTED
+    client.run(1.0)
+    assert len(client.all(m.LoggingDataAcked)) == pytest.approx(20, abs=1)
 
 
 def test_precision_landing_lands() -> None:

@@ -119,6 +119,8 @@ def test_region_of_interest_needs_no_control(client: Client) -> None:
     x, y = there.latitude_e7, there.longitude_e7
     assert client.command_int(roi, MavFrame.GLOBAL_INT, x=x, y=y, z=there.altitude_m) == ACCEPTED
     assert angles(client) == pytest.approx([0, 0, 90], abs=0.5)
+    assert client.command_int(roi, MavFrame.GLOBAL_INT, x=x, y=y, z=there.altitude_m + 500.0) == ACCEPTED
+    assert angles(client) == pytest.approx([0, 45, 90], abs=0.5)
     assert client.command(MavCmd.DO_SET_ROI_NONE) == ACCEPTED
     assert angles(client) == [0, 0, 0]
 

@@ -62,6 +62,15 @@ def test_orbit_of_plane_without_radius_uses_default() -> None:
         assert plane.flight.radius_m == used_radius
 
 
+def test_refused_orbit_of_plane_keeps_target() -> None:
+    plane, client = flying_plane()
+    plane.faults.gps_lost = True
+    client.run(10.0)
+    target = plane.flight.target
+    assert client.command(MavCmd.DO_ORBIT, 150, NAN, 0, NAN, 47.0, 8.0, 700.0) == MavResult.TEMPORARILY_REJECTED
+    assert plane.flight.target == target
+
+
 def test_plane_on_ground_stays_armed() -> None:
     plane, client = ready_plane()
     assert client.command(MavCmd.COMPONENT_ARM_DISARM, 1) == MavResult.ACCEPTED

@@ -129,6 +129,13 @@ def test_waypoints_are_passed_in_order() -> None:
     assert places[1] == pytest.approx((60.0, 15.0), abs=0.5)
 
 
+def test_relative_turn_over_180_degrees_keeps_direction_in_mission() -> None:
+    copter, client = start(CLIMB, item(MavCmd.CONDITION_YAW, 2, 270.0, 20.0, 0.0, 1.0), fly_to(10, hold=60.0))
+    client.run_until(lambda: "Mission: 2 CondYaw" in client.texts)
+    client.run(2.0)
+    assert copter.motion.yaw_rate > 0.3
+
+
 def test_landing_ends_the_mission() -> None:
     copter, client = start(CLIMB, fly_to(20), item(LAND, 3, x=north(20), y=EAST))
     client.run_until(lambda: not copter.is_armed, 120.0)

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated_client import Client
 
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavParamError, MavParamType
 from aerokit.mavlink.message import Message
@@ -55,6 +56,13 @@ def answers(client: Client, message: Message, seconds: float = 0.1) -> list[m.Pa
 def bits_of(message: m.ParamValue) -> int:
     assert message.received_frame is not None
     return int.from_bytes(message.received_frame.payload[:4], "little")
+
+
+def test_change_with_unknown_name_sets_nothing() -> None:
+    copter, _ = a_copter()
+    with pytest.raises(InvalidArgument, match="RTL_ALTT"):
+        copter.parameters.change({"WPNAV_SPEED": 300.0, "RTL_ALTT": 1.0})
+    assert copter.parameters["WPNAV_SPEED"] != 300.0
 
 
 # ---------------------------------------------------------------------------------------- tables

@@ -170,6 +170,16 @@ def test_silent_and_frozen_faults() -> None:
     assert client.command(MavCmd.DO_SEND_BANNER) == 0
 
 
+def test_missed_calls_do_not_follow_a_freeze() -> None:
+    copter, client = ready_copter(components=(ExtraComponent(154),))
+    copter.faults.frozen = True
+    client.run(10.0)
+    copter.faults.frozen = False
+    client.run(3.0)
+    components = [h.received_frame.component_id for h in client.all(m.Heartbeat) if h.received_frame]
+    assert components.count(154) == 3
+
+
 def test_heartbeats_stop_alone() -> None:
     copter, client = ready_copter()
     client.send(m.RequestDataStream(1, 1, MavDataStream.EXTRA1, 4, 1))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 from simulated_client import Client, set_mode
+from vehicles import flying_plane
 
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
@@ -494,3 +495,10 @@ def test_guided_nogps_accepts_attitude_targets_only() -> None:
     assert vehicle.mode.submode != GuidedSubmode.POSITION
     client.send(lean)
     assert vehicle.mode.submode == GuidedSubmode.ATTITUDE
+
+
+def test_motor_of_plane_takes_whole_battery_current() -> None:
+    plane, client = flying_plane()
+    client.command(MavCmd.REQUEST_MESSAGE, m.EscTelemetry1To4.ID)
+    client.run(0.1)
+    assert sum(client.last(m.EscTelemetry1To4).current) == pytest.approx(plane.battery.current_a * 100, rel=0.05)

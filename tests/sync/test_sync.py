@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import pytest
-from ctrl_c import interrupt_soon
+from ctrl_c import interrupt_when, is_waiting_for_loop
 from for_each import for_each
 from served_copter import served, served_copter, without_loop_warnings
 
@@ -31,6 +31,7 @@ from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.missions import Fence, FenceCircle, Mission, waypoint
 from aerokit.sim import SimulatedCopter, SimulatedGimbal
 from aerokit.sync.generator import FILE, generate
+from aerokit.sync.thread_future import ThreadFuture
 from aerokit.vehicle.commanding.guided import Guided, SetpointStream
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 from aerokit.vehicle.files.files import Files
@@ -342,22 +343,29 @@ def test_ctrl_c_cancels_call_and_vehicle_holds(vehicle: aerokit.sync.Vehicle) ->
     vehicle.wait_ready()
     vehicle.arm()
     vehicle.take_off(5)
-    timer = interrupt_soon()
     with pytest.raises(KeyboardInterrupt):
+        interrupt_when(lambda: vehicle.velocity.value.ground_speed_m_s > 1)
         vehicle.go_to(vehicle.position.value.offset(north_m=2000))
-    timer.join()
     vehicle.mode.wait_until(lambda mode: mode.name == "BRAKE", timeout=100)
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
 def test_ctrl_c_cancels_connect() -> None:
-    before = threading.enumerate()
-    timer = interrupt_soon()
+    with pytest.raises(KeyboardInterrupt) as caught:
+        interrupt_when(is_waiting_for_loop)
+        aerokit.sync.connect("udpin:127.0.0.1:0", timeout=60)
+    assert len(caught.traceback) <= 4, "without the places where the library waited"
+    assert loop_threads() == []
+
+
+def test_ctrl_c_while_loop_starts_has_short_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(self: ThreadFuture[Any], timeout: float) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ThreadFuture, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt) as caught:
         aerokit.sync.connect("udpin:127.0.0.1:0", timeout=60)
-    timer.join()
-    assert len(caught.traceback) <= 4, "without the places where the library waited"
-    assert [thread for thread in threading.enumerate() if thread not in before] == []
+    assert len(caught.traceback) <= 4
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")

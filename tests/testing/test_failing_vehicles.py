@@ -24,6 +24,7 @@ from aerokit.testing import Flight, SimulatedFleet, TrackPoint, run_virtual, ser
 from aerokit.testing.failure import failure_report
 from aerokit.testing.interruption import Interruption
 from aerokit.testing.served import ServedFlight
+from aerokit.transport import memory_link_pair
 
 MAX_SLEEP_S = 100.0
 
@@ -142,6 +143,24 @@ def test_vehicle_error_keeps_block_error_as_context() -> None:
                     server.wake()
                 raise LookupError("the program's")
         assert isinstance(caught.value.__context__, LookupError)
+        assert not caught.value.__suppress_context__
+
+    run_virtual(main())
+
+
+def test_error_of_datagram_callback_is_raised_by_server() -> None:
+    def on_datagram(_now: float, _data: bytes, is_from_vehicle: bool) -> None:
+        if not is_from_vehicle:
+            raise_error()
+
+    async def main() -> None:
+        near, far = memory_link_pair()
+        server = SimulatorServer(SimulatedCopter(), far)
+        with pytest.raises(VehicleError):
+            async with server, aerokit.connect(near):
+                server.on_datagram = on_datagram
+                await asyncio.sleep(10)
+                raise AssertionError("it went on")
 
     run_virtual(main())
 

@@ -93,7 +93,7 @@ def test_accepted(text: str, address: LinkAddress) -> None:
     [
         ("", "it is empty"),
         (" \t", "it is empty"),
-        ("zenoh://north", "the name of the vehicle is missing, as in zenoh://fleet/alpha"),
+        ("zenoh://north", "the name of the vehicle is missing; write it as in zenoh://fleet/alpha"),
         ("zenoh:///alpha", "the fleet = '' is not allowed"),
         ("zenohin://north/a/b", "the name = 'a/b' is not allowed"),
         ("zenoh://north/*", "the name = '.' is not allowed"),
@@ -115,7 +115,7 @@ def test_accepted(text: str, address: LinkAddress) -> None:
         ("udpin:a\0b:1", "NUL"),
         ("vehicle", "neither host:port nor the path"),
         ("14550", "neither host:port nor the path"),
-        ("udpin:14550", "the host is missing, as in udpin:127.0.0.1:14550"),
+        ("udpin:14550", "the host is missing; write udpin:127.0.0.1:14550"),
         ("udpin:0.0.0.0", "the port is missing"),
         ("udpin:0.0.0.0:", "the port is missing"),
         ("[::1]", "the port is missing"),

@@ -238,3 +238,44 @@ async def test_bytes_cleared_from_driver_count_as_dropped_write(monkeypatch: pyt
         monkeypatch.undo()
         link.close()
         await link.wait_closed()
+
+
+@each_loop
+async def test_device_that_vanishes_while_opening_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    import termios
+
+    def vanish(*_: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    with far_end() as far:
+        link = SerialLink(far.device)
+        with monkeypatch.context() as patch:
+            patch.setattr(importlib.import_module("serial_asyncio"), "SerialTransport", vanish)
+            with pytest.raises(LinkOpenError, match="Input/output error"):
+                await link.open(Recorder())
+        await link.wait_closed()
+        await link.open(Recorder())  # the port was released
+        link.close()
+        await link.wait_closed()
+
+
+@each_loop
+async def test_close_ends_if_port_cannot_be_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    with far_end() as far:
+        link = SerialLink(far.device)
+        await link.open(Recorder())
+        close = link._port.close
+
+        def fail() -> None:
+            close()
+            raise OSError(errno.EIO, "Input/output error")
+
+        monkeypatch.setattr(link._port, "close", fail)
+        link.close()
+        with anyio.fail_after(100):
+            await link.wait_closed()
+
+
+def test_number_in_baud_rate_is_no_error_number() -> None:
+    error = serial._open_error("serial:///dev/ttyS0:250000", ValueError("Invalid baud rate: 250000"))
+    assert "replay:PATH" not in str(error)

@@ -7,6 +7,7 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import anyio
 import pytest
@@ -22,9 +23,9 @@ from aerokit.mavlink.messages import CommandLong, Heartbeat, ParamRequestList, S
 from aerokit.transport import create_link
 from aerokit.transport import link as needed
 from aerokit.transport.zenoh import listen as zenoh_listen
-from aerokit.transport.zenoh.keys import Stamp, encode_sent_at
+from aerokit.transport.zenoh.keys import RefusalNotice, Stamp, encode_sent_at
 from aerokit.transport.zenoh.listen import CLIENT_TIMEOUT_S, MAX_CLIENTS, ZenohListen
-from aerokit.transport.zenoh.session import LoopQueue
+from aerokit.transport.zenoh.session import LoopQueue, call
 
 CongestionControl = pytest.importorskip("zenoh").CongestionControl
 pytestmark = pytest.mark.anyio
@@ -488,3 +489,70 @@ async def test_payload_larger_than_datagram_is_ignored() -> None:
         await eventually(small_ones_arrive)
         assert {piece for piece, _ in recorder.pieces} == {order}
         assert {piece for piece, _ in answered.pieces} == {b"small"}
+
+
+# ------------------------------------------------------------------------------------ openings that were given up
+
+
+async def test_declarations_of_abandoned_opening_are_ignored() -> None:
+    """A thread cannot be stopped, so it may declare when the link is already opened again."""
+    client_link = create_link("zenoh://north/alpha")
+    vehicle = ZenohListen("north", "alpha")
+    for link, declare in ((client_link, "_declare"), (vehicle, "_find_rivals")):
+        present: Any = link
+        present._queue = LoopQueue(call)
+        getattr(present, declare)(LoopQueue(call), MagicMock(), MagicMock())
+        assert present._declared == []
+        assert present._publisher is None
+    vehicle._serve(LoopQueue(call), MagicMock())
+    assert vehicle._publisher is None
+
+
+async def test_refused_name_can_be_served_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A beacon that made an earlier opening fail is no reason for the next one to fail."""
+    link = ZenohListen("north", "alpha")
+
+    async def open_session(*_: object) -> Any:
+        link._zenoh, link._may_have_rival = pytest.importorskip("zenoh"), True
+        return MagicMock()
+
+    monkeypatch.setattr(zenoh_listen, "open_session", open_session)
+    monkeypatch.setattr(zenoh_listen, "_RIVAL_TIMEOUT_S", 0.001)
+    link._rival_found.set()
+    await link.open(Recorder())
+    link.close()
+    await link.wait_closed()
+
+
+async def test_failed_declaration_is_open_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[threading.Thread] = []
+
+    def fail(*_: object) -> None:
+        threads.append(threading.current_thread())
+        raise pytest.importorskip("zenoh").ZError("session closed")
+
+    link = create_link(f"zenohin://north/alpha?listen=tcp/127.0.0.1:{free_port()}")
+    monkeypatch.setattr(link, "_serve", fail)
+    with pytest.raises(LinkOpenError, match="cannot open zenohin://north/alpha: session closed"):
+        await link.open(Recorder())
+    assert threads != [threading.main_thread()]  # it may block
+    await link.wait_closed()
+
+
+async def test_notice_for_namesake_is_ignored() -> None:
+    link: Any = create_link("zenoh://north/alpha?client=ground")
+    link._receiver = recorder = RefusalRecorder()
+    for nonce in (link._nonce ^ 1, link._nonce, None):
+        link._on_notice(RefusalNotice("COMMAND_LONG", f"{nonce}", None, nonce=nonce).encode(), b"", True)
+    assert [reason for _, reason, _ in recorder.refused] == [str(link._nonce), "None"]
+
+
+async def test_notice_has_nonce_of_refused_datagram(monkeypatch: pytest.MonkeyPatch) -> None:
+    link, sent = ZenohListen("north", "alpha"), list[bytes]()
+    monkeypatch.setattr(link, "_now", lambda: 100.0)
+    monkeypatch.setattr(link, "_put", lambda _key, data, _attachment: sent.append(data))
+    epoch = link._freshness.make_beacon(100.0).epoch
+    link._on_datagram("ground", frame(), Stamp(epoch, 1, 7, 1, "never").encode())
+    link._on_datagram("ground", frame(SET_POINT), Stamp(epoch, 99, 8, 2).encode())
+    notices = [RefusalNotice.decode(data) for data in sent]
+    assert [notice and notice.nonce for notice in notices] == [7, 8]

@@ -47,10 +47,18 @@ def test_stamp_round_trip(epoch: int, number: int, nonce: int, sequence: int, mo
     assert Stamp.decode(stamp.encode()) == stamp
 
 
-@given(st.text(), st.text(), st.none() | names, st.binary(), st.integers(1, 2**31))
-def test_notice_round_trip(message: str, reason: str, lease_holder: str | None, answer: bytes, count: int) -> None:
-    notice = RefusalNotice(message, reason, lease_holder, answer, count)
+@given(st.text(), st.text(), st.none() | names, st.binary(), st.integers(1, 2**31), st.none() | u32)
+def test_notice_round_trip(
+    message: str, reason: str, lease_holder: str | None, answer: bytes, count: int, nonce: int | None
+) -> None:
+    notice = RefusalNotice(message, reason, lease_holder, answer, count, nonce)
     assert RefusalNotice.decode(notice.encode()) == notice
+
+
+@pytest.mark.parametrize("field", ["message", "reason"])
+def test_notice_without_text_is_none(field: str) -> None:
+    fields = json.loads(RefusalNotice("COMMAND_LONG", "read-only").encode())
+    assert RefusalNotice.decode(json.dumps({**fields, field: None}).encode()) is None
 
 
 @given(u32, st.floats(0, 1e9))

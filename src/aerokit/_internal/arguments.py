@@ -178,7 +178,8 @@ def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
         is_left, left_text = _rule(node.left, module_globals)
         is_right, right_text = _rule(node.right, module_globals)
         return (lambda value: is_left(value) or is_right(value)), f"{left_text} or {right_text}"
-    if isinstance(node, ast.Constant):  # None is the only constant in our annotations.
+    # The constants in our annotations are None, and the `...` of tuple[X, ...], whose rule is not used.
+    if isinstance(node, ast.Constant):
         return _SIMPLE["None"]
     if isinstance(node, ast.Subscript):
         return _generic_rule(_name_of(node.value), node.slice, module_globals)
@@ -223,7 +224,7 @@ def _generic_rule(name: str, inner: ast.expr, module_globals: Mapping[str, Any])
     if name == "Mapping":
         (is_key, key_text), (is_value, value_text) = rules
         return partial(_is_mapping, is_key, is_value), f"a mapping from {key_text} to {value_text}"
-    if name in ("Iterable", "Sequence", "list", "tuple"):
+    if name in ("Iterable", "Sequence", "list", "tuple"):  # All items of our tuples have the same type.
         is_item, description = rules[0]
         return partial(_are_items, is_item), f"an iterable whose items are each {description}"
     return partial(_has_class_name, name), with_article(name)

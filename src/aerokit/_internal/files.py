@@ -58,8 +58,8 @@ def decompress(data: bytes, name: str) -> bytes:
     """Decompress ``.xz`` data. Other data is returned unchanged.
 
     Raises:
-        FileFormatError: the data is damaged or decompresses to more than :data:`MAX_FILE_SIZE`. The text begins with
-            ``name``.
+        FileFormatError: the data is damaged, needs too much memory, or decompresses to more than
+            :data:`MAX_FILE_SIZE`. The text begins with ``name``.
     """
     if not data.startswith(_XZ_MAGIC):
         return data
@@ -69,7 +69,7 @@ def decompress(data: bytes, name: str) -> bytes:
     try:
         content = decompressor.decompress(data, MAX_FILE_SIZE + 1)
     except lzma.LZMAError as error:
-        raise FileFormatError(f"{name} is damaged: {error}") from None
+        raise FileFormatError(f"{name} cannot be decompressed: {error}") from None
     if len(content) > MAX_FILE_SIZE:
         raise file_too_large(name)
     if not decompressor.eof:

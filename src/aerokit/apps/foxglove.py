@@ -205,7 +205,7 @@ class _TopicChannels:
             message_type = type(message)
             name = topics.raw_topic_name(system_id, component_id, message_type)
             make_topic = partial(topics.raw_topic, system_id, component_id, message_type)
-            if self._open_topic_if_newer(name, received_at, make_topic):
+            if self._must_send(name, received_at, make_topic):
                 self._send(name, received_at, topics.raw_fields(message))
 
     def close(self) -> None:
@@ -221,13 +221,13 @@ class _TopicChannels:
             if value is None:
                 continue
             make_topic = partial(topics.state_topic, system_id, state, value)
-            if self._open_topic_if_newer(topic_name, cell.updated_at, make_topic):
+            if self._must_send(topic_name, cell.updated_at, make_topic):
                 self._send(topic_name, cell.updated_at, topics.state_fields(value))
         # The link's statistics change with every frame, so they are sent at an interval.
         name, now = topics.vehicle_topic(system_id, "link"), self._connection.now()
         if now - self._sent_at.get(name, -_LINK_INTERVAL_S) >= _LINK_INTERVAL_S:
             link = overview(vehicle)["link"]
-            if self._open_topic_if_newer(name, now, lambda: topics.state_topic(system_id, "link", link)):
+            if self._must_send(name, now, lambda: topics.state_topic(system_id, "link", link)):
                 self._send(name, now, link)
 
     def _publish_location_and_pose(self, system_id: int, vehicle: Vehicle) -> None:
@@ -240,29 +240,29 @@ class _TopicChannels:
         location, transform, pose = (
             topics.vehicle_topic(system_id, name) for name in ("location", "transform", "pose")
         )
-        if self._open_topic_if_newer(location, position_at, lambda: Topic(location, topics.LOCATION_FIX)):
+        if self._must_send(location, position_at, lambda: Topic(location, topics.LOCATION_FIX)):
             heading, velocity = vehicle.heading_deg.latest, vehicle.velocity.latest
             location_unix_s = self._to_unix_time(position_at)
             fix = topics.location_fix(location_unix_s, system_id, position, heading, velocity)
             self._send(location, position_at, fix)
         map_position, pose_unix_s = self._map_frame.east_north_up_m(position), self._to_unix_time(pose_at)
-        if self._open_topic_if_newer(transform, pose_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
+        if self._must_send(transform, pose_at, lambda: Topic(transform, topics.FRAME_TRANSFORM)):
             self._send(transform, pose_at, topics.frame_transform(pose_unix_s, system_id, map_position, attitude))
-        if self._open_topic_if_newer(pose, pose_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
+        if self._must_send(pose, pose_at, lambda: Topic(pose, topics.POSE_IN_FRAME)):
             self._send(pose, pose_at, topics.pose_in_frame(pose_unix_s, map_position, attitude))
 
     def _publish_texts(self, system_id: int, vehicle: Vehicle) -> None:
         name = topics.vehicle_topic(system_id, "log")
         sent_at = self._sent_at.get(name, -math.inf)
         for text in vehicle.telemetry.texts_since(sent_at):
-            if text.at > sent_at and self._open_topic_if_newer(name, text.at, lambda: Topic(name, topics.LOG)):
+            if text.at > sent_at and self._must_send(name, text.at, lambda: Topic(name, topics.LOG)):
                 self._send(name, text.at, topics.log_entry(self._to_unix_time(text.at), system_id, text))
 
-    def _open_topic_if_newer(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
-        """Open the channel of a topic at its first value. Return True if the value must be sent.
+    def _must_send(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
+        """Return True if a viewer subscribes to the topic, and the value is newer than the last value sent.
 
-        The channel cannot be opened earlier, because its type depends on the value. A value must be sent if a viewer
-        subscribes to the topic, and the value is newer than the last value sent.
+        The first call opens the channel of the topic. This cannot be done earlier, because the channel's type depends
+        on the value.
         """
         channel = self._channels.get(name)
         if channel is None:
@@ -270,7 +270,7 @@ class _TopicChannels:
                 name, schema=dict(make_topic().schema), message_encoding="json", context=self.context
             )
         if not channel.has_sinks():
-            self._sent_at.pop(name, None)  # so that the next viewer gets the current value
+            self._sent_at.pop(name, None)  # so that the first of the next viewers gets the current value
             return False
         return updated_at > self._sent_at.get(name, -math.inf)
 

@@ -6,7 +6,6 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from aerokit.autopilots.failsafe_texts import failsafe_kind
 from aerokit.errors import AerokitError
 from aerokit.events import LinkState
 from aerokit.vehicle.commanding.health import REPORTS_ABOUT_ARMING
@@ -32,7 +31,7 @@ def active_failsafe(vehicle: Vehicle) -> list[str] | None:
     """
     if not vehicle.armed.latest or vehicle.system_status.latest not in FAILSAFE_STATES:
         return None
-    texts = [text for text in vehicle.telemetry.texts_since(-math.inf) if failsafe_kind(text.text)]
+    texts = vehicle.telemetry.texts_about_failsafes()
     if not texts:
         return ["no text about its cause was received"]
     begins_at = max(text.at for text in texts) - _FAILSAFE_REPORT_DURATION_S

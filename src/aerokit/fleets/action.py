@@ -72,7 +72,8 @@ class FleetAction:
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
         is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
-        holds_if_cancelled: if the action is cancelled, members that have already finished it hold, too.
+        holds_if_cancelled: if the action is cancelled or a function of the program raises an error, members that have
+            already finished it hold, too.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class FleetAction:
         self._policy_order_errors: dict[str, str] = {}
         self._pending_policy_orders = 0  # number of policy orders that have not ended
         self._last_start_at = -math.inf  # when the last member started
-        self._is_applying_policy = False
+        self._undecided: list[tuple[Member, Exception]] = []  # failures about which the policy is still to be asked
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
@@ -125,8 +126,7 @@ class FleetAction:
                 )
             await self._finished.wait()
         except BaseException:
-            if self._holds_if_cancelled:
-                self._hold_finished_members()
+            self._hold_finished_members()
             raise
         finally:
             self._context.actions.remove(self)
@@ -210,21 +210,21 @@ class FleetAction:
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _record_failure(self, member: Member, error: Exception) -> None:
-        """Record that a member failed. At the first failure, the policy is applied."""
+        """Record that a member failed. Unless the action is safe, ask the policy, until it has given orders once."""
         if member.name in self._failed:
             return
         self._failed[member.name] = error
         self._outcomes[member.name] = error
         member.record_failure(self.name, error)
-        is_policy_applied = self._policy_trigger is not None or self._is_applying_policy
-        if self._is_safe or is_policy_applied or self._context.is_closed:
+        if self._is_safe or self._context.is_closed:
             return
-        # `_apply_policy` refreshes the other members. This may call `_record_failure` again, for another member.
-        self._is_applying_policy = True
-        try:
-            self._apply_policy(member, error)
-        finally:
-            self._is_applying_policy = False
+        self._undecided.append((member, error))
+        if len(self._undecided) > 1:  # `_apply_policy` below has called this, because it refreshes the other members.
+            return
+        while self._undecided:
+            if self._policy_trigger is None:
+                self._apply_policy(*self._undecided[0])
+            del self._undecided[0]
 
     # ------------------------------------------------------------------------------ other members
 
@@ -303,8 +303,10 @@ class FleetAction:
                 await member.vehicle.return_to_launch()
             else:
                 await member.vehicle.hold()
-        except AerokitError as error:
-            self._policy_order_errors[member.name] = str(error)
+        except BaseException as error:
+            self._policy_order_errors[member.name] = str(error) or type(error).__name__
+            if not isinstance(error, AerokitError):
+                raise
             member.refresh()  # the order may have failed because of a lost link or a takeover
         finally:
             self._pending_policy_orders -= 1
@@ -323,7 +325,7 @@ class FleetAction:
     def _hold_finished_members(self) -> None:
         # Members that have finished the action get an order to hold. Members that still execute it hold because it is
         # cancelled. Failed and stopped members get no order.
-        for member in self._members:
+        for member in self._members if self._holds_if_cancelled else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
             if has_finished and member.is_flown_by_program:
                 self._context.hold(member, f"aerokit hold {member.name}")
@@ -444,10 +446,14 @@ class SelectionBase:
         timeout: float | None = None,
         stagger_s: float | None = None,
         names: tuple[str, ...] | None = None,
+        is_function: bool = False,
     ) -> FleetResult:
-        """Execute an action with all members of the selection, or with those in ``names``."""
+        """Execute an action with all members of the selection, or with those in ``names``.
+
+        ``is_function`` is True if the action is a function of the program, whatever its name.
+        """
         members = [member for member in self if names is None or member.name in names]
-        is_safe = name in FLIGHT_ENDING_ACTIONS
+        is_safe = name in FLIGHT_ENDING_ACTIONS and not is_function
         return await FleetAction(
             self._context,
             name,
@@ -456,5 +462,5 @@ class SelectionBase:
             timeout=timeout,
             stagger_s=stagger_s,
             is_safe=is_safe,
-            holds_if_cancelled=not is_safe and name not in ACTIONS_ON_GROUND,
+            holds_if_cancelled=not is_safe and (name not in ACTIONS_ON_GROUND or is_function),
         ).run()

@@ -11,6 +11,7 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument, OperationTimeout
 from aerokit.fleets.action import SelectionBase
+from aerokit.fleets.distances import POSITION_MAX_AGE_S
 from aerokit.fleets.members import Member
 from aerokit.fleets.policy import FleetResult
 from aerokit.vehicle.commanding.progress import ChangeSignal
@@ -41,7 +42,8 @@ class Actions(SelectionBase):
             **options: keyword arguments of the method.
 
         Raises:
-            InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
+            InvalidArgument: there is no such action, or there are arguments for a function. Nothing was sent. If the
+                method refuses an argument, each member fails instead.
         """
         if isinstance(action, str):
             name = action
@@ -56,7 +58,8 @@ class Actions(SelectionBase):
                 raise InvalidArgument("do: arguments and options are allowed only if action is the name of a method")
             execute = action  # type: ignore[assignment]
             name = getattr(action, "__name__", "action")
-        return await self._run(name, execute, timeout=timeout, stagger_s=stagger_s)
+        is_function = not isinstance(action, str)
+        return await self._run(name, execute, timeout=timeout, stagger_s=stagger_s, is_function=is_function)
 
     async def wait_ready(self, *, timeout: float = 90.0) -> FleetResult:
         """Wait until each member is ready to fly; see :meth:`aerokit.Vehicle.wait_ready`.
@@ -145,11 +148,12 @@ class Actions(SelectionBase):
     async def barrier(
         self, condition: Callable[[Member], bool], *, timeout: float = 60.0, description: str = "barrier"
     ) -> FleetResult:
-        """Wait until a condition is true for every member.
+        """Wait until a condition has been true for every available member, not necessarily at the same time.
 
         Args:
-            condition: function of a member; it is called four times a second and when the member's state changes.
-            timeout: seconds until the condition is true for all members.
+            condition: function of a member; it is called four times a second and when the member's state changes, until
+                it is true for this member.
+            timeout: seconds until the condition has been true for all members.
             description: name of the barrier in errors.
 
         Raises:
@@ -173,7 +177,7 @@ class Actions(SelectionBase):
                         )
                     await change_signal.next(POLL_INTERVAL_S)
 
-        result = await self._run(description, wait_for_condition)
+        result = await self._run(description, wait_for_condition, is_function=True)
         result.raise_for_errors()
         return result
 
@@ -192,8 +196,8 @@ class Actions(SelectionBase):
         """
 
         def is_at_altitude(member: Member) -> bool:
-            position = member.vehicle.position.latest
-            if position is None or position.altitude_relative_m is None:
+            position, age_s = member.vehicle.position.latest, member.vehicle.position.age
+            if position is None or position.altitude_relative_m is None or age_s > POSITION_MAX_AGE_S:
                 return False
             return abs(position.altitude_relative_m - altitude_m) <= tolerance_m
 

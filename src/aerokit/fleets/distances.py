@@ -44,7 +44,8 @@ def altitude_amsl(member: Member, target: Position) -> float:
     A relative altitude counts from the member's home. A target without an altitude has the member's present altitude.
 
     Raises:
-        ValueUnknownError, StaleValueError: the position of the member or of its home is unknown.
+        ValueUnknownError, StaleValueError: the target has no altitude above sea level, and the member's position or one
+            of its altitudes is unknown or old.
     """
     if target.altitude_amsl_m is not None:
         return target.altitude_amsl_m
@@ -114,7 +115,10 @@ class DistanceMonitor:
                 self._on_too_close(self._context.members[first], self._context.members[second], distance_m)
 
     def _flying_positions(self) -> dict[str, tuple[float, float, float]]:
-        """Return latitude, longitude and altitude of all members in the air, including those that a pilot controls."""
+        """Return latitude, longitude and altitude of members in the air, including those that a pilot controls.
+
+        Members whose position is unknown or older than `POSITION_MAX_AGE_S` cannot be compared.
+        """
         positions: dict[str, tuple[float, float, float]] = {}
         for member in self._context.members.values():
             vehicle = member.vehicle
@@ -126,7 +130,7 @@ class DistanceMonitor:
         return positions
 
     def _on_too_close(self, first: Member, second: Member, distance_m: float) -> None:
-        """Order both members to hold, if this program flies them, and publish the event."""
+        """Order each of the two that this program flies to hold, unless only reports are wanted. Publish the event."""
         pair = (first, second)
         for member in pair:
             member.refresh()

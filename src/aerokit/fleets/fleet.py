@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from aerokit._internal.arguments import checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit.connection.bus import Overflow, Subscription
-from aerokit.errors import InvalidArgument
+from aerokit.errors import AerokitError, ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.events import Event
 from aerokit.fleets.actions import Actions
 from aerokit.fleets.events import FleetEvent, MemberEvent, StateUpdate
@@ -90,11 +90,11 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: no member matches.
         """
-        for member in self._context.matching(name):
-            self._context.members[member].reclaim()
+        for member_name in self._context.matching(name):
+            self._context.members[member_name].reclaim()
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Nothing is sent, so the members continue as before.
+        """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
         Args:
             name: a member's name or a pattern.
@@ -103,8 +103,8 @@ class Fleet(Selection):
         Raises:
             InvalidArgument: no member matches.
         """
-        for member in self._context.matching(name):
-            self._context.members[member].release(reason)
+        for member_name in self._context.matching(name):
+            self._context.members[member_name].release(reason)
 
     def send_corrections(self, rtcm: bytes) -> int:
         """Send RTCM corrections (RTK, DGPS) as GPS_RTCM_DATA, once on each link.
@@ -118,13 +118,19 @@ class Fleet(Selection):
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended. Links before it have already got the corrections.
+            ConnectionClosed, LinkLost: a link has ended. The other links got the corrections.
         """
         messages = rtcm_messages(rtcm)
         count = 0
+        link_error: AerokitError | None = None
         for connection in dict.fromkeys(self._context.networks.values()):
-            # `send_rtcm` leaves out a message that another sender has just sent on the same link.
-            count = max(count, sum(send_rtcm(connection, message, self) for message in messages))
+            try:
+                # `send_rtcm` leaves out a message that another sender has just sent on the same link.
+                count = max(count, sum(send_rtcm(connection, message, self) for message in messages))
+            except (ConnectionClosed, LinkLost) as error:
+                link_error = error
+        if link_error is not None:
+            raise link_error
         return count
 
     # -------------------------------------------------------------------------------------- streams
@@ -153,9 +159,10 @@ class Fleet(Selection):
             detachments: list[Detach] = []
             for event_type in event_types:
                 # The fleet's bus has only the fleet's own events. Those of vehicles arrive on the buses of their links.
-                if issubclass(event_type, FleetEvent) and event_type is not MemberEvent:
+                is_fleet_event = issubclass(event_type, FleetEvent) and event_type is not MemberEvent
+                if is_fleet_event or event_type is Event:
                     detachments.append(self._context.bus.attach_event(event_type, sink))
-                else:
+                if not is_fleet_event:
                     vehicle_event_type = Event if event_type is MemberEvent else event_type
                     detachments += self._attach_member_events(vehicle_event_type, sink)
             return detachments

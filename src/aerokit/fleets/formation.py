@@ -22,7 +22,7 @@ from aerokit.errors import (
     ValueUnknownError,
 )
 from aerokit.fleets.action import FleetAction
-from aerokit.fleets.distances import altitude_amsl, position_of
+from aerokit.fleets.distances import POSITION_MAX_AGE_S, altitude_amsl, position_of
 from aerokit.fleets.events import FollowingStopped
 from aerokit.fleets.members import Member
 from aerokit.fleets.policy import FleetResult
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Following", "Formation", "Formations", "Offset", "follow_velocity"]
 
-# Maximum age of the positions of leader and follower.
+# Maximum age of the positions of leader and follower, and of the leader's heading.
 FOLLOWING_MAX_AGE_S = 1.5
 
 # Speed of a follower towards its place in the formation, per metre of its distance from the place, in 1/s.
@@ -148,6 +148,20 @@ def follow_velocity(
     return north, east, up
 
 
+def _heading_for(formation: Formation, leader: Member, max_age_s: float) -> float | None:
+    """Return the leader's heading if the formation turns with it, otherwise None.
+
+    Raises:
+        ValueUnknownError, StaleValueError: the heading is needed and unknown, or older than ``max_age_s``.
+    """
+    if formation.frame != "heading":
+        return None
+    try:
+        return leader.vehicle.heading_deg.fresh(max_age_s)
+    except ValueUnknownError as error:
+        raise type(error)(f"{leader.name}: {error}") from None
+
+
 @checks_arguments
 class Following:
     """Keeps followers at their places in a formation while its ``async with`` block runs. Then the followers hold.
@@ -253,11 +267,12 @@ class Following:
             self._stop(reason or "no follower is left", self._action.orders, {**result.skipped, **failed})
 
     def _stop_if_leader_lost(self) -> bool:
-        """Stop following if the leader is unavailable or its position unknown. Return True if following has stopped."""
+        """Stop following if the leader is unavailable or its place or heading unknown. Return True after a stop."""
         if not self._stopped.is_set():
             try:
                 self._check_leader()
                 position_of(self._leader, FOLLOWING_MAX_AGE_S)
+                _heading_for(self._formation, self._leader, FOLLOWING_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
                 # The active members hold, because `_tasks.cancel()` below ends their streams.
                 holding = self._action.active
@@ -299,7 +314,8 @@ class Following:
                 "member": (position.latitude_deg, position.longitude_deg, altitude_amsl(member, position)),
             }
         )
-        offset = self._formation.offset_of(member.name, leader.heading_deg.latest)
+        heading = _heading_for(self._formation, self._leader, FOLLOWING_MAX_AGE_S)
+        offset = self._formation.offset_of(member.name, heading)
         leader_north, leader_east, leader_up = points["leader"]
         member_north, member_east, member_up = points["member"]
         north = leader_north + offset.north_m - member_north
@@ -359,20 +375,21 @@ class Formations(Travel):
             timeout: seconds for each member and each leg; None: no limit.
 
         Raises:
-            InvalidArgument: a name is unknown, or two places are too close. Nothing was sent.
+            InvalidArgument: a name is unknown, two places are too close, or the speed is not allowed. Nothing was sent.
             OperationRejected: the leader is unavailable, or paths come too close. Nothing was sent.
-            ValueUnknownError: the position of the leader or of a follower is unknown.
+            ValueUnknownError: the position of the leader or of a follower, or a heading that is needed, is unknown.
         """
         leader_member, followers = self._leader_and_followers(formation, leader)
         leader_position = position_of(leader_member)
-        heading = leader_member.vehicle.heading_deg.latest
+        heading = _heading_for(formation, leader_member, POSITION_MAX_AGE_S)
+        # An altitude above the leader's home is dropped, because a follower's home may be at another altitude.
+        center = leader_position.replace(
+            altitude_amsl_m=altitude_amsl(leader_member, leader_position), altitude_relative_m=None
+        )
         targets: dict[str, Position] = {}
         for follower in followers:
             offset = formation.offset_of(follower.name, heading)
-            target = leader_position.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
-            if target.altitude_amsl_m is not None:
-                # An altitude above the leader's home is dropped, because a follower's home may be at another altitude.
-                target = Position(target.latitude_deg, target.longitude_deg, altitude_amsl_m=target.altitude_amsl_m)
+            target = center.offset(north_m=offset.north_m, east_m=offset.east_m, up_m=offset.up_m)
             targets[follower.name] = target
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -403,10 +420,11 @@ class Formations(Travel):
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
         """Check a formation and its leader. Return the member that leads, and the members that follow."""
-        for name in (leader, *formation.offsets):
+        arguments = {leader: "leader", **dict.fromkeys(formation.offsets, "formation")}
+        for name, argument in arguments.items():
             if name not in self.members:
                 raise InvalidArgument(
-                    f"formation: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
+                    f"{argument}: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
                 )
         if leader in formation.offsets:
             raise InvalidArgument(f"formation: {leader!r} is the leader and cannot have an offset")

@@ -132,7 +132,7 @@ class Member:
             self._set_state(MemberState.ACTIVE, "")
 
     def reclaim(self) -> None:
-        """End a takeover, failsafe or release. The member is then active, or lost if its vehicle is silent."""
+        """Make the member active, whatever its state is, or lost if its vehicle is silent."""
         self._control_when_reclaimed = self._current_control()
         self._ignored_failsafe = self.vehicle.system_status.latest
         self.vehicle._arbiter.clear_failsafe()
@@ -156,12 +156,12 @@ class Member:
     def _takeover_reason(self) -> str:
         """Return why the member counts as taken over; an empty string if it does not. Notice the end of a failsafe."""
         vehicle = self.vehicle
-        if vehicle.is_confirmed_disarmed:  # a disarmed vehicle does not fly, so there is no control to take over
-            return ""
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:
             self._ignored_failsafe = None  # The ignored failsafe has ended, so the next one counts again.
-        elif state is not None and is_worse_failsafe(state, self._ignored_failsafe):
+        if vehicle.is_confirmed_disarmed:  # a disarmed vehicle does not fly, so there is no control to take over
+            return ""
+        if state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
         uses_missions = "mission" in vars(vehicle)  # vehicle.mission is created at its first use
         if uses_missions and vehicle.mission.explains_mode:  # the mode changed because the mission has ended

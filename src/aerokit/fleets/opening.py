@@ -112,7 +112,8 @@ async def fleet(
                 networks[name] = await stack.enter_async_context(open_connection(source))
             elif isinstance(source, Connection):
                 networks[name] = source
-        members = _members_of_vehicles(sources_by_name, networks)
+        given_names = {name for source in sources if isinstance(source, Mapping) for name in source}
+        members = _members_of_vehicles(sources_by_name, given_names, networks)
         searched = [name for name, source in sources_by_name.items() if not isinstance(source, Vehicle)]
         ids = await find_systems(
             {name: networks[name] for name in searched},
@@ -157,8 +158,13 @@ def _named_sources(sources: tuple[Source | Mapping[str, Source], ...]) -> dict[s
     return sources_by_name
 
 
-def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[str, Connection]) -> list[Member]:
-    """Return a member for each vehicle object among the sources, and add the vehicles' connections to the networks."""
+def _members_of_vehicles(
+    sources_by_name: Mapping[str, Source], given_names: set[str], networks: dict[str, Connection]
+) -> list[Member]:
+    """Return a member for each vehicle object among the sources, and add the vehicles' connections to the networks.
+
+    ``given_names`` are the names that the program gave; the others are numbers.
+    """
     members: list[Member] = []
     for name, source in sources_by_name.items():
         if isinstance(source, Vehicle):
@@ -167,8 +173,7 @@ def _members_of_vehicles(sources_by_name: Mapping[str, Source], networks: dict[s
             if network is None:
                 network = name
                 networks[name] = source.connection
-            is_named_by_program = not name.isdecimal()  # _named_sources() numbers the other sources
-            member_name = name if is_named_by_program else f"{network}/{source.system_id}"
+            member_name = name if name in given_names else f"{network}/{source.system_id}"
             members.append(Member(member_name, network, source))
     return members
 
@@ -362,9 +367,9 @@ class MemberConnections:
         """Close all vehicles, and wait until they are closed. The arguments are the exception of the fleet's block."""
         self._has_block_failed = error is not None
         self._close.set()
-        is_every_vehicle_connected = len(self._connected) == self._running_task_count
-        # If a vehicle is not connected, opening has failed, and cancelling the tasks is enough.
-        if self._running_task_count and is_every_vehicle_connected:
+        # If a task is still connecting, opening has failed, and cancelling all tasks is enough.
+        is_no_task_connecting = len(self._connected) == self._running_task_count
+        if self._running_task_count and is_no_task_connecting:
             await run_shielded(self._wait_until_all_closed())
         await self._tasks.aclose()
 

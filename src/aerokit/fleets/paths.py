@@ -240,7 +240,7 @@ def _clip(corners: list[tuple[float, float]], outside: _Outside) -> list[tuple[f
         previous = corners[index - 1]  # the last corner is before the first one
         value, previous_value = outside(*corner), outside(*previous)
         if (value > TOLERANCE) != (previous_value > TOLERANCE):  # the edge crosses the border
-            fraction = previous_value / (previous_value - value)
+            fraction = (previous_value - TOLERANCE) / (previous_value - value)  # the border is at TOLERANCE
             crossing = tuple(p + fraction * (q - p) for p, q in zip(previous, corner, strict=True))
             clipped.append(crossing)  # type: ignore[arg-type]
         if value <= TOLERANCE:

@@ -59,7 +59,8 @@ class Deconfliction(Snapshot):
     - ``"refused"``: the conflicts cannot be resolved.
 
     ``conflicts`` has the conflicts of the direct paths, without separation. Heights are in metres above sea level.
-    In corridors, a vehicle that would start more than ``slack_s`` seconds late does not start.
+    In corridors, a vehicle that would start more than ``slack_s`` seconds late does not start. ``routes`` are the paths
+    that were compared, in metres from the target of the first one.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]
@@ -69,6 +70,7 @@ class Deconfliction(Snapshot):
     heights_m: Mapping[str, float] = {}
     delays_s: Mapping[str, float] = {}
     slack_s: float = SLACK_S
+    routes: Sequence[Route] = ()
 
 
 def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: float = math.inf) -> tuple[Conflict, ...]:
@@ -149,7 +151,7 @@ def separate_by_time(
     slack_s: float = SLACK_S,
     max_delay_s: float = 300.0,
 ) -> Deconfliction:
-    """Separate conflicting routes by time.
+    """Separate conflicting routes by time. The decision is "clear", "corridors" with the delays, or "refused".
 
     Args:
         routes: routes of the moving vehicles.

@@ -65,10 +65,10 @@ class Show(Snapshot):
         Raises:
             InvalidArgument: ``names`` lacks a track, or gives two tracks the same name.
         """
-        missing = [track for track in self.tracks if track not in names]
+        missing = [track_name for track_name in self.tracks if track_name not in names]
         if missing:
             raise InvalidArgument(f"names: no fleet member is given for these tracks: {', '.join(missing)}")
-        members = [names[track] for track in self.tracks]
+        members = [names[track_name] for track_name in self.tracks]
         if len(set(members)) < len(members):
             raise InvalidArgument(f"names: two tracks are given the same fleet member: {', '.join(members)}")
         return type(self)({names[name]: track.replace(name=names[name]) for name, track in self.tracks.items()})
@@ -84,7 +84,7 @@ class Show(Snapshot):
         for name, points in tracks.items():
             try:
                 parsed[name] = Path(name, [PathPoint(*map(float, point)) for point in points])
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:  # OverflowError: a whole number of 400 digits
                 raise InvalidArgument(f"track {name!r}: {error}") from None
         return cls(parsed)
 
@@ -107,13 +107,18 @@ class Show(Snapshot):
         """Parse a show in CSV, in the format that the module describes.
 
         Raises:
-            InvalidArgument: the text is not in this format. The error names the line.
+            InvalidArgument: the text is not in this format. The error names the line or the track.
         """
-        rows = csv.reader(io.StringIO(text))
-        if [cell.strip() for cell in next(rows, [])] != COLUMNS:
+        reader = csv.reader(io.StringIO(text))
+        try:
+            rows = [(reader.line_num, row) for row in reader]
+        except csv.Error as error:  # e.g. a quote that never ends
+            raise InvalidArgument(f"line {reader.line_num}: {error}") from None
+        _, header = rows.pop(0) if rows else (0, [])
+        if [cell.strip() for cell in header] != COLUMNS:
             raise InvalidArgument(f"line 1 must be {','.join(COLUMNS)}")
         points: dict[str, list[PathPoint]] = {}
-        for row in rows:
+        for line_number, row in rows:
             if not row:
                 continue
             try:
@@ -121,7 +126,7 @@ class Show(Snapshot):
                 t_s, north_m, east_m, up_m = map(float, numbers)
                 points.setdefault(name, []).append(PathPoint(t_s, north_m, east_m, up_m))
             except ValueError as error:
-                raise InvalidArgument(f"line {rows.line_num}: {error}") from None
+                raise InvalidArgument(f"line {line_number}: {error}") from None
         return cls({name: Path(name, path) for name, path in points.items()})
 
     @classmethod

@@ -48,7 +48,8 @@ __all__ = [
 # Speed of the correction towards the track, per metre of deviation, in 1/s.
 TRACK_GAIN = 0.8
 
-# The speed limit is max(CATCH_UP_M_S, CATCH_UP_FACTOR * speed of the track) + CATCH_UP_M_S.
+# The speed limit is max(CATCH_UP_M_S, CATCH_UP_FACTOR * speed of the track) + CATCH_UP_M_S. A member can
+# therefore catch up even where the track rests.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
 CONFLICT_SLACK_S = 0.5
@@ -94,9 +95,12 @@ async def measure_clock(vehicle: Vehicle, *, requests: int = 8) -> ClockOffset:
 
     def on_timesync(message: Timesync) -> None:
         frame = message.received_frame
-        sent_at = sent_at_by_timestamp.pop(message.ts1, None)
         is_answer = message.tc1 != 0
-        if frame is None or sent_at is None or not is_answer or frame.component_id != vehicle.component_id:
+        # Other components of the vehicle answer the same requests, by their own clocks.
+        if frame is None or not is_answer or frame.component_id != vehicle.component_id:
+            return
+        sent_at = sent_at_by_timestamp.pop(message.ts1, None)
+        if sent_at is None:
             return
         round_trip_s = frame.received_at - sent_at
         answered_at = sent_at + round_trip_s / 2  # if both directions take the same time
@@ -302,8 +306,8 @@ class Shows(Travel):
 
         Args:
             show: the trajectories.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
 
         Raises:
             InvalidArgument: the name of a track is not that of a member.
@@ -329,8 +333,8 @@ class Shows(Travel):
 
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start.
             lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction

@@ -26,9 +26,14 @@ from aerokit.fleets.separation import (
     separate_by_altitude,
     separate_by_time,
 )
+from aerokit.mavlink.enums import MavCmd
 from aerokit.missions.mission import Mission
 from aerokit.position import Home, Position, travel_target
 from aerokit.vehicle.commanding.progress import MAX_DISTANCE_M
+from aerokit.vehicle.state.telemetry import is_reported_on_ground
+
+# Starts and targets may differ by this much from those of a plan, because vehicles drift and positions are noisy.
+MAX_PLAN_DRIFT_M = 3.0
 
 SeparationMethod = Literal["layers", "corridors", "refuse"]
 """Method to separate crossing paths: by altitude (layers), by time (corridors), or not at all (refuse)."""
@@ -59,16 +64,17 @@ class Travel(SelectionBase):
             speed_m_s: ground speed in m/s; None: unchanged.
             max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
-            stagger_s: delay in seconds between the starts of consecutive members; None: all at once. Not for corridors.
-            separation: result of :meth:`plan_separation` for these targets.
+            stagger_s: delay in seconds between the starts of consecutive members, on each leg; None: all at once. Not
+                for corridors.
+            separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
             InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` would change the delays of
                 corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
-            OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
-                unavailable after the separation was planned. Then nothing was sent, or after a leg the others stay in
-                their layers.
+            OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
+                members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
+                Then the others stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -101,7 +107,7 @@ class Travel(SelectionBase):
     ) -> Deconfliction:
         """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
-        Members without a target count as obstacles at their current positions. Publishes :class:`PathsCompared`.
+        Members without a target count as obstacles at their last known positions. Publishes :class:`PathsCompared`.
 
         Args:
             targets: as for :meth:`go_to`.
@@ -131,6 +137,7 @@ class Travel(SelectionBase):
             if by == "refuse" and deconfliction.decision == "layers":  # the paths cross
                 reason = f"{describe_pairs(deconfliction.conflicts)} come too close"
                 deconfliction = deconfliction.replace(decision="refused", reason=reason, heights_m={})
+        deconfliction = deconfliction.replace(routes=tuple(routes))
         self._context.publish(
             PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
         )
@@ -152,9 +159,12 @@ class Travel(SelectionBase):
     ) -> FleetResult:
         """Fly members to their targets, directly or with the planned separation.
 
-        ``names`` are all members of the result, which has those without a target as skipped; by default those with one.
+        ``names`` are the members of the result, which lists those without a target as skipped. Default: the members
+        with a target.
         """
-        if separation is None and self._context.min_distance_m is not None:
+        if separation is not None:
+            self._check_plan(action, targets, separation)
+        elif self._context.min_distance_m is not None:
             separation = self.plan_separation(targets, speed_m_s=speed_m_s)
         if separation is None or separation.decision == "clear":
             return await self._fly_to(
@@ -170,14 +180,34 @@ class Travel(SelectionBase):
             )
         heights_m = separation.heights_m
         result = await self._fly_in_layers(
-            action, targets, speed_m_s, timeout, heights_m=heights_m, max_distance_m=max_distance_m
+            action,
+            targets,
+            speed_m_s,
+            timeout,
+            heights_m=heights_m,
+            max_distance_m=max_distance_m,
+            stagger_s=stagger_s,
         )
-        without_layer = [self.members[name] for name in names or targets if name not in heights_m]
-        result.skipped |= {
-            member.name: "the separation was planned without it" if member.is_available else member.status
-            for member in without_layer
-        }
+        result.skipped |= {name: self.members[name].status for name in names or targets if name not in heights_m}
         return result
+
+    def _check_plan(self, action: str, targets: Mapping[str, Position], plan: Deconfliction) -> None:
+        """Raise OperationRejected unless the plan was made for these targets and the members' present positions."""
+        routes, _ = self._routes(targets)
+        present = {route.name: route for route in routes}
+        planned = {route.name: route for route in plan.routes}
+        for name in {**planned, **present}:
+            if name not in present:
+                reason = f"{name} became unavailable after the separation was planned"
+            elif name not in planned:
+                reason = f"the separation was planned without {name}"
+            elif math.dist(present[name].start, planned[name].start) > MAX_PLAN_DRIFT_M:
+                reason = f"{name} has moved since the separation was planned"
+            elif math.dist(present[name].target, planned[name].target) > MAX_PLAN_DRIFT_M:
+                reason = f"the separation was planned for another target of {name}"
+            else:
+                continue
+            raise OperationRejected(f"{action}: {reason}; nothing was sent")
 
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]
@@ -200,7 +230,7 @@ class Travel(SelectionBase):
         moving = [members[name] for name in targets if members[name].is_available]
         if not moving:
             return [], {}
-        origin = LocalOrigin(position_of(moving[0]))
+        origin = LocalOrigin(targets[moving[0].name])  # It stays the same while the members move.
         routes = [
             Route(
                 member.name,
@@ -252,9 +282,10 @@ class Travel(SelectionBase):
         *,
         heights_m: Mapping[str, float],
         max_distance_m: float,
+        stagger_s: float | None,
     ) -> FleetResult:
         """Fly up to the layers, across, and down. A leg begins when all members have finished the leg before."""
-        starts = {name: position_of(self._context.members[name], math.inf) for name in heights_m}
+        starts = {name: position_of(self._context.members[name]) for name in heights_m}
         climb = {name: _at_altitude(starts[name], height) for name, height in heights_m.items()}
         crossing = {name: _at_altitude(targets[name], height) for name, height in heights_m.items()}
         descent = {name: targets[name] for name in heights_m}
@@ -266,7 +297,9 @@ class Travel(SelectionBase):
                     f"{action}: {', '.join(missing)} became unavailable after the separation was planned; "
                     + ("nothing was sent" if result is None else "the others stay in their layers")
                 )
-            result = await self._fly_to(action, leg, speed_m_s, timeout, max_distance_m=max_distance_m)
+            result = await self._fly_to(
+                action, leg, speed_m_s, timeout, max_distance_m=max_distance_m, stagger_s=stagger_s
+            )
             if not result.is_complete:
                 break
         assert result is not None
@@ -371,8 +404,15 @@ class Missions(SelectionBase):
 
         Args:
             timeout: seconds until all members have finished; None: no limit.
+
+        Raises:
+            OperationRejected: the last upload failed for a member, or had no mission for these members.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
+        if not names:
+            raise OperationRejected(
+                "wait_missions_finished: the last upload failed, or had no mission for these members"
+            )
         return await self._run(
             "mission.wait_finished", lambda member: member.vehicle.mission.wait_finished(timeout=timeout), names=names
         )
@@ -382,8 +422,9 @@ class Missions(SelectionBase):
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced by the
-        member's present altitude.
+        Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
+        item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
+        by the member's present altitude.
 
         Args:
             missions: maps names of members to missions.
@@ -391,19 +432,20 @@ class Missions(SelectionBase):
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
+            OperationRejected: a member is unavailable.
             ValueUnknownError: the position of a member is unknown.
         """
         min_m = self._context.min_distance_m if min_distance_m is None else min_distance_m
         if min_m is None:
             raise InvalidArgument("min_distance_m is required, because this fleet was created without it")
         members = self._require_available(missions)
-        paths: list[Path | None] = []
+        paths: list[Path] = []
         if members:
             first_member = next(iter(members.values()))
             # A position of any age will do, because it is only the origin of the coordinates.
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
-        conflicts = find_conflicts([path for path in paths if path is not None], min_m)
+        conflicts = find_conflicts(paths, min_m)
         reason = f"{describe_pairs(conflicts)} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
         self._context.publish(
@@ -427,12 +469,18 @@ class Missions(SelectionBase):
         return members
 
 
-def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path | None:
-    """Return the path of a mission, with time 0 for all points; None if no item has a position."""
-    points: list[PathPoint] = []
+def _mission_path(origin: LocalOrigin, member: Member, mission: Mission) -> Path:
+    """Return the path of a mission from the member's present position, with time 0 for all points."""
+    here = position_of(member)
+    points = [PathPoint(0.0, *origin.of_member(member))]
     for item in mission:
+        if item.command >= MavCmd.NAV_LAST or item.command == MavCmd.NAV_ROI:  # the vehicle does not fly there
+            continue
         position = item.position
-        if position is not None and not math.isnan(position.latitude_deg):
-            north_m, east_m, up_m = origin.to_local(position, altitude_amsl(member, position))
-            points.append(PathPoint(0.0, north_m, east_m, up_m))
-    return Path(member.name, points) if points else None
+        if position is None and item.command in (MavCmd.NAV_TAKEOFF, MavCmd.NAV_VTOL_TAKEOFF):
+            position = item.replace(x=round(here.latitude_deg * 1e7), y=round(here.longitude_deg * 1e7)).position
+        if position is not None:
+            points.append(PathPoint(0.0, *origin.to_local(position, altitude_amsl(member, position))))
+    if is_reported_on_ground(member.vehicle.telemetry):  # The member climbs before it flies to the first item.
+        points[0] = points[0].replace(up_m=max(point.up_m for point in points[:2]))
+    return Path(member.name, points)

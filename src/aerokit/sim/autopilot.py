@@ -17,6 +17,7 @@ from aerokit.protocols.servers.files import FileTree
 from aerokit.sim.channel import Channel
 from aerokit.sim.commands import CommandHandler, CommandServer, ReceivedCommand
 from aerokit.sim.motion import Motion
+from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import AttachableComponent, SimulatedVehicle
 
 _CORRECTIONS_MAX_AGE_S = 5.0
@@ -167,6 +168,8 @@ class SimulatedAutopilot(SimulatedVehicle):
     signing: VehicleSigning
     """Message signing, whose key survives a reboot."""
     motion: Motion
+    parameters: SimParameters
+    """Parameters by name. A test may change them, and they survive a reboot."""
 
     def __init__(
         self,
@@ -189,6 +192,9 @@ class SimulatedAutopilot(SimulatedVehicle):
     def make_signing(self, key: SigningKey | None, timestamp: int) -> VehicleSigning:
         """Create the signing of this firmware, with a stored key and time stamp."""
         raise NotImplementedError
+
+    def on_speedup(self, speedup: float) -> None:
+        """Multiply the timeouts for clients that no parameter has; see `aerokit.sim.kinds.scale_timeouts`."""
 
     def open_channel(self, *, version: int = 2) -> Channel:
         """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""

@@ -138,6 +138,11 @@ def rotated(vector: Ned, yaw: float) -> Ned:
     return (forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw, down)
 
 
+def constrained(value: float, low: float, high: float) -> float:
+    """Limit a value. NaN becomes the middle, as in ArduPilot (AP_Math.cpp, constrain_value)."""
+    return (low + high) / 2.0 if math.isnan(value) else max(low, min(high, value))
+
+
 def is_finite(*vectors: Ned | None) -> bool:
     """Return True if all components of all vectors are finite. Vectors that are None do not count."""
     return all(math.isfinite(part) for vector in vectors if vector is not None for part in vector)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.formatting import did_you_mean, short_repr
 from aerokit.errors import InvalidArgument
-from aerokit.sim.parameters import SimParameters
 from aerokit.sim.vehicle import SimulatedVehicle
+
+if TYPE_CHECKING:
+    from aerokit.sim.parameters import SimParameters
 
 __all__ = ["kind_class", "kind_names", "scale_timeouts", "simulated"]
 
@@ -70,13 +72,12 @@ def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leav
     """
     if speedup <= 1.0:
         return
+    from aerokit.sim.autopilot import SimulatedAutopilot
+
     for vehicle in vehicles:
-        parameters = getattr(vehicle, "parameters", None)
-        if isinstance(parameters, SimParameters):
-            _scale(parameters, speedup, leave)
-        text_links = getattr(vehicle, "text_links", None)  # PX4 only
-        if text_links is not None:
-            text_links.speedup = speedup
+        if isinstance(vehicle, SimulatedAutopilot):
+            _scale(vehicle.parameters, speedup, leave)
+            vehicle.on_speedup(speedup)
 
 
 def _scale(parameters: SimParameters, speedup: float, leave: Collection[str]) -> None:

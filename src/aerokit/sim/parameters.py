@@ -98,12 +98,13 @@ class SimParameters:
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
 
-        Raises InvalidArgument, with similar names, for an unknown name.
+        Raises InvalidArgument, with similar names, for an unknown name. Nothing was set then.
         """
-        for name, value in values.items():
+        for name in values:
             if name not in self:
                 similar = ", ".join(get_close_matches(name, self._rows)) or "none"
                 raise InvalidArgument(f"the simulated vehicle has no parameter {name!r}; similar names: {similar}")
+        for name, value in values.items():
             self[name] = value
 
     def __contains__(self, name: object) -> bool:

@@ -146,7 +146,7 @@ class SimulatorServer:
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
             _uncancel(owner)
         if self.failure is not None and self.failure is not error:
-            raise self.failure from self.failure.__cause__  # "from" keeps the cause that the exception has already.
+            raise self.failure  # Its context is the exception that has ended the block.
 
     def wake(self) -> None:
         """Run all events that are due. Call this method after a change of a fault or of a value of a vehicle.
@@ -217,10 +217,10 @@ class SimulatorServer:
             return
         self._skip_lateness()
         now = self.now
-        if self.on_datagram is not None:
-            is_from_vehicle = False
-            self.on_datagram(now, data, is_from_vehicle)
         try:
+            if self.on_datagram is not None:
+                is_from_vehicle = False
+                self.on_datagram(now, data, is_from_vehicle)
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
                 # The vehicle may be ahead of `now`: a timer fired early, or another vehicle advanced this vehicle.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)

@@ -269,7 +269,10 @@ class SimulatedVehicle:
         count = 0
 
         def repeat() -> None:
-            nonlocal count
+            nonlocal start, count
+            late_s = self.now - (start + count * interval)
+            if late_s > interval:  # The vehicle was frozen. The missed calls would follow in a burst.
+                start += late_s
             count += 1
             # The next call is scheduled first, so that an action that reboots the vehicle cancels it.
             self.call_at(round((start + count * interval) * NS_PER_S) / NS_PER_S, repeat)

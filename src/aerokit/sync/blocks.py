@@ -381,12 +381,13 @@ def opened(
 ) -> TwinT:
     """Open a context on a new loop thread; if ``address`` is a connection, on the connection's loop thread."""
     is_connection = isinstance(address, ConnectionTwin)
-    loop = address._loop if is_connection else LoopThread()
+    loop: LoopThread | None = None
     try:
+        loop = address._loop if is_connection else LoopThread()
         async_address = address.aio if is_connection else address
         context: OpenContext[Any] = loop.open_context(open_async(async_address, **options))
     except BaseException as error:
-        if not is_connection:
+        if loop is not None and not is_connection:
             loop.close()
         if isinstance(error, KeyboardInterrupt):  # The traceback inside this library would not help the user.
             raise error.with_traceback(None) from error.__cause__

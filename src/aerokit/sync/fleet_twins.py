@@ -120,16 +120,17 @@ class Selection(SelectionTwin["AsyncSelection"]):
             speed_m_s: ground speed in m/s; None: unchanged.
             max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
-            stagger_s: delay in seconds between the starts of consecutive members; None: all at once. Not for corridors.
-            separation: result of :meth:`plan_separation` for these targets.
+            stagger_s: delay in seconds between the starts of consecutive members, on each leg; None: all at once. Not
+                for corridors.
+            separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
             InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` would change the delays of
                 corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
-            OperationRejected: paths come too close and cannot be separated, and nothing was sent; or a member became
-                unavailable after the separation was planned. Then nothing was sent, or after a leg the others stay in
-                their layers.
+            OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
+                members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
+                Then the others stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -153,7 +154,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> Deconfliction:
         """Compare the straight paths to these targets and plan their separation. Nothing is sent.
 
-        Members without a target count as obstacles at their current positions. Publishes :class:`PathsCompared`.
+        Members without a target count as obstacles at their last known positions. Publishes :class:`PathsCompared`.
 
         Args:
             targets: as for :meth:`go_to`.
@@ -184,8 +185,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             show: the trajectories.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
 
         Raises:
             InvalidArgument: the name of a track is not that of a member.
@@ -210,8 +211,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
-            origin: the place from which the show's metres count. If it has no altitude above sea level, it is at the
-                altitude of the first member's home.
+            origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
+                altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start.
             lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
@@ -251,9 +252,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds for each member and each leg; None: no limit.
 
         Raises:
-            InvalidArgument: a name is unknown, or two places are too close. Nothing was sent.
+            InvalidArgument: a name is unknown, two places are too close, or the speed is not allowed. Nothing was sent.
             OperationRejected: the leader is unavailable, or paths come too close. Nothing was sent.
-            ValueUnknownError: the position of the leader or of a follower is unknown.
+            ValueUnknownError: the position of the leader or of a follower, or a heading that is needed, is unknown.
         """
         return self._loop.run(self.aio.form, formation, leader=leader, speed_m_s=speed_m_s, timeout=timeout)
 
@@ -335,6 +336,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Args:
             timeout: seconds until all members have finished; None: no limit.
+
+        Raises:
+            OperationRejected: the last upload failed for a member, or had no mission for these members.
         """
         return self._loop.run(self.aio.wait_missions_finished, timeout=timeout)
 
@@ -346,8 +350,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> Deconfliction:
         """Compare the paths of missions, regardless of time, and publish :class:`PathsCompared`. Nothing is sent.
 
-        Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced by the
-        member's present altitude.
+        Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
+        item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
+        by the member's present altitude.
 
         Args:
             missions: maps names of members to missions.
@@ -355,6 +360,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
+            OperationRejected: a member is unavailable.
             ValueUnknownError: the position of a member is unknown.
         """
         return self._loop.call(self.aio.compare_missions, missions, min_distance_m=min_distance_m)
@@ -378,7 +384,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
             **options: keyword arguments of the method.
 
         Raises:
-            InvalidArgument: there is no such action, or an argument is wrong. Nothing was sent.
+            InvalidArgument: there is no such action, or there are arguments for a function. Nothing was sent. If the
+                method refuses an argument, each member fails instead.
         """
         return self._loop.run(self.aio.do, action, *arguments, timeout=timeout, stagger_s=stagger_s, **options)
 
@@ -461,11 +468,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
         timeout: float = 60.0,
         description: str = "barrier",
     ) -> FleetResult:
-        """Wait until a condition is true for every member.
+        """Wait until a condition has been true for every available member, not necessarily at the same time.
 
         Args:
-            condition: function of a member; it is called four times a second and when the member's state changes.
-            timeout: seconds until the condition is true for all members.
+            condition: function of a member; it is called four times a second and when the member's state changes, until
+                it is true for this member.
+            timeout: seconds until the condition has been true for all members.
             description: name of the barrier in errors.
 
         Raises:
@@ -523,7 +531,7 @@ class Fleet(FleetTwin, Selection):
         self._loop.call(self.aio.reclaim, name)
 
     def release(self, name: str, reason: str = "released by the program") -> None:
-        """Exclude members from actions until :meth:`reclaim`. Nothing is sent, so the members continue as before.
+        """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
 
         Args:
             name: a member's name or a pattern.
@@ -546,7 +554,7 @@ class Fleet(FleetTwin, Selection):
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.
-            ConnectionClosed, LinkLost: a link has ended. Links before it have already got the corrections.
+            ConnectionClosed, LinkLost: a link has ended. The other links got the corrections.
         """
         return self._loop.call(self.aio.send_corrections, rtcm)
 

@@ -2686,8 +2686,13 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         A :meth:`pause` by another task does not end the wait, but a pilot who then changes to another mode than that of
         the mission does. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
-        a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
+        a download, unless another station has replaced the mission since. If the item is unknown, the mode after the
         completion shows whether the vehicle lands.
+
+        A replaced mission is noticed when the call begins, by another number of items, by another mission id (PX4 1.15
+        and later), or by the vehicle's answer to the other station (only on a link shared with that station). A mission
+        with the same number of items that arrives at ArduPilot over another link, or as a file, is not noticed: call
+        :meth:`download` first if another station may replace missions.
 
         Args:
             timeout: seconds to wait; None for no limit.

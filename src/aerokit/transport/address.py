@@ -75,8 +75,8 @@ class LinkAddress(Snapshot):
 def parse_address(text: str) -> LinkAddress:
     """Parse a connection string.
 
-    A bare ``host:port`` and ``udp:`` listen, as in DroneKit and pymavlink. In forms with a scheme, percent-encoded
-    characters of devices and paths are decoded.
+    A bare ``host:port`` and ``udp:`` listen, as in DroneKit and pymavlink. In forms with a scheme, except
+    ``pty:``, percent-encoded characters of devices and paths are decoded.
 
     Raises:
         InvalidArgument: the string is wrong; the text has the reason and the accepted forms.
@@ -236,7 +236,7 @@ class _Parser:
             if _is_ipv6(host):
                 raise self.error("an IPv6 address needs brackets, as in [::1]:14550")
             if host.isdigit() and not tail:  # The text is only a port, e.g. in "udpin:14550".
-                raise self.error(f"the host is missing, as in {kind}:127.0.0.1:{host}")
+                raise self.error(f"the host is missing; write {kind}:127.0.0.1:{host}")
         if not host and kind in _LISTENING:
             host = "0.0.0.0"
         if not host:
@@ -257,7 +257,7 @@ class _Parser:
                     raise self.error(f"{key}={endpoint} is not a zenoh endpoint such as tcp/10.0.0.5:7447")
         fleet, slash, name = text.partition("/")
         if not slash:
-            raise self.error(f"the name of the vehicle is missing, as in {kind}://fleet/alpha")
+            raise self.error(f"the name of the vehicle is missing; write it as in {kind}://fleet/alpha")
         try:
             check_name("the fleet", fleet)
             check_name("the name", name)
@@ -306,7 +306,7 @@ class _Parser:
         return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
 
     def parse_options(self, kind: LinkKind, query: str) -> dict[str, str]:
-        """Parse and check the options after the ``?``. Options that have their default value are left out."""
+        """Parse and check the options after the ``?``. rtscts=0, costly=0 and speed=1, the defaults, are left out."""
         options: dict[str, str] = {}
         allowed = _OPTIONS.get(kind, ())
         if kind not in _NEVER_COSTLY:
@@ -324,7 +324,7 @@ class _Parser:
                     raise self.error(f"{key}= is empty")
             else:
                 options[key] = self.checked_option(key, value.strip().lower())
-        # An option with its default value is left out, so that equal links have equal addresses.
+        # Left out, so that equal links have equal addresses.
         defaults = (("rtscts", "0"), ("costly", "0"), ("speed", "1"))
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 

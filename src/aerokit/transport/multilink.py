@@ -120,7 +120,7 @@ class MultiLink(Link):
         if self._is_closed:
             raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
         if self._was_opened:
-            raise BusyError(f"{self.address} is open; a link can be opened only once")
+            raise BusyError(f"{self.address} was already opened; a link can be opened only once")
         self._was_opened, self._receiver = True, receiver
         self._foreign.clear()
         self._is_opening, self._last_loss = True, None
@@ -207,15 +207,17 @@ class MultiLink(Link):
         self._receiver = None
         for opening in openings:
             opening.cancel()
-        await asyncio.wait(openings)
-        for link in self._own_links:
-            link.close()
-        # A closed link cannot be opened again.
-        for index, make_link in enumerate(self._factories):
-            if index not in self._foreign:
-                self._links[index] = make_link()
-        self._is_available = [False] * len(self._links)
-        self._was_opened = False
+        try:
+            await asyncio.wait(openings)
+        finally:  # The caller may be cancelled again; anyio does so at each await.
+            for link in self._own_links:
+                link.close()
+            # A closed link cannot be opened again.
+            for index, make_link in enumerate(self._factories):
+                if index not in self._foreign:
+                    self._links[index] = make_link()
+            self._is_available = [False] * len(self._links)
+            self._was_opened = False
 
     def _start_opening(self, index: int) -> None:
         task = asyncio.get_running_loop().create_task(self._retry_opening(index), name="aerokit opening")
@@ -223,12 +225,16 @@ class MultiLink(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _retry_opening(self, index: int) -> None:
-        """Try to open a link until it is open or this link is closed, with increasing delays."""
+        """Try to open a link, with increasing delays, until it is open, it can never be opened, or this link ends."""
         backoff = Backoff()
         is_reported = False
         while not self._is_closed:
             await asyncio.sleep(backoff.next_delay())
-            error = await self._open_one(index)
+            try:
+                error = await self._open_one(index)
+            except Exception as failure:  # e.g. another connection has opened the link meanwhile
+                logger.warning("one of several links is given up: %s", failure)
+                return
             if error is None:
                 return
             logger.debug("the link still cannot be opened: %s", error)
@@ -263,6 +269,8 @@ class MultiLink(Link):
                 receiver.link_interrupted(error)
             return
         self._receiver = None
+        for task in self._openings:
+            task.cancel()
         lost = LinkLost(f"all links are lost; the last error: {error}")
         lost.__cause__ = error
         receiver.link_lost(lost)

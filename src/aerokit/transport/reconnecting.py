@@ -130,7 +130,7 @@ class ReconnectingLink(Link):
         if self._is_closed:
             raise ConnectionClosed(f"{self.address} was closed; make a new link to open it again")
         if self._was_opened:
-            raise BusyError(f"{self.address} is open; a link can be opened only once")
+            raise BusyError(f"{self.address} was already opened; a link can be opened only once")
         self._was_opened, self._receiver = True, receiver
         self._current = current = _CurrentReceiver(self)
         try:
@@ -219,7 +219,7 @@ class ReconnectingLink(Link):
         try:
             while not await self._try_to_open():
                 pass
-        except Exception as error:  # The program's make_link() raised, so further attempts are useless.
+        except Exception as error:  # make_link() failed, or returned a link that can never be opened.
             lost = LinkLost(f"{self.address} cannot be reopened: {error}")
             lost.__cause__ = error
             self._end(lost)

@@ -90,12 +90,9 @@ class SerialLink(BaseLink):
     async def _connect(self) -> None:
         """Open the port. This method contains no await, so that it cannot be cancelled halfway."""
         self._loop = asyncio.get_running_loop()
-        self._port = port = self._open_port()
+        self._port, self._transport = self._open_port()
         self._released.clear()
-        self._transport = importlib.import_module("serial_asyncio").SerialTransport(
-            self._loop, _SerialProtocol(self), port
-        )
-        _replace_port_methods(port, self._device_failed)
+        _replace_port_methods(self._port, self._device_failed)
         limit = max(4096, int(self._baud / 10 * _MAX_BUFFER_S))
         # The transport must buffer nothing itself: data that the driver does not accept waits in the outbox, where it
         # can be discarded.
@@ -108,19 +105,26 @@ class SerialLink(BaseLink):
             stalled=self._report_stalled,
         )
 
-    def _open_port(self) -> Any:
+    def _open_port(self) -> tuple[Any, Any]:
+        """Open the port with pyserial. Return the port and its transport."""
         try:
             return self._open_device()
         except (OSError, ValueError, OverflowError) as error:
             raise _open_error(self.address, error) from None
 
-    def _open_device(self) -> Any:
-        """Open the port with pyserial. Raises OSError, or ValueError for an unsupported baud rate."""
+    def _open_device(self) -> tuple[Any, Any]:
+        """See `_open_port`. Raises OSError, or ValueError for an unsupported baud rate."""
         serial = importlib.import_module("serial")
         try:
-            return serial.Serial(
+            port = serial.Serial(
                 self._device, self._baud, rtscts=self._rtscts, exclusive=True, timeout=0, write_timeout=0
             )
+            try:
+                transport_class = importlib.import_module("serial_asyncio").SerialTransport
+                return port, transport_class(self._loop, _SerialProtocol(self), port)  # configures the port once more
+            except BaseException:
+                port.close()
+                raise
         except _TermiosError as error:
             # This error occurs if the device vanishes while it is being opened. pyserial does not convert it.
             raise serial.SerialException(*error.args) from error
@@ -173,7 +177,8 @@ class SerialLink(BaseLink):
             with contextlib.suppress(Exception):
                 # Without this call, close() would wait up to 30 s for the unsent data.
                 self._port.reset_output_buffer()
-        self._port.close()
+        with contextlib.suppress(OSError):  # The device may be gone.
+            self._port.close()
         self._released.set()
 
 
@@ -239,8 +244,8 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
 def _open_error(address: str, error: Exception) -> OSError:
     """Return the LinkOpenError for an error of pyserial, with a hint for the user."""
     number = error.errno if isinstance(error, OSError) else None
-    # An error of termios has no `errno`: its number is only in the text.
-    if number is None and str(errno.ENOTTY) in str(error):
+    # pyserial puts an error of termios into its text: "Could not configure port: (25, 'Inappropriate ioctl …')".
+    if number is None and f"({errno.ENOTTY}, " in str(error):
         number = errno.ENOTTY
     cause = OSError(number, os.strerror(number)) if number else OSError(str(error))
     is_missing = number in (errno.ENOENT, errno.ENXIO, errno.ENODEV)

@@ -69,8 +69,7 @@ def bind_to(address: SocketAddress, kind: socket.SocketKind) -> socket.socket:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         # With SO_REUSEADDR, a TCP port can be bound again just after it was closed. The option is not set on Windows,
         # where another program could then bind the same port at the same time.
-        is_windows = not hasattr(socket, "AF_UNIX")
-        if kind is socket.SOCK_STREAM and not is_windows:
+        if kind is socket.SOCK_STREAM and sys.platform != "win32":
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address.address)
     except BaseException:

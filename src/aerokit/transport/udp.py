@@ -92,7 +92,7 @@ class _UdpLink(BaseLink):
         try:
             await self._loop.create_datagram_endpoint(lambda: _DatagramProtocol(self), sock=sock)
         except BaseException:
-            self._released.set()  # asyncio has already closed the socket.
+            self._released.set()  # asyncio closes the socket in the next iteration of the loop.
             raise
 
     def _transport_opened(self, transport: asyncio.DatagramTransport) -> None:
@@ -285,7 +285,7 @@ class UdpBroadcast(_UdpLink):
         elif not self._keeps_peers:
             # The receiver does not choose peers, so this link does: `write` sends to this peer instead of broadcasting.
             self.keep_peer(source)
-        # Such a link has a single remote end for its receiver, so its peer is None.
+        # To a receiver that does not keep peers, this link has a single remote end, so the peer is None.
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:

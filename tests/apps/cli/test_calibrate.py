@@ -10,7 +10,7 @@ from typing import Any
 
 import anyio
 import pytest
-from cli_harness import run_on
+from cli_harness import records, run_on
 
 from aerokit.apps.cli import calibrate
 from aerokit.apps.cli.calibrate import bar, lines_of
@@ -51,6 +51,12 @@ def test_picture_fits_small_terminal(pose: Pose) -> None:
     assert all(len(line) < 80 and line.isascii() for line in [*lines, bar(0.5)])
 
 
+def test_long_instruction_is_shown_to_its_end() -> None:
+    text = "Place the vehicle on its left side on a level surface, do not move it, and keep away from the propellers"
+    lines = lines_of(CalibrationStep("accelerometer", 0.5, text))
+    assert " ".join(line.strip() for line in lines) == text
+
+
 def test_pictures_of_poses_differ() -> None:
     assert len({"\n".join(lines_of(CalibrationStep("level", None, "", pose))) for pose in Pose}) == len(Pose)
 
@@ -70,8 +76,11 @@ def test_compass_prints_fitness(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_end_of_input_cancels_on_vehicle(entered: list[bool], capsys: pytest.CaptureFixture[str]) -> None:
     entered += [True, False]
-    assert run(SimulatedCopter(boot_time_s=0.0), "accelerometer") == 130
-    assert "not cancelled on the vehicle" in capsys.readouterr().out
+    assert run(SimulatedCopter(boot_time_s=0.0), "accelerometer", "--json") == 130
+    cancellation = records(capsys.readouterr().out)[-1]
+    assert cancellation["type"] == "calibration_cancelled"
+    assert cancellation["is_cancelled"] is False
+    assert "not cancelled on the vehicle" in cancellation["text"]
 
 
 @pytest.mark.parametrize("kind", [SimulatedCopter, SimulatedPx4])

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from served_copter import served
 
-from aerokit.apps.cli import main
+from aerokit.apps.cli import devices, main
+from aerokit.apps.cli.main import make_parser
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedGimbal
 
 Run = Callable[..., tuple[int, str, str]]
@@ -45,6 +49,17 @@ def run(address: str, capsys: pytest.CaptureFixture[str]) -> Run:
         return code, printed.out, printed.err
 
     return run
+
+
+@pytest.mark.parametrize("success", [True, None])
+def test_picture_without_address_is_reported_as_not_downloaded(
+    success: bool | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = make_parser("camera").parse_args(["camera", "photo", "--to", str(tmp_path)])
+    capture: Any = SimpleNamespace(index=3, place=None, file_url="", success=success, to_dict=dict)
+    camera: Any = None  # is not needed, because nothing is downloaded
+    assert asyncio.run(devices._show(options, camera, capture)) is False
+    assert "not downloaded: its address was not reported" in capsys.readouterr().out
 
 
 def test_camera_info_prints_model_capabilities_and_storage(run: Run) -> None:

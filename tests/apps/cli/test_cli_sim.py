@@ -9,6 +9,8 @@ import re
 import sys
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import anyio
 import pytest
@@ -18,7 +20,7 @@ from aerokit import connect
 from aerokit.apps.cli import main
 from aerokit.apps.cli.arguments import DEFAULT_SIM_ADDRESS, FAULTS, expand_address, fault, is_address_template
 from aerokit.apps.cli.main import make_parser
-from aerokit.apps.cli.sim import _client_address, _inject, simulated_fleet
+from aerokit.apps.cli.sim import _client_address, _emit_addresses, _inject, simulated_fleet
 from aerokit.errors import AerokitError
 from aerokit.sim import HOME, SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.sim.faults import Faults
@@ -147,6 +149,14 @@ def test_sim_pty_prints_name_of_other_end(tmp_path: Path, capsys: pytest.Capture
 )
 def test_zenoh_client_address_connects_to_listening_endpoint(options: str, client: str) -> None:
     assert _client_address("zenohin://f/a", f"zenohin://f/a{options}") == client
+
+
+def test_sim_hint_has_endpoint_of_first_vehicle(capsys: pytest.CaptureFixture[str]) -> None:
+    template = "zenohin://f/v{id}?listen=tcp/0.0.0.0:{7440+id}"
+    options = make_parser("sim").parse_args(["sim", template, "--system-id", "5"])
+    server: Any = SimpleNamespace(addresses=["zenohin://f/v5"], vehicles_on=[[SimpleNamespace(system_id=5)]])
+    _emit_addresses(server, options)
+    assert "try: aerokit demo --connect 'zenoh://f/v5?connect=tcp/127.0.0.1:7445'\n" in capsys.readouterr().out
 
 
 def test_negative_coordinates_are_parsed_as_values() -> None:

@@ -119,6 +119,13 @@ def test_params_set_and_get_round_trip(run: Run) -> None:
     assert [line.split() for line in out.splitlines()] == [["WPNAV_SPEED", "725.5"], ["LOG_BITMASK", "255"]]
 
 
+def test_params_load_with_unknown_name_counts_it_as_not_set(run: Run) -> None:
+    Path("mine.param").write_text("WPNAV_ACCEL_Z,110\nNO_SUCH,1\n")
+    code, out, _ = run("params", "load", "mine.param")
+    assert code == 5
+    assert "2 parameters in mine.param, 1 of them differed, 1 were not set\n" in out
+
+
 def test_params_set_with_unknown_name_sets_the_others(run: Run) -> None:
     code, out, _ = run("params", "set", "WPNAV_ACCEL=210", "NO_SUCH=1")
     assert code == 5

@@ -15,6 +15,7 @@ import aerokit
 from aerokit.apps.cli import fly, main
 from aerokit.apps.cli import fly as flown_plan
 from aerokit.apps.cli.mission import read_plan
+from aerokit.errors import InvalidArgument
 from aerokit.mavlink.enums import CopterMode, MavCmd
 from aerokit.sim import SimulatedCopter, SimulatedRover, SimulatedSub, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
@@ -67,6 +68,19 @@ def test_fly_from_auto_shows_no_warning_about_mode(copter: SimulatedCopter, caps
 def test_fly_sim_starts_at_planned_home(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_virtual(run_on(None, "fly", "m.waypoints", "--sim")) == 0
     assert "simulated copter at 47.397742, 8.545594" in capsys.readouterr().out
+
+
+def test_fly_sim_starts_at_sea_level_if_planned(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = []
+
+    def simulated_vehicle(kind: str, home: tuple[float, float, float], **options: object) -> None:
+        started.append(home)
+        raise InvalidArgument("end of this test")
+
+    monkeypatch.setattr("aerokit.apps.cli.sim.simulated_vehicle", simulated_vehicle)
+    Path("m.waypoints").write_text(MISSION.replace("\t488\t", "\t0\t"))
+    assert run_virtual(run_on(None, "fly", "m.waypoints", "--sim")) == 2
+    assert started == [(47.397742, 8.545594, 0.0)]
 
 
 @pytest.mark.parametrize(
@@ -199,8 +213,9 @@ def test_fly_of_invalid_file_fails(content: str, code: int, text: str, capsys: p
 
 def test_fly_contradicting_options_exit_with_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*FLY, "--sim", "--connect", "tcp:127.0.0.1:1"]) == 2
-    assert main([*FLY, "--vehicle", "plane"]) == 2
-    assert "--vehicle needs --sim" in capsys.readouterr().err
+    for option, value in (("--vehicle", "plane"), ("--speedup", "5")):
+        assert main([*FLY, option, value]) == 2
+        assert f"{option} needs --sim" in capsys.readouterr().err
 
 
 # -------------------------------------------------------------------------------------- Ctrl-C

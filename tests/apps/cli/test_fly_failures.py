@@ -8,6 +8,8 @@ import io
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import anyio
 import pytest
@@ -17,14 +19,21 @@ from exhaustive import exhaustive
 import aerokit
 from aerokit.apps.cli import fly, main
 from aerokit.apps.cli import fly as flown_plan
+from aerokit.apps.cli.flight_recording import _StillnessNearGround
+from aerokit.apps.cli.fly import PlanFlight
+from aerokit.apps.cli.main import make_parser
+from aerokit.apps.cli.mission import read_plan
 from aerokit.apps.cli.output import TIMED_OUT, emit, emit_error
+from aerokit.apps.cli.supervised_flight import FlightReport
+from aerokit.apps.cli.terminal import InterruptStack
 from aerokit.errors import OperationRejected
 from aerokit.logs.flights import read_flight
 from aerokit.logs.report.statistics import statistics_of, summary
-from aerokit.mavlink.enums import CopterMode
-from aerokit.mavlink.messages import ParamValue
+from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.mavlink.messages import ParamValue, VfrHud
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import read_waypoint_file
+from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
 from aerokit.transport.link import memory_link_pair
@@ -67,16 +76,19 @@ def test_interrupted_arm_command_arriving_late_is_disarmed(
     assert "the arm command may still take effect" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("answers", [True, False])
 def test_fly_ctrl_c_during_takeoff_returns_to_launch(
-    copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
+    answers: bool, copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The last received landed state is "on ground", but the vehicle refuses to disarm."""
+    """The last received landed state is "on ground", but the vehicle refuses to disarm, or does not answer."""
 
     async def scenario() -> int:
         async with simulated_link(copter) as link:
             flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
             while copter.is_landed:  # noqa: ASYNC110 - there is nothing to await
                 await anyio.sleep(0.02)
+            if not answers:
+                copter.faults.ignore(MavCmd.COMPONENT_ARM_DISARM)
             ctrl_c()
             return await flight
 
@@ -341,3 +353,63 @@ def test_fly_in_unknown_simulation_counts_its_seconds(
     assert run_virtual(scenario()) == 0
     out = capsys.readouterr().out
     assert re.search(r"armed for 1 min 0\d s \(a simulation at 5 times real speed: 1\d s on this clock\)", out)
+
+
+@pytest.mark.parametrize(
+    ("last_command", "is_warned"), [(20, False), (21, False), (85, False), (16, True), (189, True)]
+)
+def test_fly_warns_if_mission_does_not_end_with_landing(last_command: int, is_warned: bool) -> None:
+    """Commands: return, land, VTOL landing, waypoint, DO_LAND_START."""
+    Path("m.waypoints").write_text(MISSION.replace("\t20\t", f"\t{last_command}\t"))
+    options = make_parser("fly").parse_args(["fly", "m.waypoints"])
+    vehicle: Any = SimpleNamespace(distance_to=lambda _: 10.0, connection=SimpleNamespace(now=lambda: 0.0))
+    report = FlightReport(vehicle, options, speedup=1.0)
+    flight = PlanFlight(vehicle, read_plan("m.waypoints"), report, InterruptStack(), options)
+    assert any("does not end with a landing or return" in text for text in flight._warnings()) is is_warned
+
+
+def test_status_line_has_no_old_speed(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:
+    options = make_parser("fly").parse_args(["fly", "m.waypoints"])
+
+    async def scenario() -> None:
+        async with simulated_link(copter) as link, aerokit.connect(link) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            copter.faults.lose(VfrHud, times=1000)
+            async with FlightReport(vehicle, options, speedup=1.0).running():
+                await anyio.sleep(8)
+
+    run_virtual(scenario())
+    assert "STABILIZE, speed unknown" in capsys.readouterr().out
+
+
+def test_fly_progress_ends_silently_with_connection(copter: SimulatedCopter) -> None:
+    """Its error must not replace that of the flight."""
+    ours, theirs = memory_link_pair()
+    options = make_parser("fly").parse_args(["fly", "m.waypoints"])
+
+    async def scenario() -> None:
+        async with SimulatorServer([copter], [theirs]), aerokit.connect(ours) as vehicle:
+            report = FlightReport(vehicle, options, speedup=1.0)
+            flight = PlanFlight(vehicle, read_plan("m.waypoints"), report, InterruptStack(), options)
+            progress = asyncio.create_task(flight._print_progress())
+            await anyio.sleep(1)
+            theirs.close()
+            await progress
+
+    run_virtual(scenario())
+
+
+@pytest.mark.parametrize(
+    ("age_s", "height_m", "has_lasted"), [(0.0, 0.5, True), (30.0, 0.5, False), (0.0, None, False), (0.0, 9.0, False)]
+)
+def test_only_new_positions_near_ground_show_stillness(age_s: float, height_m: float | None, has_lasted: bool) -> None:
+    now = [100.0]
+    here = Position(47.4, 8.5, altitude_relative_m=height_m)
+    vehicle: Any = SimpleNamespace(
+        connection=SimpleNamespace(now=lambda: now[0]), position=SimpleNamespace(latest=here, age=age_s)
+    )
+    stillness = _StillnessNearGround(vehicle, 20.0)
+    now[0] = 120.0
+    stillness.update()
+    assert stillness.has_lasted is has_lasted

@@ -340,7 +340,11 @@ def test_params_set_without_equals_sign_error_says_how(capsys: pytest.CaptureFix
     [
         ({}, "'aerokit-mavlink[monitor]'"),
         ({"url": "file:///home/me/aerokit", "dir_info": {}}, "'aerokit-mavlink[monitor] @ file:///home/me/aerokit'"),
-        ({"url": "file:///home/me/aerokit", "dir_info": {"editable": True}}, "-e '/home/me/aerokit[monitor]'"),
+        ({"url": "file:///home/me/my%20kit", "dir_info": {"editable": True}}, "-e '/home/me/my kit[monitor]'"),
+        (
+            {"url": "https://git.example/aerokit.git", "vcs_info": {"vcs": "git", "commit_id": "5ae20c17"}},
+            "'aerokit-mavlink[monitor] @ git+https://git.example/aerokit.git@5ae20c17'",
+        ),
     ],
 )
 def test_missing_extra_names_command_for_this_installation(

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import anyio
 import pytest
-from cli_harness import GROUND_STATION, HOME, ctrl_c, run_on, run_on_messages, run_with
+from cli_harness import GROUND_STATION, HOME, ctrl_c, records, run_on, run_on_messages, run_with
 from flight_harness import Wire
 
 import aerokit
 from aerokit import messages as m
-from aerokit.apps.cli import main
+from aerokit.apps.cli import listening, main
 from aerokit.apps.cli.listening import _printing_kept_name
 from aerokit.apps.cli.output import TIMED_OUT
 from aerokit.connection.frame_observers import keep_existing
@@ -45,6 +45,15 @@ def test_status_of_signing_vehicle_names_missing_key(
     assert "  arming   not known whether it arms: no COMMAND_ACK" in out
     assert "frames are signed" in err.splitlines()[0]
     assert copter.now < 25.0, "both commands must finish soon"
+
+
+def test_status_counts_frames_and_seconds_from_opening_of_link(capsys: pytest.CaptureFixture[str]) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.faults.heartbeats_stopped = True
+    copter.call_later(8.0, lambda: setattr(copter.faults, "heartbeats_stopped", False))
+    assert run_with(copter, ["status", "--json"]) == [0]
+    link = next(record for record in records(capsys.readouterr().out) if record["type"] == "link")
+    assert link["seconds"] > 11
 
 
 def test_status_of_armed_vehicle_does_not_call_it_ready(capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,6 +182,17 @@ def test_events_prints_events_until_ctrl_c(capsys: pytest.CaptureFixture[str]) -
     assert "ModeChanged  STABILIZE" in out
     assert "INFO: ArduPilot Ready" in out
     assert "LinkReport" not in out
+
+
+def test_events_names_number_of_missed_events(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(listening, "_MAX_WAITING_EVENTS", 1)
+    texts = [(1, 1, m.Statustext(6, f"text {number}")) for number in range(3)]
+    assert run_on_messages([(1, 1, m.Heartbeat(2, 3, 81, 0, 3, 3)), *texts], "events", "--seconds", "4") == 0
+    lines = capsys.readouterr().out.splitlines()
+    text_at = next(index for index, line in enumerate(lines) if line.endswith("INFO: text 2"))
+    assert lines[text_at - 1] == "3 events were dropped"
 
 
 def test_events_control_characters_are_replaced(capsys: pytest.CaptureFixture[str]) -> None:

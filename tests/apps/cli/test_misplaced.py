@@ -35,7 +35,7 @@ PLACE = "udpin:127.0.0.1:14999"
         (f"mission check {PLACE}", f"aerokit record {PLACE} flight.tlog"),
         (PLACE, f"aerokit status {PLACE}"),
         (f"record flight.tlog {PLACE}", "the recording must follow the address: ADDRESS flight.tlog"),
-        (f"demo --connect {PLACE} {PLACE}", "is a second address, after --connect"),
+        (f"demo --connect {PLACE} {PLACE}", "is a second address, besides --connect"),
         ("status survey.plan", "`aerokit fly survey.plan` flies it"),
         ("params list --connect mine.param", "`aerokit params load mine.param` sets these parameters"),
         ("monitor hover.py", "`aerokit run hover.py` runs a DroneKit program"),

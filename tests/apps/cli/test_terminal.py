@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import io
 import os
@@ -55,6 +56,22 @@ def test_countdown_with_json_or_pipe_is_hidden(monkeypatch: pytest.MonkeyPatch) 
     assert stderr_without_vehicle(monkeypatch, io.StringIO(), "params", "list").startswith("aerokit: ")
 
 
+class FullTerminal(Terminal):
+    def write(self, text: str) -> int:
+        raise OSError(28, "No space left on device")
+
+
+def test_countdown_error_does_not_replace_error_of_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def wait() -> None:
+        async with asking.waiting(argparse.Namespace(json=False), "tcp:127.0.0.1:1", 30.0):
+            await asyncio.sleep(3.0)
+            raise LookupError
+
+    with monkeypatch.context() as patch, pytest.raises(LookupError):
+        patch.setattr(sys, "stderr", FullTerminal())
+        run_virtual(wait())
+
+
 # ------------------------------------------------------------------------------------ question
 
 
@@ -86,6 +103,17 @@ def test_confirm_while_waiting_does_not_block_loop(
         os.close(ours)
     assert turns == [False] * 5
     assert capsys.readouterr().err == "fly? [y/N] "
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no epoll")
+@pytest.mark.parametrize(("content", "is_confirmed"), [(b"y\n", True), (b"", False), (b"\xff\n", False)])
+def test_confirm_reads_redirected_input(
+    content: bytes, is_confirmed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "input").write_bytes(content)
+    with (tmp_path / "input").open(encoding="utf-8") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert asyncio.run(asyncio.wait_for(asking.confirm("fly?"), 10.0)) is is_confirmed
 
 
 # ---------------------------------------------------------------------------------- completion

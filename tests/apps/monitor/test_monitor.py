@@ -19,7 +19,7 @@ from aerokit.apps.cli.listening import _event_text
 from aerokit.apps.monitor import app as monitor
 from aerokit.apps.monitor import model as model_module
 from aerokit.apps.monitor.app import ConfirmScreen, Monitor, Panel
-from aerokit.apps.monitor.lines import DANGER, LINK_STYLES, WARNING, Canvas, VehicleText, number
+from aerokit.apps.monitor.lines import DANGER, LINK_STYLES, WARNING, Canvas, VehicleText, _heading, number
 from aerokit.apps.monitor.model import SEVERITY_STYLES, MonitorModel, _event_line
 from aerokit.connection.opening import open_connection
 from aerokit.connection.tasks import BackgroundTasks
@@ -107,8 +107,8 @@ async def test_monitor_commands_named_vehicle_after_confirmation() -> None:
         await it.press("y")
         assert set(it.mode_commands()) == {2}
         assert [each.mode.value.name for each in it.app._model.vehicles.values()] == ["STABILIZE", "LAND"]
-        await it.wait_drawn("land: command sent")
-        assert "land: command sent" in it.screen()
+        await it.wait_drawn("land: sending")
+        assert "land: sending" in it.screen()
 
 
 @pytest.mark.exhaustive
@@ -232,6 +232,11 @@ def test_number_has_no_sign_for_zero(value: float | None, text: str) -> None:
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize(("heading_deg", "text"), [(0.2, "0°"), (359.4, "359°"), (359.7, "0°"), (-10.0, "350°")])
+def test_heading_has_no_360_degrees(heading_deg: float, text: str) -> None:
+    assert _heading(heading_deg) == text
+
+
 async def test_heading_is_shown_once_and_zero_without_sign() -> None:
     async with stage(1) as it:
         await it.wait_drawn("climb")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
+from importlib import import_module
 
+import anyio
 import pytest
 
 import aerokit
-from aerokit.apps.network import Publisher, publishing
+from aerokit.apps.network import Publisher, discover, publishing, zenoh_publisher
 from aerokit.apps.network.mqtt_publisher import parse_broker
 from aerokit.errors import InvalidArgument
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -51,3 +54,35 @@ def test_publisher_error_does_not_end_connection(caplog: pytest.LogCaptureFixtur
     with caplog.at_level(logging.ERROR, "aerokit"):
         run_virtual(run())
     assert len([each for each in caplog.records if "publisher" in each.getMessage()]) == 1
+
+
+def test_cancelled_zenoh_publisher_has_closed_its_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed_sessions = []
+
+    async def open_session(*_: object) -> str:
+        return "session"
+
+    def close_session(session: str, closed: Callable[[], object]) -> None:
+        def close() -> None:
+            closed_sessions.append(session)
+            closed()
+
+        asyncio.get_running_loop().call_later(1.0, close)
+
+    async def run() -> None:
+        with anyio.CancelScope() as scope:
+            async with zenoh_publisher("zenoh://north/alpha"):
+                scope.cancel()
+                await anyio.sleep(10)
+        assert closed_sessions == ["session"]
+
+    module = import_module("aerokit.apps.network.zenoh_publisher")
+    monkeypatch.setattr(module, "open_session", open_session)
+    monkeypatch.setattr(module, "close_session", close_session)
+    run_virtual(run())
+
+
+@pytest.mark.parametrize("wait", [0.0, -1.0, float("nan")])
+def test_discover_with_invalid_wait_raises(wait: float) -> None:
+    with pytest.raises(InvalidArgument, match="wait"):
+        asyncio.run(discover("north", wait=wait))

@@ -219,6 +219,14 @@ def test_impact_on_hill_counts_once_vehicle_is_disarmed() -> None:
     assert flight.fly([(30.0, 0.0)] * 3)
 
 
+def test_fall_from_tree_is_crash() -> None:
+    """The impact on the tree is still described when the vehicle hits the ground."""
+    free_fall = [(20.0 - 4.9 * (STEP_S * step) ** 2, 9.8 * STEP_S * step) for step in range(1, 20)]
+    flight = FakeFlight()
+    assert not flight.fly([*sinking(40, 90.0, 20.0)[:-118], *free_fall])
+    assert flight.fly([(0.0, 0.0)] * 40)
+
+
 def test_jumping_height_after_impact_does_not_hide_crash() -> None:
     """PX4's estimate after a fall, measured in its simulator."""
     assert FakeFlight().fly([*sinking(40, 90.0, 0.0)[:-120], *[(0.0, 0.0), (1.1, 0.0), (0.0, 0.0), (-1.1, 0.0)] * 10])

@@ -118,6 +118,7 @@ async def test_invalid_arguments_send_nothing(order: str, body: object, text: st
         (b'{"altitude_m": 10}', {"Aerokit-Seen-At": "-100"}, 409),
         (b'{"altitude_m": 10}', {"Host": "evil.example"}, 421),
         (b'{"altitude_m": 10}', {"Origin": "http://evil.example"}, 403),
+        (b'{"altitude_m": 10}', {"Origin": "http://["}, 403),
         (b'{"altitude_m": 10}', {"Origin": "null"}, 403),
         (b'{"altitude_m": 10}', {"Origin": "http://127.0.0.1:9090"}, 403),
         (b'{"altitude_m": 10}', {"Sec-Fetch-Site": "cross-site"}, 403),
@@ -202,6 +203,7 @@ async def test_repeated_key_after_result_expiry_is_refused(monkeypatch: pytest.M
             await stage.submit("mode", {"mode": "NONE"})
         again = await stage.submit("arm", Idempotency_Key="the-same-key")
         assert (again.status_code, again.json()["error"]) == (409, "KeyUsed")
+        assert "its result is no longer stored" in again.json()["detail"]
         assert not stage.flight.copter.is_armed
 
 
@@ -311,6 +313,7 @@ async def test_disconnected_client_does_not_cancel_command() -> None:
         assert stage.flight.vehicle.position.value.distance_to(there) < 3
         record = await stage.client.get("/api/orders/gone-away", headers=BEARER)
         assert record.json()["state"] == "done"
+        assert 3 < record.json()["ended_unix_s"] - record.json()["given_unix_s"] < 33
 
 
 async def test_newer_command_overrules_older_one() -> None:

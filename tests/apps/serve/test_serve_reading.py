@@ -20,11 +20,15 @@ from aerokit.apps.readiness import readiness
 from aerokit.apps.serve import make_app
 from aerokit.apps.serve.app import STATIC
 from aerokit.apps.serve.failsafe import ground_station_failsafe
+from aerokit.apps.serve.served_vehicles import _thin_out
 from aerokit.apps.serve.stream import MAX_ANONYMOUS_SOCKETS, MAX_QUEUED_MESSAGES, MAX_SOCKETS
 from aerokit.autopilots import px4_custom_mode
 from aerokit.errors import InvalidArgument
-from aerokit.mavlink.enums import MavCmd
-from aerokit.mavlink.messages import AvailableModes
+from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import MavCmd, MavMissionResult
+from aerokit.mavlink.framer import Framer
+from aerokit.mavlink.messages import AvailableModes, MissionAck, ParamValue
+from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import (
     Fence,
     FenceCircle,
@@ -35,6 +39,7 @@ from aerokit.missions import (
     take_off,
 )
 from aerokit.parameters import load_metadata
+from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, SimulatedPlane, SimulatedPx4, SimulatedRover, SimulatedVehicle, simulated_link
 
 pytestmark = pytest.mark.anyio
@@ -81,6 +86,23 @@ async def test_mission_with_changed_count_is_downloaded_again() -> None:
         await mission.upload(Mission([take_off(altitude_relative_m=10), return_to_launch()]))
         await anyio.sleep(3)
         assert await names() == ["NAV_TAKEOFF", "NAV_RETURN_TO_LAUNCH"]
+
+
+async def test_mission_of_same_length_is_downloaded_again() -> None:
+    """Another program has uploaded it, whose answer from the vehicle arrives on a shared link."""
+    async with open_stage() as stage:
+        mission, copter = stage.flight.vehicle.mission, stage.flight.copter
+
+        async def names() -> list[str]:
+            answer = await stage.client.get("/api/vehicles/1/mission", headers=BEARER)
+            return [each["name"] for each in answer.json()["items"]]
+
+        await mission.upload(Mission([take_off(altitude_relative_m=10)]))
+        assert await names() == ["NAV_TAKEOFF"]
+        copter.missions.replace(0, Mission([return_to_launch()]).to_items(home_is_item_0=True))
+        assert await names() == ["NAV_TAKEOFF"]
+        stage.flight.wire.deliver(FrameEncoder(1, 1).encode(MissionAck(254, 190, MavMissionResult.ACCEPTED)))
+        assert await names() == ["NAV_RETURN_TO_LAUNCH"]
 
 
 @pytest.mark.parametrize("is_open", [True, False])
@@ -261,6 +283,33 @@ async def test_slow_client_gets_newest_state_and_stalled_is_closed() -> None:
         assert socket.task.done()
 
 
+class SlowSocket(Socket):
+    """Takes a message every 10 ms, while a new event is published."""
+
+    async def _take(self, message: object) -> None:
+        await anyio.sleep(0.01)
+        self.app._served.publish({"type": "event", "event": "Test"})
+        await super()._take(message)
+
+
+async def test_stream_of_slow_client_has_states_among_many_events() -> None:
+    async with open_stage() as stage, SlowSocket(stage.app, query="rate_hz=5") as socket:
+        with anyio.fail_after(2):
+            for _ in range(5):
+                await socket.next("state")
+
+
+async def test_failed_stream_is_logged_and_closed(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with open_stage() as stage, Socket(stage.app) as socket:
+        await socket.next("state")
+        monkeypatch.setattr(stage.app._served, "snapshot", lambda: json.dumps(object()))
+        assert (await socket.next("websocket.close"))["code"] == 1011
+    assert "the stream of states has failed" in caplog.text
+    assert "is not JSON serializable" in caplog.text
+
+
 async def test_client_that_sends_is_disconnected() -> None:
     async with open_stage() as stage, Socket(stage.app) as socket:
         await socket.next("state")
@@ -285,6 +334,28 @@ async def test_track_covers_flight_within_limit(monkeypatch: pytest.MonkeyPatch)
         assert points[0][:2] == pytest.approx((start.latitude_deg, start.longitude_deg), abs=1e-6)
         end = vehicle.position.value
         assert points[-1][:2] == pytest.approx((end.latitude_deg, end.longitude_deg), abs=2e-5)
+
+
+def test_full_track_keeps_marks_of_gaps() -> None:
+    here = Position(47.0, 8.0)
+    track = [(here.offset(north_m=index), index in (4, 7)) for index in range(8)]
+    _thin_out(track)
+    assert [(round(position.distance_to(here)), is_after_gap) for position, is_after_gap in track] == [
+        (0, False),
+        (1, False),
+        (3, False),
+        (5, True),
+        (7, True),
+    ]
+
+
+async def test_failed_background_task_is_logged(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aerokit.apps.serve.served_vehicles.TRACK_GAP_S", None)
+    async with open_stage():
+        await anyio.sleep(1)
+    assert "a task of aerokit serve has failed" in caplog.text
 
 
 async def test_track_marks_gap_after_silence() -> None:
@@ -389,6 +460,18 @@ async def test_failsafe_is_named_from_parameters(
         for name, value in values.items():
             await vehicle.parameters.set(name, value)
         assert ground_station_failsafe(vehicle)["action"] == action
+
+
+async def test_recording_has_parameters_that_were_read(tmp_path: Path) -> None:
+    """A report reads PARAM_VALUE, so MAVFTP is not used during a recording."""
+    path = tmp_path / "flight.tlog"
+    async with open_stage() as stage:
+        stage.flight.vehicle.connection.record(path)
+        answer = await stage.client.get("/api/vehicles/1/parameters", headers=BEARER)
+        assert len(answer.json()["parameters"]) == len(stage.flight.copter.parameters)
+    frames = Framer().receive(b"".join(raw for _, raw in read_tlog(path)), 0.0)
+    recorded = {ParamValue.decode_body(frame.body).param_id for frame in frames if frame.message_id == ParamValue.ID}
+    assert recorded >= set(stage.flight.copter.parameters)
 
 
 async def test_parameters_have_metadata(tmp_path: Path) -> None:

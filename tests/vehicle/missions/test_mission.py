@@ -10,7 +10,7 @@ from typing import Any
 import anyio
 import pytest
 from flight_harness import Flight, Px4Flight, now, open_flight, open_px4
-from plan_flights import long_mission, short_mission
+from plan_flights import long_mission, near_home, short_mission
 
 from aerokit import events
 from aerokit import messages as m
@@ -22,7 +22,16 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavMissionType, MavResult, MissionState
+from aerokit.mavlink import FrameEncoder
+from aerokit.mavlink.enums import (
+    CopterMode,
+    MavCmd,
+    MavLandedState,
+    MavMissionResult,
+    MavMissionType,
+    MavResult,
+    MissionState,
+)
 from aerokit.missions import Mission, MissionItem
 from aerokit.missions.actions import jump
 from aerokit.missions.navigation import return_to_launch, waypoint
@@ -93,6 +102,28 @@ async def test_mission_replaced_by_another_station_is_flown_to_landing() -> None
         await mission.start()
         await mission.wait_finished(timeout=600)
         assert flight.vehicle.landed_state.value == MavLandedState.ON_GROUND
+
+
+async def test_mission_with_another_id_is_flown_to_landing() -> None:
+    """PX4 reports another id of the mission after another station has replaced it by one of the same length."""
+    async with armed(open_px4, waypoint(*near_home(18), altitude_relative_m=4)) as flight:
+        flight.px4.missions.replace(MavMissionType.MISSION, short_mission(flight, return_to_launch()).to_items())
+        await anyio.sleep(2.0)
+        await flight.vehicle.mission.start()
+        await flight.vehicle.mission.wait_finished(timeout=600)
+        assert flight.vehicle.landed_state.value == MavLandedState.ON_GROUND
+
+
+@pytest.mark.parametrize("station", [(254, 190), (255, 190)])
+async def test_mission_accepted_from_another_station_is_finished_in_air(station: tuple[int, int]) -> None:
+    """On a shared link, ArduPilot's answer to the other station, which may have our ids, shows a new mission."""
+    async with armed(open_flight, return_to_launch()) as flight:
+        replacement = short_mission(flight, waypoint(*near_home(18), altitude_relative_m=4))
+        flight.copter.missions.replace(MavMissionType.MISSION, replacement.to_items(home_is_item_0=True))
+        flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(*station, MavMissionResult.ACCEPTED)))
+        await flight.vehicle.mission.start()
+        await flight.vehicle.mission.wait_finished(timeout=600)
+        assert flight.vehicle.landed_state.value == MavLandedState.IN_AIR
 
 
 async def test_unknown_mission_that_ends_in_air_is_finished_there() -> None:

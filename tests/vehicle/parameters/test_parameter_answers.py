@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import anyio
 import pytest
 from flight_harness import Flight
 
@@ -111,6 +112,23 @@ async def test_echo_of_previous_write_confirms_nothing(grounded: Flight) -> None
     assert (await parameters.set("LAND_SPEED", 61)).outcome == "set"
     assert lost
     assert copter.parameters["LAND_SPEED"] == 61
+
+
+async def test_late_value_during_other_writes_does_not_stay(grounded: Flight) -> None:
+    """The late answer to a read arrives after the confirmation, but before those of the other parameters."""
+    copter, parameters = grounded.copter, grounded.vehicle.parameters
+    await parameters.get("LAND_SPEED")
+    on_set = copter.handlers[ParamSet.ID]
+
+    def send_late_value(message: ParamSet, channel: Any) -> None:
+        if message.param_id == "RTL_ALT":
+            copter.send(ParamValue("LAND_SPEED", 50, message.param_type, len(copter.parameters), 65535))
+        on_set(message, channel)
+
+    copter.handlers[ParamSet.ID] = send_late_value
+    await parameters.set_many({"LAND_SPEED": 61, "RTL_ALT": 2000})
+    await anyio.sleep(1.5)
+    assert parameters.table["LAND_SPEED"].value == copter.parameters["LAND_SPEED"] == 61
 
 
 async def test_echo_of_cancelled_write_confirms_nothing(grounded: Flight) -> None:

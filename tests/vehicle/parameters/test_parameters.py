@@ -293,6 +293,20 @@ async def test_late_message_with_replaced_value_is_ignored() -> None:
         assert parameters.table["RTL_ALT"].value == 1500
 
 
+async def test_write_undone_by_another_station_at_once_is_noticed() -> None:
+    """The value looks like a late message from before the write, so it is read when no late message may arrive."""
+    simulated = copter()
+    async with open_flight(simulated) as flight:
+        received, parameters = ParameterEvents(flight), flight.vehicle.parameters
+        await parameters.download()
+        await parameters.set("RTL_ALT", 2000)
+        other = FrameEncoder(254, 190)
+        simulated.receive(other.encode(messages.ParamSet(1, 1, "RTL_ALT", 1500.0, 6)), simulated.now)
+        await anyio.sleep(1.5)
+        assert received.events == [("RTL_ALT", 1500, 2000), ("RTL_ALT", 2000, 1500)]
+        assert parameters.table["RTL_ALT"].value == 1500
+
+
 async def test_block_exit_unsubscribes() -> None:
     async with open_flight(copter()) as flight:
         kept: Parameters = flight.vehicle.parameters

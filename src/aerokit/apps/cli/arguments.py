@@ -64,6 +64,7 @@ def address_or_template(text: str) -> str:
 
 
 def vehicle_kind(text: str) -> str:
+    """Parse the kind of a simulated vehicle, or the path of a recording (.tlog) that it replays."""
     from aerokit.sim.kinds import kind_class
 
     if text.endswith(".tlog"):
@@ -251,14 +252,14 @@ def add_record(command: argparse._ActionsContainer) -> None:
 
 
 def add_faults(command: argparse._ActionsContainer) -> None:
-    """Add ``--fault NAME[@S]`` for simulated vehicles."""
+    """Add ``--fault NAME[=VALUE][@S]`` for simulated vehicles."""
     faults = command.add_argument(
         "--fault",
         action="append",
         type=fault,
         default=[],
         dest="faults",
-        metavar="NAME[@S]",
+        metavar="NAME[=VALUE][@S]",
         help="fault of every simulated vehicle, from the start or after S simulated seconds (repeatable):"
         f" {', '.join(FAULTS)}; loss=0.2 loses a fifth of the frames, 'prearm_failures=TEXT' refuses to arm",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import address, number, port
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
@@ -195,18 +195,9 @@ async def _publish(options: argparse.Namespace) -> int:
 
 async def _wait_until_ended(connection: Connection, stop: asyncio.Event) -> None:
     """Wait until ``stop`` is set or the connection ends. Raise the error that ended the connection."""
-    ended: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
-    connection.on_end(ended.set_result)
-    stopped = asyncio.ensure_future(stop.wait())
-    waits: set[asyncio.Future[Any]] = {ended, stopped}
-    try:
-        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        stopped.cancel()
-        with suppress(asyncio.CancelledError):
-            await stopped
-    if ended.done():
-        connection.raise_if_ended()
+    connection.on_end(lambda _: stop.set())
+    await stop.wait()
+    connection.raise_if_ended()
 
 
 def _emit_serving(options: argparse.Namespace, bridge: FoxgloveBridge) -> None:

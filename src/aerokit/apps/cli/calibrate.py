@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from typing import TYPE_CHECKING
 
 import anyio
@@ -131,14 +132,17 @@ async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
 
 async def _cancel(options: argparse.Namespace, calibration: Calibration) -> int:
     text = "cancelled on the vehicle"
+    is_cancelled = False
     try:
         with anyio.fail_after(_CANCEL_TIMEOUT_S):
             await calibration.cancel()
+        is_cancelled = True
     except (NotSupported, OperationTimeout) as error:
         text = f"not cancelled on the vehicle: {error}"
     except TimeoutError:  # This error has no text.
         text = f"not cancelled on the vehicle: it did not confirm within {_CANCEL_TIMEOUT_S:g} s"
-    emit(options, "calibration_cancelled", {"sensor": options.sensor, "text": text}, f"{options.sensor}: {text}")
+    record = {"sensor": options.sensor, "is_cancelled": is_cancelled, "text": text}
+    emit(options, "calibration_cancelled", record, f"{options.sensor}: {text}")
     return INTERRUPTED
 
 
@@ -178,7 +182,7 @@ class Display:
 
 
 def lines_of(step: CalibrationStep) -> list[str]:
-    """Return a step as lines of text: the picture of the pose, the instruction, and the poses that follow."""
+    """Return a step as lines of text: the picture of the pose, the poses that follow, and the instruction."""
     lines = []
     if step.pose is not None:
         view = "seen from behind" if step.pose in _FROM_BEHIND else "seen from the right side"
@@ -186,7 +190,9 @@ def lines_of(step: CalibrationStep) -> list[str]:
         lines = ["", f"  {step.pose.value.upper()} ({view})", *PICTURES[step.pose].strip("\n").splitlines(), _GROUND]
         if next_poses:
             lines.append(f"  then: {next_poses}")
-    return [*lines, f"  {step.instruction[:76]}"]
+    # An instruction may be a text of the vehicle, of any length.
+    instruction = textwrap.wrap(step.instruction, 76, max_lines=3, placeholder=" ...")
+    return [*lines, *(f"  {line}" for line in instruction)]
 
 
 def bar(progress: float) -> str:

@@ -54,7 +54,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         type=writable_file,
         default=_DEFAULT_LOG,
         metavar="FILE",
-        help=f"record all messages ({_DEFAULT_LOG}); an existing file is kept as demo.1.tlog",
+        help=f"record all messages (default: {_DEFAULT_LOG}; an existing file is kept as demo.1.tlog)",
     )
     command.add_argument(
         "--speedup", type=number(0.1, 100), default=5.0, metavar="X", help="simulation speed factor (default: 5)"
@@ -153,8 +153,8 @@ class _SquareFlight(SupervisedFlight):
         """Wait until the vehicle is ready, then arm it and take off."""
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready")
-        take_off_plan = vehicle.autopilot.take_off(altitude_m, 0.0, is_vtol=vehicle.is_vtol)  # sends nothing
-        if take_off_plan is None:
+        # This only describes a take-off, and sends nothing. The altitude of home does not matter for the check.
+        if vehicle.autopilot.take_off(altitude_m, home_altitude_amsl_m=0.0, is_vtol=vehicle.is_vtol) is None:
             raise NotSupported(f"demo: {vehicle.autopilot.firmware} cannot take off")
         await record_parameters(vehicle, self._print)
         await vehicle.wait_ready(timeout=_READY_TIMEOUT_S)

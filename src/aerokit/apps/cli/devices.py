@@ -119,13 +119,15 @@ async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -
     text = f"{capture.index:>5}  {place_text}  {_printable_text(capture.file_url)}".rstrip()
     record = {name: value for name, value in capture.to_dict().items() if name != "received_at"}
     emit(options, "picture", record, text)
-    if options.to is None or not capture.success:
-        has_failed = capture.success is False  # None if the camera has not reported the result
-        return not has_failed
-    name = _file_name(capture)
+    if capture.success is False:  # None if the camera has not reported the result
+        return False
+    if options.to is None:
+        return True
+    name = _file_name(capture) if capture.file_url else None
     if name is None:
+        reason = "unsafe file name in its address" if capture.file_url else "its address was not reported"
         not_fetched = {"index": capture.index, "file": None, "bytes": None}
-        emit(options, "fetched_picture", not_fetched, "       not downloaded: unsafe file name in its address")
+        emit(options, "fetched_picture", not_fetched, f"       not downloaded: {reason}")
         return False
     content = await camera.read_picture(capture)
     target = _write_new(options.to, name, content)

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import anyio
 
-from aerokit.apps.cli.output import DONE
-from aerokit.errors import AerokitError
+from aerokit.apps.cli.output import DONE, plain_text
+from aerokit.errors import AerokitError, OperationTimeout
+from aerokit.events import SILENT_AFTER_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,8 +33,10 @@ async def record_parameters(vehicle: Vehicle, print_line: Callable[[str], None])
     """
     try:
         table = await vehicle.parameters.download(method="list", timeout=_PARAMETERS_TIMEOUT_S)
-    except AerokitError:
+    except OperationTimeout:
         print_line(f"  the recording lacks parameters: not all were received within {_PARAMETERS_TIMEOUT_S:g} s")
+    except AerokitError as error:  # the end of the connection, or a refusal
+        print_line(f"  the recording lacks parameters: {plain_text(error)}")
     else:
         print_line(f"  {len(table)} parameters recorded")
 
@@ -82,14 +85,19 @@ class _StillnessNearGround:
         """True if the vehicle had been still for the whole time at the last `update`."""
 
     def update(self) -> None:
-        """Update ``has_lasted`` from the vehicle's latest position. Call this regularly."""
+        """Update ``has_lasted`` from the vehicle's latest position. Call this regularly.
+
+        An old position, and one without a height, do not show that the vehicle lies still near the ground.
+        """
         now = self._vehicle.connection.now()
         position = self._vehicle.position.latest
         if position is None:
             return
+        is_old = self._vehicle.position.age > SILENT_AFTER_S
         has_moved = self._still_at is None or position.distance_to(self._still_at) > _MAX_DRIFT_M
-        is_high = abs(position.altitude_relative_m or 0.0) > _MAX_HEIGHT_M
-        if has_moved or is_high:
+        height_m = position.altitude_relative_m
+        is_near_ground = height_m is not None and abs(height_m) <= _MAX_HEIGHT_M
+        if is_old or has_moved or not is_near_ground:
             self._still_at = position
             self._still_since = now
         self.has_lasted = now - self._still_since >= self._min_duration_s

@@ -92,8 +92,7 @@ class PlanFlight(SupervisedFlight):
             await vehicle.mission.wait_finished()
         finally:
             progress.cancel()
-            with suppress(asyncio.CancelledError):
-                await progress
+            await asyncio.wait({progress})
         return await self._finish()
 
     async def _download_mission(self) -> tuple[MissionItem, ...]:
@@ -130,8 +129,12 @@ class PlanFlight(SupervisedFlight):
             distance = self._vehicle.distance_to(first_position)
             if distance > _MAX_START_DISTANCE_M:
                 warnings.append(f"the first waypoint is {distance / 1000:.1f} km away")
-        if not any(part in items[-1].name for part in ("LAND", "RETURN_TO_LAUNCH")):
-            warnings.append("the mission does not end with a landing or return: the vehicle stays at its last waypoint")
+        # The last item could also be DO_LAND_START, which does not land.
+        if not any(part in items[-1].name for part in ("NAV_LAND", "NAV_VTOL_LAND", "RETURN_TO_LAUNCH")):
+            warnings.append(
+                "the mission does not end with a landing or return: the vehicle stays at its last waypoint, or returns"
+                " to launch (ArduPlane)"
+            )
         return warnings
 
     @property
@@ -151,17 +154,17 @@ class PlanFlight(SupervisedFlight):
 
     async def _print_progress(self) -> None:
         """Print each new mission item. If the mode changes, explain why the flight does not end at once."""
-        with (
-            self._vehicle.subscribe(events.MissionCurrentChanged, events.ModeChanged, capacity=100) as changes,
-            suppress(AerokitError),
-        ):
-            async with anyio.create_task_group() as group:
+        async with anyio.create_task_group() as group:
+            with (
+                self._vehicle.subscribe(events.MissionCurrentChanged, events.ModeChanged, capacity=100) as changes,
+                suppress(AerokitError),  # the end of the connection, which also ends the flight
+            ):
                 async for event in changes:
                     if isinstance(event, events.ModeChanged):
                         group.start_soon(self._explain_wait, event.after)
                     elif isinstance(event, events.MissionCurrentChanged) and event.after is not None:
                         self._print(f"to item {event.after}{self._name_of(event.after)}")
-                group.cancel_scope.cancel()
+            group.cancel_scope.cancel()
 
     async def _explain_wait(self, mode: str) -> None:
         """Print why the flight does not fail at once when the mode changes to ``mode``.
@@ -226,7 +229,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add_record(command)
     add_vehicle(command)
     add_json(command)
-    command.set_defaults(run=run_fly, connect=None)
+    # `run_fly` must know whether --connect is given, so it fills in the default address itself. argparse has no public
+    # list of a group's options.
+    command.set_defaults(run=run_fly, connect=None, simulation_actions=tuple(simulated._group_actions))
 
 
 async def run_fly(options: argparse.Namespace) -> int:
@@ -255,16 +260,9 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
         raise InvalidArgument(f"{options.file} has no mission items, so there is nothing to fly")
     if options.sim and options.connect is not None:
         raise InvalidArgument("--sim and --connect cannot be used together")
-    simulation_options = {
-        "--vehicle": options.vehicle,
-        "--parameter": options.parameters or None,
-        "--wind": options.wind,
-        "--battery": options.battery,
-        "--fault": options.faults or None,
-    }
-    for name, value in simulation_options.items():
-        if value is not None and not options.sim:
-            raise InvalidArgument(f"{name} needs --sim")
+    for action in options.simulation_actions:
+        if getattr(options, action.dest) != action.default and not options.sim:
+            raise InvalidArgument(f"{action.option_strings[0]} needs --sim")
     if not (options.sim or options.yes or is_interactive()):
         raise InvalidArgument(
             "cannot ask for confirmation, because stdin is not a terminal; --yes omits the question; nothing was sent"
@@ -324,7 +322,8 @@ async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: Asyn
     latitude_deg, longitude_deg, altitude_m = HOME
     if start is not None:
         latitude_deg, longitude_deg = start.latitude_deg, start.longitude_deg
-        altitude_m = start.altitude_amsl_m or altitude_m
+        if start.altitude_amsl_m is not None:
+            altitude_m = start.altitude_amsl_m
     home = (latitude_deg, longitude_deg, altitude_m)
     vehicle = simulated_vehicle(kind, home=home, boot_time_s=_SIM_BOOT_TIME_S, **conditions(options))
     scale_timeouts([vehicle], options.speedup, leave=dict(options.parameters))

@@ -170,11 +170,12 @@ async def _print_all(connection: Connection, options: argparse.Namespace) -> Non
         async with waiting(options, connection.link.address, _COUNTDOWN_S):
             event = await events.get()
         while True:
+            if events.missed > missed:
+                new_missed = events.missed - missed
+                emit(options, "missed", {"events": new_missed}, f"{new_missed} events were dropped")
+                missed = events.missed
             if options.all or not isinstance(event, LinkReport):
                 _emit_event(event, unix_time_at_0 + event.at, options)
-            if events.missed > missed:
-                emit(options, "missed", {"events": events.missed - missed}, None)
-                missed = events.missed
             event = await events.get()
 
 

@@ -64,8 +64,8 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
         if not takes_connect:
             return f"`{parser.prog}` takes no address; to record a link: aerokit record {shlex.quote(word)} flight.tlog"
         if any(argument.startswith("--connect") for argument in words):
-            return f"{word!r} is a second address, after --connect"
-        other_words = words[:index] + words[index + 1 :] or _required_arguments(parser)
+            return f"{word!r} is a second address, besides --connect"
+        other_words = (words[:index] + words[index + 1 :]) or _required_arguments(parser)
         line = shlex.join([*command, *other_words, "--connect", word])
         return f"{word!r} is an address, which needs --connect: {line}"
     return None
@@ -81,10 +81,11 @@ def _superfluous_connect(parser: argparse.ArgumentParser, words: list[str]) -> s
 
 
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
-    """Return the error text if an address is before the action, as in ``aerokit params udpin:… list``."""
+    """Return the error text for words that begin with an address, as in ``aerokit params udpin:… list``."""
     address, *after_address = words
     action, *arguments = after_address or ["ACTION"]
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
+    # For an unknown or a missing action, the first one shows whether the actions of this command take --connect.
     action_parser = actions.get(action) or next(iter(actions.values()))
     takes_connect = "--connect" in action_parser._option_string_actions
     address_words = ["--connect", address] if takes_connect else [address]

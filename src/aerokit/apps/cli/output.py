@@ -216,6 +216,7 @@ def import_extra(module: str, extra: str) -> Any:
 def _requirement(extra: str) -> str:
     """Return the pip argument that installs this package with an extra, from the source it was installed from."""
     from importlib.metadata import PackageNotFoundError, distribution
+    from urllib.parse import unquote
 
     try:
         source = json.loads(distribution("aerokit-mavlink").read_text("direct_url.json") or "{}")
@@ -223,7 +224,9 @@ def _requirement(extra: str) -> str:
         source = {}
     url = source.get("url", "")
     if url.startswith("file://") and source.get("dir_info", {}).get("editable"):
-        return f"-e '{url.removeprefix('file://')}[{extra}]'"
+        return f"-e '{unquote(url.removeprefix('file://'))}[{extra}]'"
+    if version_control := source.get("vcs_info"):
+        url = f"{version_control['vcs']}+{url}@{version_control['commit_id']}"
     return f"'aerokit-mavlink[{extra}]{f' @ {url}' if url else ''}'"
 
 

@@ -213,7 +213,9 @@ async def _load(options: argparse.Namespace) -> int:
         return _emit_results(options, results.values(), table, metadata)
     changed = [result for result in results.values() if result.outcome != "unchanged"]
     code = _emit_results(options, changed, table, metadata)
-    print(f"{len(results)} parameters in {options.file}, {len(changed)} of them differed")
+    failed_count = sum(result.error is not None for result in changed)
+    not_set = f", {failed_count} were not set" if failed_count else ""
+    print(f"{len(results)} parameters in {options.file}, {len(changed) - failed_count} of them differed{not_set}")
     if changed and metadata is None and not options.force:
         print(metadata_source(vehicle))
     return code

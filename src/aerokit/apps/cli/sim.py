@@ -347,7 +347,8 @@ def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> Non
         emit(options, "simulated", record, text if address == shared[0] else None)
     if not options.json:
         first_vehicle, *further_vehicles = server.vehicles_on[0]
-        client = _client_address(server.addresses[0], options.addresses[0])
+        argument = expand_address(options.addresses[0], 0, first_vehicle.system_id)
+        client = _client_address(server.addresses[0], argument)
         system_option = f" --system-id {first_vehicle.system_id}" if further_vehicles else ""
         print(f"try: aerokit demo --connect {client}{system_option}", flush=True)
         if client != _SERIAL_LINE_PLACEHOLDER:
@@ -363,7 +364,7 @@ def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
 def _client_address(address: str, argument: str) -> str:
     """Return the address with which a client on this machine connects; for a serial line, a placeholder.
 
-    ``address`` is the address of the open link, ``argument`` the address or template in the command line.
+    ``address`` is the address of the open link, ``argument`` the address in the command line, without placeholders.
     """
     scheme, _, location = address.partition(":")
     if scheme == "zenohin":
@@ -377,7 +378,7 @@ def _client_address(address: str, argument: str) -> str:
 
 def _zenoh_options(address: str) -> str:
     """Return the query part of the zenoh address with which a client connects to the simulator."""
-    parsed = parse_address(expand_address(address, number=0, system_id=1))
+    parsed = parse_address(address)
     endpoints = parsed.option("listen") or parsed.option("connect")
     config = parsed.option("config")
     options = []

@@ -215,12 +215,12 @@ async def run_status(options: argparse.Namespace) -> int:
     from aerokit.vehicle.connect import vehicles_on
 
     async with opened(options) as connection, vehicles_on(connection, rates={}) as vehicles:
+        started_at = connection.now()
         try:
             await await_vehicle(connection, options, options.patience)
         except AerokitError:
             _emit_components(connection, options, {})
             raise
-        started_at = connection.now()
         await anyio.sleep(options.seconds)
         vehicles_found = dict(vehicles)  # a copy, because more vehicles may be found while messages are requested
         all_checks = await asyncio.gather(*map(_readiness_of, vehicles_found.values()))
@@ -249,7 +249,8 @@ async def _readiness_of(vehicle: Vehicle) -> Readiness:
                 await _request(vehicle, message, cell)
             except CommandTimeout as error:
                 # A vehicle that does not answer one request would not answer the others either.
-                return Readiness((str(error), *vehicle.missing_for_flight()), (), is_known=False)
+                against_arming = (str(error), *vehicle.missing_for_flight())
+                return Readiness(against_arming, against_flight=(), is_known=False)
     return readiness(vehicle, await vehicle.why_not_armable())
 
 
@@ -263,7 +264,7 @@ async def _request(vehicle: Vehicle, message: Any, cell: Any) -> None:
 
 
 def _emit_link(connection: Connection, options: argparse.Namespace, seconds: float) -> None:
-    """Print what was received from all senders together. ``seconds`` is the time since the first heartbeat."""
+    """Print what was received from all senders together. ``seconds`` is the time since the link was opened."""
     statistics = list(connection.statistics())
     record = {
         "address": connection.link.address,

@@ -21,6 +21,7 @@ from aerokit.apps.readiness import arms_but_cannot_fly_text, readiness
 from aerokit.errors import (
     AerokitError,
     CommandRejected,
+    CommandTimeout,
     HeartbeatTimeout,
     OperationRejected,
     OperationTimeout,
@@ -86,10 +87,10 @@ class SupervisedFlight(ABC):
         except Exception as error:
             # All errors are caught, because a vehicle that this program has armed must not stay armed on the ground.
             text = plain_text(error)
-            if not self._prints_reasons:
+            if not self._prints_reasons:  # the reasons follow the first line of the text
                 text = text.partition("\n")[0].removesuffix("; still missing:")
             self._print(f"failed: {text}")
-            if HIT_GROUND in text:
+            if HIT_GROUND in str(error):
                 self._report.record_impact()
             if self.has_sent_arm_command:
                 await self._make_safe(partial(self._after_failure, error))
@@ -144,7 +145,7 @@ class SupervisedFlight(ABC):
             self._print(f"failed again: {plain_text(error)}")
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
 
-    async def _after_failure(self, error: Exception) -> int:
+    async def _after_failure(self, error: Exception) -> int:  # subclasses use the error
         """Disarm on the ground, if this program still has control. In the air, leave control to pilot or failsafe.
 
         If the vehicle is disarmed, wait for a late arming. The result, an exit code, is not used, because the error is
@@ -174,7 +175,8 @@ class SupervisedFlight(ABC):
         if self._is_armed_on_ground and action != "nothing":
             try:
                 await self._disarm()
-            except CommandRejected as error:  # the vehicle may have taken off after it reported its landed state
+            except (CommandRejected, CommandTimeout) as error:
+                # The vehicle may have taken off after it reported its landed state.
                 self._print(f"disarming failed: {plain_text(error)}")
             if vehicle.is_confirmed_disarmed or not self._check_control():
                 return DONE
@@ -195,7 +197,8 @@ class SupervisedFlight(ABC):
     async def _watch_late_arming(self) -> None:
         """Stay connected while an arm command may still take effect.
 
-        If the vehicle arms, `Vehicle.arm` disarms it again in the background. This method waits until it is disarmed.
+        If the vehicle arms, `Vehicle.arm` disarms it again in the background. This method waits until it is disarmed,
+        at most 30 s, and prints the vehicle's state.
         """
         if not self._may_arm_late:
             return
@@ -292,7 +295,7 @@ class FlightReport:
             for task in tasks:
                 task.cancel()
             with anyio.CancelScope(shield=True):
-                await asyncio.gather(*tasks, return_exceptions=True)
+                await asyncio.wait(tasks)  # asyncio itself logs the error of a task that has failed
 
     def record_impact(self) -> None:
         """Record that the vehicle has just hit the ground, so that the summary distinguishes the time before."""
@@ -415,7 +418,9 @@ class FlightReport:
             elif checks is not None and checks.against_flight:
                 self.print_line(f"  {arms_but_cannot_fly_text(vehicle)}: {'; '.join(checks.against_flight)}")
             else:
-                self.print_line(f"  {vehicle.mode_name}, {vehicle.ground_speed_m_s.latest or 0.0:.1f} m/s")
+                speed = vehicle.ground_speed_m_s
+                is_known = speed.age <= SILENT_AFTER_S
+                self.print_line(f"  {vehicle.mode_name}, {f'{speed.value:.1f} m/s' if is_known else 'speed unknown'}")
 
     def _on_velocity(self, _: Velocity | None, velocity: Velocity) -> None:
         if velocity.down_m_s >= IMPACT_M_S:

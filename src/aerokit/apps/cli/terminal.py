@@ -70,12 +70,15 @@ async def _read_line() -> str:
             line.set_result(text)
 
     def read() -> None:
-        text = sys.stdin.readline()
+        try:
+            text = sys.stdin.readline()
+        except (OSError, ValueError):  # the terminal has gone, or the input is not text
+            text = ""
         loop.call_soon_threadsafe(set_line, text)
 
     try:
         loop.add_reader(sys.stdin, read)
-    except NotImplementedError:  # on Windows
+    except (NotImplementedError, PermissionError):  # on Windows; and on Linux, if stdin is a file or /dev/null
         threading.Thread(target=read, daemon=True).start()
         return await line
     try:
@@ -156,8 +159,7 @@ async def waiting(
         yield
     finally:
         task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
+        await asyncio.wait({task})
 
 
 async def _count_down(text: str, seconds: float) -> None:

@@ -280,7 +280,7 @@ class Monitor(App[None]):
     async def _run_command(self, vehicle: Vehicle, method: str) -> None:
         command = KEY_COMMANDS[method].lower()
         add_line = partial(self._model.add_line, vehicle.system_id)
-        add_line(f"{command}: command sent", "bold")
+        add_line(f"{command}: sending", "bold")
         try:
             await getattr(vehicle, method)()
         except AerokitError as error:

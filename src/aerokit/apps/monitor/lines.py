@@ -96,7 +96,7 @@ class VehicleText:
             ("attitude", cell(vehicle.attitude, _attitude)),
             ("altitude", cell(vehicle.position, _altitude)),
             ("position", cell(vehicle.position, _coordinates)),
-            ("heading", cell(vehicle.heading_deg, lambda heading: f"{heading % 360:.0f}°")),
+            ("heading", cell(vehicle.heading_deg, _heading)),
             ("speed", self._speeds()),
             ("battery", cell(vehicle.batteries, lambda batteries: " · ".join(map(_battery, batteries)))),
             ("GPS", cell(vehicle.gps, lambda receivers: " · ".join(map(_gps, receivers)))),
@@ -133,7 +133,7 @@ class VehicleText:
         if more:
             columns += [
                 (10, cell(vehicle.ground_speed_m_s, _speed)),
-                (6, cell(vehicle.heading_deg, lambda heading: f"{heading % 360:.0f}°")),
+                (6, cell(vehicle.heading_deg, _heading)),
                 (40, cell(vehicle.gps, lambda receivers: _gps(receivers[0]))),
             ]
         if not self._silent_s and more:
@@ -257,6 +257,10 @@ def _mission(mission: MissionProgress) -> str:
     return f"item {mission.current}"
 
 
+def _heading(heading_deg: float) -> str:
+    return f"{round(heading_deg) % 360}°"
+
+
 def _speed(speed: float) -> str:
     return number(speed, 1, " m/s")
 
@@ -291,12 +295,12 @@ class Canvas:
 
     def __init__(self, columns: int, rows: int, points: Iterable[tuple[float, float]]) -> None:
         self._columns = max(columns, 2)
-        self._rows = max(rows - 1, 2)
+        self._rows = max(rows - 1, 2)  # without the last row
         all_points = list(points) or [(0.0, 0.0)]
         norths, easts = zip(*all_points, strict=True)
         self._middle_north = (max(norths) + min(norths)) / 2
         self._middle_east = (max(easts) + min(easts)) / 2
-        # Each Braille character has two columns and four rows of dots.
+        # Each Braille character has two columns and four rows of dots. One character is a margin at the edges.
         width_dots = 2 * (self._columns - 1)
         height_dots = 4 * (self._rows - 1)
         self._metres_per_dot: float = max(

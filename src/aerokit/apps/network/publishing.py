@@ -108,7 +108,7 @@ class Publishing:
         except Exception:  # an error would end this task and close the connection, perhaps during a flight
             if not self._has_logged_error:
                 self._has_logged_error = True
-                logger.exception("publisher %r raised an error; publishing continues", self._publisher)
+                logger.exception("the publisher %r could not publish a state; publishing continues", self._publisher)
             return
         self.published += 1
 

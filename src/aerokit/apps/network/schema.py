@@ -111,7 +111,7 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
     arguments = typing.get_args(value_type)
     if origin in (typing.Union, types.UnionType):
         return {"anyOf": [_schema_of(argument, definitions) for argument in arguments]}
-    if origin in (tuple, list):
+    if origin is tuple:
         first_type, *other_types = arguments
         if other_types == [Ellipsis]:  # any number of values of one type: tuple[float, ...]
             return {"type": "array", "items": _schema_of(first_type, definitions)}

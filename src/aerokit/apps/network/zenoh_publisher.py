@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from typing import TYPE_CHECKING, Any
 
 import anyio
 
-from aerokit._internal.arguments import checked
+from aerokit._internal.arguments import check_range, checked
 from aerokit._internal.async_block import async_block
 from aerokit.apps.network.publisher import Publisher
+from aerokit.connection.tasks import run_shielded
 from aerokit.errors import InvalidArgument
 from aerokit.transport.address import parse_address
 from aerokit.transport.create import network_options
@@ -71,10 +73,15 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
     try:
         yield publisher
     finally:
-        closed = asyncio.Event()
-        close_session(session, closed.set)
-        with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(closed.wait(), _CLOSE_SESSION_TIMEOUT_S)
+        await run_shielded(_close(session))
+
+
+async def _close(session: Any) -> None:
+    """Close a session, and wait for its end, but not longer than `_CLOSE_SESSION_TIMEOUT_S`."""
+    closed = asyncio.Event()
+    close_session(session, closed.set)
+    with anyio.move_on_after(_CLOSE_SESSION_TIMEOUT_S):
+        await closed.wait()
 
 
 @checked
@@ -104,6 +111,7 @@ async def discover(
         LinkOpenError: there is no network, or eclipse-zenoh is not installed.
     """
     check_name("fleet", fleet)
+    check_range("wait", wait, 0, math.inf, above=True)
     keys: set[str] = set()
     subscribers: list[Any] = []  # keeps the subscriber alive, because zenoh ends a garbage-collected subscription
 
@@ -120,13 +128,11 @@ async def discover(
 
     options = NetworkOptions(tuple(connect), tuple(listen), "", config)
     session = await open_session(f"zenoh://{fleet}", options, subscribe)
-    closed = asyncio.Event()
     try:
         await anyio.sleep(wait)
     finally:
         subscribers.clear()
-        close_session(session, closed.set)
-    await closed.wait()
+        await run_shielded(_close(session))
     names: set[str] = set()
     for key in keys:
         _, _, name, *_ = key.split("/")  # aerokit/FLEET/NAME/…

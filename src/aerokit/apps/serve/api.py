@@ -111,6 +111,7 @@ _ORDER: dict[str, Any] = {
         "order": {"type": "string"},
         "arguments": {"type": "object"},
         "given_unix_s": {"type": "number"},
+        "ended_unix_s": {"type": ["number", "null"], "description": "time of `done` or `failed`"},
         "state": {"enum": ["running", "done", "failed"]},
         "result": {},
         "problem": {"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]},
@@ -289,8 +290,8 @@ class HttpApi:
         self._settings = settings
         self._metadata = metadata
         self._locks: dict[Vehicle, asyncio.Lock] = {}
-        # Downloaded missions, fences and rally points, with the time of each download.
-        self._plans: dict[tuple[Vehicle, str], tuple[Mission | Fence | RallyPoints, float]] = {}
+        # Downloaded missions, fences and rally points, with the time of each download, and the version downloaded.
+        self._plans: dict[tuple[Vehicle, str], tuple[Mission | Fence | RallyPoints, float, tuple[int, int]]] = {}
         served.listen(self._on_message)
 
     def operations(self) -> tuple[Operation, ...]:
@@ -374,8 +375,9 @@ class HttpApi:
 
     async def _mission(self, request: Request) -> Response:
         mission, age_s = await self._plan(request, "mission")
-        current = self._vehicle_of(request).mission.current.latest
-        return json_response({"items": _items(mission), "current": current, "age_s": age_s})
+        control = self._vehicle_of(request).mission
+        place = {"current": control.current.latest, "version": list(control._version)}
+        return json_response({"items": _items(mission), "age_s": age_s, **place})
 
     async def _fence(self, request: Request) -> Response:
         fence, age_s = await self._plan(request, "fence")
@@ -389,15 +391,15 @@ class HttpApi:
         """Return the mission, fence or rally points of a vehicle, and their age in seconds."""
         vehicle, is_refresh = self._vehicle_of(request), self._is_refresh(request)
         async with self._lock(vehicle):
-            plan, read_at = self._plans.get((vehicle, kind), (None, 0.0))
-            # If the vehicle reports another number of mission items, its mission has changed. MAVLink does not report
-            # other changes.
+            plan, read_at, version = self._plans.get((vehicle, kind), (None, 0.0, None))
+            control = getattr(vehicle, kind)
             count = vehicle.mission.count.latest if kind == "mission" else None
-            has_changed = plan is not None and count is not None and count != len(plan.to_items())
+            has_other_count = plan is not None and count is not None and count != len(plan.to_items())
+            has_changed = has_other_count or version != control._version
             if plan is None or has_changed or is_refresh:
-                plan = await getattr(vehicle, kind).download()
+                plan = await control.download()
                 read_at = vehicle.connection.now()
-                self._plans[vehicle, kind] = plan, read_at
+                self._plans[vehicle, kind] = plan, read_at, control._version
         return plan, to_jsonable(vehicle.connection.now() - read_at)
 
     def _on_message(self, message: dict[str, Any]) -> None:
@@ -425,8 +427,10 @@ class HttpApi:
     async def _parameters(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
         is_refresh = self._is_refresh(request)
+        # A report reads the parameters of a recording from PARAM_VALUE, not from MAVFTP.
+        is_recorded = vehicle.connection._observers.recording is not None
         async with self._lock(vehicle):
-            table = await vehicle.parameters.download(refresh=is_refresh)
+            table = await vehicle.parameters.download(method="list" if is_recorded else "auto", refresh=is_refresh)
         metadata = self._metadata_of(vehicle)
         return json_response({"parameters": [_parameter(table[name], metadata) for name in sorted(table)]})
 

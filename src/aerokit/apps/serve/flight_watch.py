@@ -169,21 +169,20 @@ class FlightWatch:
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
         """Detect when an impact begins or is over, and evaluate it with each new velocity.
 
-        An impact begins with the first slower velocity after a fast descent.
+        An impact begins with the first slower velocity after a fast descent. A vehicle that falls again, from a tree,
+        has a second impact, unless it has already crashed.
         """
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
         at = self._vehicle.velocity.updated_at
         down_m_s = velocity.down_m_s
-        had_impact = bool(self._detector.describe())
         self._detector.update()
-        has_impact = bool(self._detector.describe())
         if down_m_s >= IMPACT_M_S:  # While the vehicle sinks fast, only the sink rate is stored.
             self._last_sink_at = at
             self._last_sink_m_s = down_m_s
-        elif not has_impact:
+        elif not self._detector.describe():
             self._forget_impact()
-        elif not had_impact:
+        elif self._crash is None and (self._impact_at is None or self._impact_at < self._last_sink_at):
             self._start_impact(at, down_m_s)
         if self._impact_at is not None:
             self._evaluate_impact(at, velocity.ground_speed_m_s, vertical_speed_m_s=abs(down_m_s))

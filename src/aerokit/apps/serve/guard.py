@@ -129,7 +129,7 @@ class SecurityMiddleware:
         }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one ASGI request: refuse it if `_check` fails, otherwise add the headers to its response."""
+        """Handle one ASGI request: refuse it if `_check` fails, and add the headers to every HTTP response."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -155,8 +155,8 @@ class SecurityMiddleware:
         host = headers.get("host", "")
         if not self._is_own_host(host):
             raise HttpProblem(421, "WrongHost", f"host name {host[:100]!r} is not allowed; --allow-host allows it")
-        origins = headers.getlist("origin")
-        if any(urlsplit(origin).netloc.lower() != host.lower() for origin in origins):
+        # An origin is a scheme, "://" and a host. Anything else, such as "null", is not this server.
+        if any(origin.partition("://")[2].lower() != host.lower() for origin in headers.getlist("origin")):
             raise HttpProblem(403, "WrongOrigin", "requests from pages of other sites are not allowed")
         # Links on other sites may open the page, but scripts and images of other sites must not request anything.
         if headers.get("sec-fetch-site", "none") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":

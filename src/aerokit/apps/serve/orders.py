@@ -262,6 +262,7 @@ _RECORD_FIELDS = (
     "order",
     "arguments",
     "given_unix_s",
+    "ended_unix_s",
     "state",
     "result",
     "problem",
@@ -278,6 +279,7 @@ class OrderRecord:
     order: str
     arguments: dict[str, Any]
     given_unix_s: float
+    ended_unix_s: float | None = None
     state: str = "running"
     result: Any = None
     problem: dict[str, Any] | None = None
@@ -309,8 +311,8 @@ class OrderRunner:
         """Start an order, or return the earlier order with this key. ``order_type.check`` has checked the arguments.
 
         Raises:
-            HttpProblem: the key is missing or was used for another order, the client has only seen an old state, or
-                ``force`` is not allowed.
+            HttpProblem: the key is missing, or was used for another order or for one whose result is no longer stored;
+                the client has only seen an old state; or ``force`` is not allowed.
             FileFormatError, InvalidArgument: the arguments cannot be parsed.
             BusyError: too many orders are running.
             HeartbeatTimeout: the vehicle is silent.
@@ -326,8 +328,15 @@ class OrderRunner:
         earlier = self._records.get(key)
         if earlier is not None and earlier.is_same(vehicle.system_id, order_type.name, recorded_arguments):
             return earlier
-        if earlier is not None or key in self._used_keys:
+        if earlier is not None:
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
+        if key in self._used_keys:  # perhaps for this order, which a new key would repeat
+            raise HttpProblem(
+                409,
+                "KeyUsed",
+                "an order with this Idempotency-Key has ended, and its result is no longer stored; nothing was sent"
+                " now: check the state of the vehicle before you give an order with a new key",
+            )
         self._check(vehicle, order_type, recorded_arguments, seen_at_s)
         unix_s = vehicle.connection.unix_time()
         record = OrderRecord(key, vehicle.system_id, order_type.name, recorded_arguments, unix_s)
@@ -419,6 +428,7 @@ class OrderRunner:
             if record.problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
+            record.ended_unix_s = vehicle.connection.unix_time()
             record.ended.set()
             self._publish(record)
 

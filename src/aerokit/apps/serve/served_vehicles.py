@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -30,6 +31,8 @@ from aerokit.vehicle.vehicle import Vehicle, overview
 if TYPE_CHECKING:
     from aerokit.connection.bus import Detach
     from aerokit.position import Position
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 Listener = Callable[[dict[str, Any]], object]
 
@@ -67,8 +70,7 @@ class ServedVehicles:
         self._message_count = 0
         self._snapshot = ""
         self._snapshot_at = -math.inf
-        # Errors of background tasks, such as the end of a connection, are ignored: the vehicles' states show the end.
-        self._background = BackgroundTasks(lambda error: None)
+        self._background = BackgroundTasks(_log_unexpected)
         self._vehicles: Mapping[int, Vehicle] = {}
         if isinstance(source, Connection):
             self._attach(source)
@@ -191,7 +193,7 @@ class ServedVehicles:
         silent: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
-                self._watch(vehicle)
+                self._watch(vehicle)  # begins to watch a new vehicle
                 position = vehicle.position.latest
                 if position is None or vehicle.position.age > TRACK_GAP_S:
                     silent.add(system_id)
@@ -202,7 +204,7 @@ class ServedVehicles:
                     if last_position.distance_to(position) < MIN_TRACK_STEP_M:
                         continue
                 if len(track) >= MAX_TRACK_POINTS:
-                    del track[1::2]
+                    _thin_out(track)
                 track.append((position, system_id in silent))
                 silent.discard(system_id)
             await anyio.sleep(TRACK_INTERVAL_S)
@@ -218,7 +220,7 @@ class ServedVehicles:
         """Return the overview of a vehicle, and further values that the page shows (docs/serve.md).
 
         ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
-        wire, where ArduPilot's item 0 is home. ``unarmable_mode`` is None if the vehicle can arm in its mode.
+        wire, where ArduPilot's item 0 is home.
         """
         watch = self._watch(vehicle)
         missing = vehicle.missing_for_flight()
@@ -242,9 +244,22 @@ class ServedVehicles:
             "active_failsafe": active_failsafe(vehicle),
             "mission_item": vehicle.mission.current.latest,
             "mission_items": vehicle.mission.count.latest,
+            "mission_version": list(vehicle.mission._version),
             "is_flying_mission": _is_flying_mission(vehicle),
             "unarmable_mode": unarmable_mode(vehicle),
         }
+
+
+def _log_unexpected(error: Exception) -> None:
+    """Log an error of a background task, unless it is about the vehicle or the link, whose states show it."""
+    if not isinstance(error, AerokitError):
+        logger.error("a task of aerokit serve has failed", exc_info=error)
+
+
+def _thin_out(track: list[tuple[Position, bool]]) -> None:
+    """Remove every second point, except the first point and the last one. The mark of a gap moves to the next point."""
+    pairs = zip(track[2::2], track[3::2], strict=False)
+    track[2:] = [(position, is_after_gap or removed[1]) for removed, (position, is_after_gap) in pairs]
 
 
 async def _read_return_altitude(vehicle: Vehicle) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from collections import deque
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from aerokit.apps.serve.guard import AccessControl
     from aerokit.apps.serve.orders import OrderRunner
     from aerokit.apps.serve.served_vehicles import ServedVehicles
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_SOCKETS = 32
 MAX_ANONYMOUS_SOCKETS = 16
@@ -94,10 +97,14 @@ class StateStream:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-        if receiving.done() and not receiving.cancelled() and receiving.exception() is None:
+        failure = None if sending.cancelled() else sending.exception()
+        if not receiving.cancelled() and receiving.exception() is None:
             code = 1008  # "policy violation": the client has sent a message
-        elif sending.done() and not sending.cancelled() and isinstance(sending.exception(), TimeoutError):
+        elif isinstance(failure, TimeoutError):
             code = 1013  # "try again later": the client does not read
+        elif receiving.cancelled() and not isinstance(failure, WebSocketDisconnect):  # the client is still connected
+            logger.error("the stream of states has failed", exc_info=failure)
+            code = 1011  # "internal error"
         else:
             return
         with suppress(Exception):  # the client may have disconnected
@@ -108,7 +115,7 @@ class StateStream:
         loop = asyncio.get_running_loop()
         queue: deque[dict[str, Any]] = deque()
         changed = asyncio.Event()
-        missed = 0  # number of messages that were dropped since the last message was sent
+        missed = 0  # number of messages that were dropped since the last one from the queue was sent
 
         def enqueue(message: dict[str, Any]) -> None:
             nonlocal missed
@@ -126,7 +133,7 @@ class StateStream:
                 if loop.time() >= next_snapshot_at:
                     await _send(socket, self._served.snapshot())
                     next_snapshot_at = loop.time() + period_s
-                while queue:
+                while queue and loop.time() < next_snapshot_at:
                     message = dict(queue.popleft())  # a copy, because all clients get the same object
                     if missed:
                         message["missed"] = missed

@@ -135,14 +135,14 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start a calibration. Param 1 is a mask of compasses (0: all). Param 3 is 1 to save without acceptance."""
+        """Start a calibration. Param 1 is a mask of compasses (0: all). Param 3 saves without acceptance."""
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
-        if not 0 <= command.param1 <= 255:
+        requested = (to_int(command.param1) or _ALL_COMPASSES) & _ALL_COMPASSES  # Other bits are ignored.
+        if not 0 <= command.param1 <= 255 or not requested:
             return MavResult.FAILED
-        requested = to_int(command.param1) & _ALL_COMPASSES  # Bits of compasses that are not fitted are ignored.
-        self._compass_mask = _ALL_COMPASSES if requested == 0 else requested
+        self._compass_mask = requested
         self._started_at = self._vehicle.now
         self._saves_at_once = command.param3 != 0.0
         return MavResult.ACCEPTED

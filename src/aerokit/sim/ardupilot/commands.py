@@ -43,7 +43,8 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
     }
     if vehicle.KIND != "sub":
         handlers[Cmd.DO_FOLLOW] = lambda command: Result.ACCEPTED if 0 < command.param1 <= 255 else Result.DENIED
-    # Each lambda reads the device again, because a reboot replaces the device objects.
+    # Each lambda reads the device again, because a reboot replaces the device objects. It does not replace `requests`
+    # and `calibrations`.
     if vehicle.KIND in ("copter", "plane"):
         handlers[Cmd.AIRFRAME_CONFIGURATION] = lambda command: vehicle.devices.move_gear(command)
         handlers[Cmd.DO_PARACHUTE] = lambda command: vehicle.devices.handle_chute(command)
@@ -364,6 +365,7 @@ class GimbalCommands:
         if mode == MavMountMode.GPS_POINT and not has_place_in_params:
             altitude = float(to_int(command.param4))  # The firmware uses whole metres (AP_Mount_Backend.cpp).
             frame = MavFrame.GLOBAL_RELATIVE_ALT
+            # The firmware does not check the place. In the simulation, an invalid one ends the look at a place.
             gimbal.look_at(self._vehicle.world_point(to_int(command.x), to_int(command.y), altitude, frame))
             return Result.ACCEPTED
         return Result.FAILED

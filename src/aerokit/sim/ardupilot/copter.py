@@ -288,10 +288,9 @@ class SimulatedCopter(CopterHost):
         heading = commanded_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
-        is_relative = command.param4 == 1.0
-        # Param 3 is the direction. For a relative angle, `commanded_heading` has already applied it, so the copter
-        # turns the shorter way (0).
-        direction = 0 if is_relative else int(command.param3)
+        direction = to_int(command.param3)
+        if command.param4 == 1.0:  # A relative turn of more than 180 degrees keeps its direction (autoyaw.cpp).
+            direction = direction or 1
         self.yaw.turn_to(heading, math.radians(command.param2), direction)
         return MavResult.ACCEPTED
 

@@ -239,7 +239,10 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Enter AUTO, which requires a mission; while armed on the ground, one that begins with a take-off."""
+        """Enter AUTO, which requires a mission, unless ``force`` is set.
+
+        While armed on the ground, even with ``force``, the mission must begin with a take-off.
+        """
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
             return True  # Arming enters the current mode again, which must not restart the mission.
@@ -444,8 +447,8 @@ class CopterAuto(MissionMode):
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
         if item.param4 > 0:  # The angle is relative; the direction (param 3) is its sign.
-            heading = self.vehicle.motion.yaw + math.copysign(heading, direction or 1.0)
-            direction = 0
+            direction = direction or 1
+            heading = self.vehicle.motion.yaw + math.copysign(heading, direction)
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:

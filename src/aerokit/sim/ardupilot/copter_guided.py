@@ -10,7 +10,7 @@ from aerokit.mavlink.enums import CopterMode, MavFrame
 from aerokit.mavlink.messages import SetAttitudeTarget, SetPositionTargetGlobalInt, SetPositionTargetLocalNed
 from aerokit.sim.ardupilot.copter_modes import CopterHost, CopterModeBase, CopterTakeOff
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import PositionTarget, Setpoint, is_finite, rotated
+from aerokit.sim.commands import PositionTarget, Setpoint, constrained, is_finite, rotated
 from aerokit.sim.motion import Ned, euler_from_quaternion
 
 _ZERO: Ned = (0.0, 0.0, 0.0)
@@ -308,7 +308,7 @@ class CopterSetpoints:
             copter.motion.turn(target.body_yaw_rate)
         # The field `thrust` sets a climb rate, and 0.5 holds the altitude. The simulation ignores bit 3 of
         # GUID_OPTIONS, which makes the field set the throttle instead.
-        climb_share = (max(0.0, min(1.0, target.thrust)) - 0.5) * 2.0
+        climb_share = (constrained(target.thrust, 0.0, 1.0) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0
         if not has_attitude and not ignored_rates:

@@ -44,7 +44,7 @@ class AutoYaw:
             self.hold()
 
     def turn_to(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
-        """Turn to a heading in radians. ``direction`` is 1 for clockwise, -1 for anticlockwise, 0 for the shorter way.
+        """Turn to a heading in radians. Positive ``direction``: clockwise; negative: anticlockwise; 0: the shorter way.
 
         ``rate`` (radians per second; 0: the default rate) applies only to a turn by the longer way. A turn by the
         shorter way has the default rate.
@@ -54,10 +54,10 @@ class AutoYaw:
         self._control = self._go_to_heading
         self._rate = 0.0
         offset = wrap_pi(self._heading - motion.yaw)
-        is_longer_way = direction != 0 and math.copysign(1, offset) != direction
+        is_longer_way = offset * direction < 0
         # `Motion.face` always turns the shorter way. `_go_to_heading` uses `_rate` to turn the longer way.
         if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:
-            self._rate = direction * (rate or motion.limits.turn_rate_rad_s)
+            self._rate = math.copysign(rate or motion.limits.turn_rate_rad_s, direction)
 
     def turn_to_last_heading(self, tolerance: float) -> bool:
         """Turn to the last heading of `turn_to` again. Return True within ``tolerance`` radians of that heading."""

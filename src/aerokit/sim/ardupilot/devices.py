@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import GripperActions, MavSeverity, ParachuteAction, WinchActions
 from aerokit.mavlink.enums import MavResult as Result
-from aerokit.sim.commands import ReceivedCommand, to_int
+from aerokit.sim.commands import ReceivedCommand, constrained, to_int
 
 if TYPE_CHECKING:
     from aerokit.sim.ardupilot.host import ArduPilotHost
@@ -28,6 +28,7 @@ class ArduPilotDevices:
         self.line_m: float = 0.0  # Length of the winch's line.
         self.line_rate_m_s: float = 0.0  # Above 0 while the winch lets out line.
         self._goal_m: float | None = None  # Length at which the winch stops; None if it stops only on command.
+        self._has_scheduled_step = False  # even after RELAXED, until the step is due
 
     def _is_set(self, name: str) -> bool:
         return bool(self._vehicle.parameters.get(name, 0))
@@ -68,7 +69,7 @@ class ArduPilotDevices:
         elif self._is_set("CHUTE_ENABLED"):
             if vehicle.is_landed:
                 vehicle.info("Parachute: Landed")
-            elif -vehicle.motion.down < _MIN_CHUTE_ALTITUDE_M:
+            elif vehicle.altitude_m < _MIN_CHUTE_ALTITUDE_M:
                 vehicle.send_text(MavSeverity.ALERT, "Parachute: Too low")
             else:
                 self.chute_is_released = True
@@ -81,25 +82,28 @@ class ArduPilotDevices:
         action, length_m, rate_m_s = to_int(command.param2), command.param3, command.param4
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return Result.FAILED
-        was_moving = self.line_rate_m_s != 0.0
         self._goal_m = None
         self.line_rate_m_s = 0.0  # The action RELAXED only stops the winch.
         if action == WinchActions.RATE_CONTROL:
-            self.line_rate_m_s = max(-_WINCH_RATE_M_S, min(_WINCH_RATE_M_S, rate_m_s))
+            self.line_rate_m_s = constrained(rate_m_s, -_WINCH_RATE_M_S, _WINCH_RATE_M_S)
         elif action == WinchActions.RELATIVE_LENGTH_CONTROL:
             self._goal_m = self.line_m + length_m
-            self.line_rate_m_s = _WINCH_RATE_M_S if length_m > 0 else -_WINCH_RATE_M_S
-        if not was_moving and self.line_rate_m_s:  # A winch that moves already has a scheduled step.
-            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
+            self.line_rate_m_s = _WINCH_RATE_M_S * ((length_m > 0) - (length_m < 0))  # 0 for NaN
+        self._schedule_step()
         return Result.ACCEPTED
 
+    def _schedule_step(self) -> None:
+        if self.line_rate_m_s and not self._has_scheduled_step:
+            self._has_scheduled_step = True
+            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
+
     def _run(self) -> None:
+        self._has_scheduled_step = False
         self.line_m += self.line_rate_m_s * _WINCH_INTERVAL_S
         # Once the line has passed the goal, the remaining length and the rate have opposite signs.
         if self._goal_m is not None and (self._goal_m - self.line_m) * self.line_rate_m_s <= 0:
-            self.line_rate_m_s = 0.0
-        if self.line_rate_m_s:
-            self._vehicle.call_later(_WINCH_INTERVAL_S, self._run)
+            self.line_m, self.line_rate_m_s = self._goal_m, 0.0
+        self._schedule_step()
 
     def winch_status(self) -> m.WinchStatus | None:
         """Return WINCH_STATUS, or None if the vehicle has no winch."""

@@ -76,9 +76,15 @@ class ArduPilotExternal:
         is_enabled = parameters.get("PLND_ENABLED", 0.0) and parameters.get("PLND_TYPE", 0.0) == _PLND_TYPE_MAVLINK
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
             return
+        if target.position_valid and not target.distance > 0:  # The firmware divides the position by the distance.
+            return
         self.latest[type(target)] = target
         # The offset of the target is relative to the nose, so it is rotated by the heading.
-        north, east, _down = rotated((target.x, target.y, target.z), motion.yaw)
+        offset = (target.x, target.y, target.z)
+        if not target.position_valid:  # Only the angles from the downward axis are known.
+            height = motion.ground_down - motion.down
+            offset = (-math.tan(target.angle_y) * height, math.tan(target.angle_x) * height, height)
+        north, east, _down = rotated(offset, motion.yaw)
         self._target = (motion.north + north, motion.east + east)
         self._target_at = self._vehicle.now
 

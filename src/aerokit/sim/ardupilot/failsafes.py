@@ -59,7 +59,7 @@ class BatteryFailsafe:
         if self._remaining_mah() < parameters["BATT_ARM_MAH"]:
             return "Battery 1 below minimum arming capacity"
         for level, word in _WORDS.items():
-            is_voltage_low, is_charge_low = self._is_voltage_and_charge_low(level)
+            is_voltage_low, is_charge_low = self._low_quantities(level)
             if is_voltage_low:
                 return f"Battery 1 {word} voltage failsafe"
             if is_charge_low:
@@ -71,13 +71,13 @@ class BatteryFailsafe:
 
     def _level_if_below(self, level: int) -> int:
         """Return ``level`` if the battery has been below the limits of this level for long enough, otherwise 0."""
-        is_voltage_low, is_charge_low = self._is_voltage_and_charge_low(level)
+        is_voltage_low, is_charge_low = self._low_quantities(level)
         voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
         timeout = self._vehicle.parameters["BATT_LOW_TIMER"]  # 0 ignores a low voltage.
         is_voltage_low_for_long = 0 < timeout < voltage_low_for
         return level if is_charge_low or is_voltage_low_for_long else _OK
 
-    def _is_voltage_and_charge_low(self, level: int) -> tuple[bool, bool]:
+    def _low_quantities(self, level: int) -> tuple[bool, bool]:
         """Return whether the voltage, and whether the charge, is below the limit of the level."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
         # The value 0 of these parameters means that there is no limit.
@@ -106,7 +106,7 @@ class ArduPilotFailsafes(Generic[HostT]):
         self.has_estimator_failed = False
         self.is_radio_lost = False  # A lost radio also prevents arming.
         self.ground_station_seen_at: float = math.nan
-        """Time of the last heartbeat of the ground station MAV_GCS_SYSID."""
+        """Time of the last heartbeat, RC override or MANUAL_CONTROL of the ground station MAV_GCS_SYSID."""
         self.radio_received_at: float = math.nan  # Time of the last RC pulses or overrides.
 
     def start(self) -> None:
@@ -340,7 +340,7 @@ class ArduPilotArming(Generic[HostT]):
         """Called after arming."""
 
     def disarm(self, *, force: bool = True) -> bool:
-        """Stop the motors and return True. Without ``force``, a vehicle in the air stays armed (False)."""
+        """Stop the motors, even in the air, and return True. With ``force=False``, a vehicle in the air stays armed."""
         vehicle = self.vehicle
         if not vehicle.motors.is_armed:
             return True

@@ -150,7 +150,7 @@ class ArduPilotFence(Generic[HostT]):
         self.enabled: int = 0  # Enabled kinds of fences (bits of FENCE_TYPE), including kinds that are not configured.
         self.breached: int = 0  # Kinds of fences that are breached at present.
         self.breach_count: int = 0
-        self.breach_time_ms: int = 0  # Start of the latest breach, in milliseconds since boot.
+        self.breach_time_ms: int = 0  # When a fence was last breached while no other was, in ms since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
         # Maps a kind of fence to the metres beyond its limit at which a further breach counts as new.
@@ -323,12 +323,12 @@ class ArduPilotFence(Generic[HostT]):
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
     def _record_breach(self, kind: int) -> None:
-        """Count a new breach of this kind of fence. FENCE_STATUS reports only the first of several breaches."""
+        """Count a new breach of this kind of fence. Only the first of several sends FENCE_STATUS at once."""
         vehicle = self.vehicle
         self.breach_count += 1
         was_any_breached = self.breached != 0
         self.breached |= kind
-        if was_any_breached:  # Only the first breach sets the time and sends FENCE_STATUS.
+        if was_any_breached:  # Like the firmware, keep the time of the first breach (AC_Fence.cpp, record_breach).
             return
         self.breach_time_ms = vehicle.time_boot_ms
         if vehicle.now - self._reported_at > _STATUS_INTERVAL_S:

@@ -184,7 +184,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._send_next(peer, session, request, 0)
 
     def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, block_number: int) -> None:
-        """Send a block of a burst, and schedule the next block. Other requests wait until the end of the burst."""
+        """Send a block of a burst, and schedule the next block. Other requests wait until the end of the burst.
+
+        A short block is followed by a refusal, the last of `_BURST_BLOCKS` by nothing.
+        """
         block_size = request.size or DATA_SIZE
         offset = request.offset + block_number * block_size
         sequence = (request.sequence + 1 + block_number) & 0xFFFF

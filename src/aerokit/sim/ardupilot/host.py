@@ -19,7 +19,6 @@ from aerokit.sim.channel import Channel
 from aerokit.sim.commands import rotated
 from aerokit.sim.missions import MissionStore
 from aerokit.sim.motion import GRAVITY_M_S2, GlobalPoint, LocalFrame, Ned
-from aerokit.sim.parameters import SimParameters
 
 RC_ROLL, RC_PITCH, RC_THROTTLE, RC_YAW = range(4)
 """Indices of the RC channels of the sticks, in ArduPilot's default RCMAP."""
@@ -321,8 +320,6 @@ class ArduPilotHost(SimulatedAutopilot):
     """Text about the airframe in the banner, or None to send no such text."""
     GIT_HASH: ClassVar[bytes] = b"5ae20c17"
 
-    parameters: SimParameters
-    """Parameters by name. A test may change them, and they survive a reboot."""
     timeline: BootTimeline
     uid: bytes
     battery: SimulatedBattery

@@ -141,6 +141,7 @@ class CommandList(ItemList):
             stored_item = as_stored(item, self._kind)
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
                 return stored_item
+            # Like the firmware, without `start` (AP_Filesystem_Mission.cpp, finish_upload_mission).
             if stored_item.command == Cmd.DO_JUMP and not 0 < stored_item.param1 < len(items):
                 return MavMissionResult.ERROR
             result = self._write(seq + start, stored_item)

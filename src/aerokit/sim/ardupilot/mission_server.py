@@ -73,11 +73,11 @@ class ArduPilotMissionServer(MissionServer):
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
         """Store a list of items, as the upload of a file does, and return the MAV_MISSION_RESULT.
 
-        ``start`` is the index of the first item in a mission; other lists are replaced as a whole. Without ``clear``, a
-        mission keeps its other items; for other lists, the result is ERROR.
+        ``start`` is the index in the mission at which the first item is stored; other lists are replaced as a whole.
+        Without ``clear``, a mission keeps its other items; for other lists, the result is ERROR.
         """
         if mission_type == MavMissionType.MISSION:
-            if clear:
+            if clear:  # Like the firmware, continue with a running mission, which cannot be cleared.
                 self._clear_list(self.commands)
             return self.commands.write_file(list(items), start)
         if not clear:

@@ -194,6 +194,8 @@ class ArduPilotNavigation:
 
     def _use_gps_when_possible(self) -> None:
         """Let the estimator use GPS, or check again in a second if that is not possible yet."""
+        if self.flags == _WITH_POSITION:  # `_check_gps` was first.
+            return
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
             self._vehicle.call_later(1.0, self._use_gps_when_possible)
             return
@@ -276,7 +278,7 @@ class SmartPath:
         self._points: list[Ned] = []
         self._cleaned_count = 0  # Number of points after the last simplification.
         self._good_at = -math.inf  # time of the last good position
-        self._saved_at = -math.inf  # time of the last recorded point
+        self._saved_at = -math.inf  # time at which the path last had space for the position
         self._warned_at = -math.inf
         self._is_started = False  # True after the first `reset`
         self.is_active: bool = False  # True while SMART_RTL is possible.

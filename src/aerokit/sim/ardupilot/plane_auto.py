@@ -19,7 +19,7 @@ from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.mission_run import MissionMode, horizontal_distance
 from aerokit.sim.ardupilot.plane_modes import PlaneHost, PlaneLanding, PlaneNavigatingMode
 from aerokit.sim.channel import Channel
-from aerokit.sim.commands import CommandHandler, ReceivedCommand, to_int
+from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, to_int
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
@@ -296,7 +296,7 @@ class PlaneGuided(PlaneNavigatingMode):
         if selects_all_angles or not mask & Mask.BODY_PITCH_RATE_IGNORE:
             self._pitch = _TimedValue(pitch, now)
         if not mask & Mask.THROTTLE_IGNORE:
-            self._throttle = _TimedValue(max(0.0, min(1.0, message.thrust)), now)
+            self._throttle = _TimedValue(constrained(message.thrust, 0.0, 1.0), now)
 
     def update(self, dt: float) -> None:
         """Follow the latest attitude or course that was commanded. Without one, circle the target."""
@@ -357,7 +357,8 @@ class PlaneSetpoints:
             return
         point = plane.world_point(0, 0, message.alt, message.coordinate_frame)  # Only the altitude is used.
         if point is None:
-            plane.send_text(MavSeverity.WARNING, "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT")
+            text = "Invalid coord frame in SET_POSTION_TARGET_GLOBAL_INT"  # The misspelling is the firmware's.
+            plane.send_text(MavSeverity.WARNING, text)
         elif not message.type_mask & PositionMask.Z_IGNORE:
             _north, _east, down = point
             self._guided.change_altitude(down)

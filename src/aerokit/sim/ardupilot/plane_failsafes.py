@@ -155,8 +155,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     def _check_end_of_long(self) -> None:
         """End the long failsafe once its link has returned: the ground station, or the radio."""
         parameters = self.vehicle.parameters
-        # With FS_LONG_TIMEOUT alone, the end of the long failsafe could start the short one (system.cpp,
-        # check_long_failsafe).
+        # Like the firmware (system.cpp, check_long_failsafe).
         is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if is_short_enabled else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:
@@ -281,13 +280,13 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     def return_place(self) -> Ned:
         """Return the place to which the plane returns after a breach.
 
-        With FENCE_RET_RALLY, this is a rally point. Otherwise it is the uploaded return point or home, at FENCE_RET_ALT
-        or half-way between the altitude limits.
+        With FENCE_RET_RALLY, this is where RTL would return. Otherwise it is the uploaded return point or home, at
+        FENCE_RET_ALT, half-way between the altitude limits or, if these leave no room, at RTL_ALTITUDE.
         """
         plane, parameters = self.vehicle, self.vehicle.parameters
         home_north, home_east, home_down = plane.home_or_ground
         if parameters["FENCE_RET_RALLY"]:
-            return best_return_place(plane, (home_north, home_east, home_down - parameters["RTL_ALTITUDE"]))
+            return best_return_place(plane, plane.home_of_rtl)
         lowest = parameters["FENCE_ALT_MIN"] + parameters["FENCE_MARGIN"]
         highest = parameters["FENCE_ALT_MAX"] - parameters["FENCE_MARGIN"]
         height = parameters["FENCE_RET_ALT"]

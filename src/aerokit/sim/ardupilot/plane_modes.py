@@ -44,6 +44,13 @@ class PlaneHost(ArduPilotVehicle):
         """Home, or the power-on location while home is not set."""
         return self.navigation.home or (0.0, 0.0, self.wing.ground_down)
 
+    @property
+    def home_of_rtl(self) -> Ned:
+        """Home at RTL_ALTITUDE, or at the current altitude if that is negative."""
+        north, east, home_down = self.home_or_ground
+        height = self.parameters["RTL_ALTITUDE"]
+        return (north, east, self.wing.down if height < 0 else home_down - height)
+
     def is_valid_airspeed(self, airspeed: float) -> bool:
         """Return True if an airspeed (m/s) is within AIRSPEED_MIN and AIRSPEED_MAX."""
         return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
@@ -309,12 +316,8 @@ class PlaneRtl(PlaneNavigatingMode):
     def enter(self, *, force: bool) -> bool:
         super().enter(force=force)
         plane = self.vehicle
-        north, east, home_down = plane.home_or_ground
-        height = plane.parameters["RTL_ALTITUDE"]
         self.radius: float = plane.parameters["RTL_RADIUS"]
-        keeps_altitude = height < 0
-        down = plane.wing.down if keeps_altitude else home_down - height
-        self._place = best_return_place(plane, (north, east, down))
+        self._place = best_return_place(plane, plane.home_of_rtl)
         return True
 
 

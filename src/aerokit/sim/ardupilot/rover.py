@@ -138,7 +138,11 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         self._update_link(_GCS, is_lost=self.is_ground_station_lost)
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
-        """Record whether a link is lost, and start or end the common failsafe of both links."""
+        """Record whether a link is lost, and start or end the common failsafe of both links.
+
+        Like the firmware (failsafe.cpp, failsafe_trigger), text and parameter are those of the link that is checked
+        when the timeout ends, and a link whose check is disabled while it is lost stays lost.
+        """
         rover = self.vehicle
         was_any_link_lost = bool(self._lost)
         self._lost = (self._lost | {name}) if is_lost else (self._lost - {name})
@@ -221,7 +225,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION after a new breach."""
+        """Execute FENCE_ACTION after a new breach. Far beyond the limit, HOLD replaces every action but report only."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if action == REPORT_ONLY:

@@ -97,7 +97,8 @@ class GuidedSetpoints:
     def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
         """Convert a set-point to a target of GUIDED. ``point`` is its position in the world frame.
 
-        A set-point with an acceleration, with a number that is not finite, or that `is_complete` rejects is ignored.
+        A set-point with an acceleration, with a position or velocity that is not finite, or that `is_complete` rejects
+        is ignored.
         """
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:

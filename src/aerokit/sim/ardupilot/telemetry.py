@@ -256,8 +256,8 @@ def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
         return [value if fitted else 0 for fitted in has_motor]
 
     voltages = per_motor(round(vehicle.battery.voltage_v * 100))
-    # Each motor takes a quarter of the battery current, in units of 0.01 A.
-    currents = per_motor(round(vehicle.battery.current_a / 4 * 100))
+    # The motors share the battery current equally, in units of 0.01 A.
+    currents = per_motor(round(vehicle.battery.current_a / sum(has_motor) * 100))
     rpms = per_motor(round(vehicle.motors.throttle * _FULL_THROTTLE_RPM))
     # Number of received telemetry packets. The field has 16 bits.
     counts = per_motor(int(vehicle.uptime * _ESC_PACKETS_PER_S) & 0xFFFF)

@@ -143,7 +143,7 @@ def _wind(vehicle: ArduPilotVehicle) -> m.Wind | None:
 
 _POS_HORIZ_ABS = int(EkfStatusFlags.POS_HORIZ_ABS)
 _NO_YAW = Mask.YAW_IGNORE | Mask.YAW_RATE_IGNORE
-_VELOCITY_ONLY = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
+_WITHOUT_POSITION = Mask.X_IGNORE | Mask.Y_IGNORE | Mask.Z_IGNORE | _NO_YAW
 _POSITION_ONLY = (
     Mask.VX_IGNORE | Mask.VY_IGNORE | Mask.VZ_IGNORE | Mask.AX_IGNORE | Mask.AY_IGNORE | Mask.AZ_IGNORE | _NO_YAW
 )  # fmt: skip
@@ -260,7 +260,7 @@ def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
     target = guided.destination
     if target is None:  # The submode follows a velocity, not a position.
         vectors = (0.0, 0.0, 0.0, *guided.velocity, *guided.acceleration)
-        return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _VELOCITY_ONLY, *vectors, yaw=0.0, yaw_rate=0.0)
+        return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _WITHOUT_POSITION, *vectors, yaw=0.0, yaw_rate=0.0)
     local = vehicle.navigation.local(target)
     return m.PositionTargetLocalNed(time, MavFrame.LOCAL_NED, _POSITION_ONLY, *local, *(0.0,) * 8)
 

@@ -143,7 +143,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.files: FileTree = self.storage.files
 
     def _reset(self) -> None:
-        """Create the parts that do not survive a power cycle."""
+        """Create or reset the parts that do not survive a power cycle."""
         self.is_initialised: bool = False
         self.has_left_boot: bool = False
         self.is_landed: bool = self.motion.is_on_ground
@@ -162,7 +162,7 @@ class ArduPilotVehicle(ArduPilotHost):
         modes = [make_mode(self) for make_mode in self.MODES]
         self._modes: dict[int, ArduPilotMode] = {mode.number: mode for mode in modes}
         self.reset_controllers()
-        self.mission: MissionRun = MissionRun(self, self.auto)
+        self.mission: MissionRun = MissionRun(self, self.auto)  # executes the mission that `missions` stores
         self.missions.reset()
         self.mode: ArduPilotMode = self._modes[self.first_mode]
 

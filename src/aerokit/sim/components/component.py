@@ -40,7 +40,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
     except InvalidArgument:
         return None
     motion = vehicle.motion  # type: ignore[attr-defined]
-    # Only models of autopilots have a home. For the others, the origin is the home.
+    # Only models of autopilots have a home, and `altitude_m` above it. For the others, the origin is the home.
     height_m = getattr(vehicle, "altitude_m", -motion.down)
     return Pose(place, height_m, motion.roll, motion.pitch, motion.yaw)
 
@@ -48,7 +48,7 @@ def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
 def serve_files(component: SimulatedComponent, files: FileTree) -> SessionFtpServer[FileTree]:
     """Serve files of a component by MAVFTP, as PX4 does. Call this function in ``listen()``.
 
-    The files may change at any time, see `FileTree.put`. Power-off ends the sessions, but keeps the files. The
+    The files may change at any time, see `FileTree.put`. A power cycle ends the sessions, but keeps the files. The
     component's ``faults.no_ftp`` turns the server off.
     """
     from aerokit.sim.px4.ftp import Px4Ftp  # imported only when needed, because most components serve no files

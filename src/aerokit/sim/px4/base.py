@@ -174,7 +174,6 @@ class Px4Vehicle(Px4Host):
         self.on(m.Ping, self._on_ping)
         self.serve_timesync()
         self.missions.listen()
-        self.failsafes.listen()
 
     @property
     def ftp(self) -> Px4Ftp:
@@ -208,7 +207,7 @@ class Px4Vehicle(Px4Host):
         self.gimbal.start()
         self.call_later(_WARNING_BOOT_SHARE * self._boot_time_s, self._warn_while_booting)
         self.mission.start()
-        self.failsafes.listen()  # A restart has created a new object, which has to listen, too.
+        self.failsafes.listen()  # A restart has created a new object.
         self.failsafes.start()
         self.call_later(self._boot_time_s, self._set_ready)
 
@@ -247,6 +246,9 @@ class Px4Vehicle(Px4Host):
         text_id = self._next_text_id
         self._next_text_id = (text_id + 1) & 0xFFFF
         self.call_later(0.0, lambda: self.send_chunks(severity, text, text_id))
+
+    def on_speedup(self, speedup: float) -> None:
+        self.text_links.speedup = speedup
 
     def send_parts(self, chunks: list[m.Statustext]) -> None:
         self.text_links.send(chunks)
@@ -383,13 +385,13 @@ class Px4Vehicle(Px4Host):
             self.mission.on_landed()
 
     def _auto_disarm(self) -> None:
-        """Disarm some time after a landing, or after arming without a take-off."""
+        """Disarm some time after a landing, or after arming without a take-off. A time of 0 turns this off."""
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown:
-            if self.now - self._landed_at >= self.parameters["COM_DISARM_LAND"]:
+            if 0 < self.parameters["COM_DISARM_LAND"] <= self.now - self._landed_at:
                 self.arming.disarm("landing")
-        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.armed_at:  # The value 0 turns this off.
+        elif 0 < self.parameters["COM_DISARM_PRFLT"] <= self.now - self.arming.armed_at:
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:

@@ -295,9 +295,10 @@ class _Flight:
         north, east, down = self._destination(command)
         has_radius = math.isfinite(command.param1)
         if px4.VEHICLE_TYPE == MavType.FIXED_WING:
-            result = self._change(modes.HOLD)  # sets the target to the current position; the next line replaces it
-            px4.flight.target = (north, east, down)
-            px4.flight.radius_m = command.param1 if has_radius else px4.parameters["NAV_LOITER_RAD"]
+            result = self._change(modes.HOLD)  # sets the target to the current position
+            if result == MavResult.ACCEPTED:
+                px4.flight.target = (north, east, down)
+                px4.flight.radius_m = command.param1 if has_radius else px4.parameters["NAV_LOITER_RAD"]
             return result
         radius = command.param1 if has_radius else orbit.radius_m
         speed = abs(command.param2) if math.isfinite(command.param2) else orbit.speed_m_s
@@ -313,7 +314,7 @@ class _Flight:
             return MavResult.DENIED
         if not px4.is_armed:
             self._tuning_since = math.nan
-        elif math.isnan(self._tuning_since):
+        elif not self._tuning_since >= px4.arming.armed_at:  # not started (NaN), or before the last disarming
             self._tuning_since = px4.now
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
         progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
@@ -330,8 +331,14 @@ class _Flight:
             return MavResult.TEMPORARILY_REJECTED
         is_forward = requested_state == MavVtolState.FW
         if px4.vtol_state != requested_state:
-            px4.vtol_state = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
-            px4.call_later(_TRANSITION_DURATION_S, lambda: setattr(px4, "vtol_state", requested_state))
+            transition = MavVtolState.TRANSITION_TO_FW if is_forward else MavVtolState.TRANSITION_TO_MC
+            px4.vtol_state = transition
+
+            def finish() -> None:
+                if px4.vtol_state == transition:  # No request has reversed the transition.
+                    px4.vtol_state = requested_state
+
+            px4.call_later(_TRANSITION_DURATION_S, finish)
         return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:

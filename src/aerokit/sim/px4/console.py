@@ -34,9 +34,9 @@ class Px4Shell:
         if message.device != SerialControlDev.DEV_SHELL or message.flags & SerialControlFlag.REPLY:
             return
         self.is_open = bool(message.flags & SerialControlFlag.RESPOND)
-        self._line += bytes(message.data[: message.count])
-        is_complete = self._line.endswith(b"\n")
-        if not self.is_open or not is_complete:
+        # Without RESPOND, PX4 closes the shell (mavlink_receiver.cpp), which forgets the line.
+        self._line = self._line + bytes(message.data[: message.count]) if self.is_open else b""
+        if not self._line.endswith(b"\n"):
             return
         line = self._line
         self._line = b""
@@ -67,6 +67,7 @@ class Px4LogStream:
         # (system id, component id) of the client; None while no log is streamed.
         self._station: tuple[int, int] | None = None
         self._channel: Channel | None = None
+        self._stream_number = 0  # ends the calls of `_run` for an earlier stream
         self._sequence = 0  # number of the next block
         self._tries = 0  # how often this block was sent
         self._acknowledged = 0  # number of definition blocks that were acknowledged
@@ -82,7 +83,8 @@ class Px4LogStream:
         self._station = command.sender
         self._channel = command.channel
         self._sequence = self._tries = self._acknowledged = 0
-        self._px4.call_later(_BLOCK_INTERVAL_S, self._run)
+        self._stream_number += 1
+        self._run_later(self._stream_number)
         return MavResult.ACCEPTED
 
     def stop(self, _: ReceivedCommand) -> int:
@@ -99,9 +101,12 @@ class Px4LogStream:
     def _sends_definitions(self) -> bool:
         return self._acknowledged < _DEFINITION_BLOCKS
 
-    def _run(self) -> None:
+    def _run_later(self, stream: int) -> None:
+        self._px4.call_later(_BLOCK_INTERVAL_S, lambda: self._run(stream))
+
+    def _run(self, stream: int) -> None:
         """Send the next block, or repeat a definition block that was not acknowledged."""
-        if self._station is None:
+        if self._station is None or stream != self._stream_number:
             return
         self._tries += 1
         if self._tries > _MAX_TRIES and self._sends_definitions:
@@ -118,7 +123,7 @@ class Px4LogStream:
         self._px4.send(block, self._channel)
         if not self._sends_definitions:  # A definition block keeps its number until it is acknowledged.
             self._sequence += 1
-        self._px4.call_later(_BLOCK_INTERVAL_S, self._run)
+        self._run_later(stream)
 
 
 def _ulog_message(number: int) -> bytes:

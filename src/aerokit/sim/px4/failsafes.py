@@ -355,8 +355,8 @@ class Px4Failsafes:
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
         """Update the active failures.
 
-        A new or more severe action starts the delay, and a new one also ends an override by the user. An action more
-        severe than WARN stays active until the user changes the mode.
+        A new or more severe action starts the delay, and a new one also ends an override by the user. After the end of
+        its cause, an action more severe than WARN stays active until the user changes the mode.
         """
         for cause, action in failing.items():
             if cause not in self._active and action >= Action.HOLD:
@@ -390,7 +390,7 @@ class Px4Failsafes:
         return worst
 
     def _execute(self, action: FailsafeAction) -> None:
-        """Start an action that differs from the present one, or end the failsafe (`Action.NONE`)."""
+        """Start an action that differs from the present one, or end the failsafe (NONE or WARN)."""
         if action == self.action:
             return
         px4, previous = self._px4, self.action

@@ -13,7 +13,6 @@ from aerokit.missions import MissionItem
 from aerokit.sim.autopilot import SimulatedAutopilot, SimulatedBattery
 from aerokit.sim.channel import Channel
 from aerokit.sim.motion import LocalFrame, Ned
-from aerokit.sim.parameters import SimParameters
 from aerokit.sim.px4.modes import Px4Mode
 
 
@@ -126,8 +125,6 @@ class Px4Host(SimulatedAutopilot):
 
     VEHICLE_TYPE: ClassVar[int]
 
-    parameters: SimParameters
-    """Parameters, which survive a reboot."""
     frame: LocalFrame
     battery: SimulatedBattery
     home: Ned

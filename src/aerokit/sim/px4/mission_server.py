@@ -114,7 +114,7 @@ class Px4MissionServer(MissionServer):
         return self.lists[MavMissionType.MISSION]
 
     def _store_if_changed(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
-        """Store a list, unless a list with the same opaque id is stored already."""
+        """Store a list, unless it is the stored one (same opaque id, not empty) or has an unknown type."""
         if mission_type not in self.lists or (items and opaque_id == self.id(mission_type)):
             return
         self.store(mission_type, items)
@@ -217,7 +217,7 @@ class Px4MissionServer(MissionServer):
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
         """Send the next item, or the previous item again. A request for any other index ends the download."""
         link = self._link(channel)
-        link.uses_int = isinstance(request, m.MissionRequestInt)
+        link.uses_int = isinstance(request, m.MissionRequestInt)  # even if another client sends it, as in PX4
         if sender_of(request) != link.client:
             self._warn("WPM: REJ. CMD: partner id mismatch")
             return
@@ -291,7 +291,7 @@ class Px4MissionServer(MissionServer):
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
         """Handle an item of an upload. An unexpected item is not stored."""
         link = self._link(channel)
-        link.uses_int = isinstance(message, m.MissionItemInt)
+        link.uses_int = isinstance(message, m.MissionItemInt)  # even if another client sends it, as in PX4
         if sender_of(message) != link.client:
             self._warn("REJ. MIS ITEM: partner id mismatch")
         elif message.mission_type != link.mission_type:
@@ -335,7 +335,10 @@ class Px4MissionServer(MissionServer):
         self._end(link, Result.ACCEPTED)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL. During a transfer, send a text instead."""
+        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL. During a transfer, send a text instead.
+
+        PX4 accepts an unknown type, too (mavlink_mission.cpp, handle_mission_clear_all).
+        """
         link = self._link(channel)
         if link.state is not TransferState.IDLE:
             self._warn("WPM: IGN CLEAR CMD: Busy")

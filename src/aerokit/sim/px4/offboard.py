@@ -138,7 +138,10 @@ class Px4Offboard:
         self.updated_at = self._vehicle.now
 
     def _on_actuators(self, target: SetActuatorControlTarget, _: Channel) -> None:
-        """Apply the thrust of actuator group 0. PX4 1.14 and later ignore the message."""
+        """Hold the attitude, with the thrust of actuator group 0. A message for another group keeps the old thrust.
+
+        PX4 1.14 and later ignore the message.
+        """
         if self._vehicle.version_number >= _VERSION_1_14:
             return
         motion = self._vehicle.motion

@@ -97,15 +97,16 @@ class Px4Gimbal:
         return (roll, pitch, yaw)
 
     def _angles_to(self, place: tuple[int, int, float]) -> Angles:
-        """Return the angles to a place, given as latitude and longitude (degrees times 1e7) and altitude AMSL."""
+        """Return the angles, yaw from north, to latitude and longitude (degrees times 1e7) and altitude AMSL."""
         latitude_e7, longitude_e7, altitude_m = place
         motion = self._px4.motion
         place_north, place_east = self._px4.frame.to_local(latitude_e7, longitude_e7)
         north, east = place_north - motion.north, place_east - motion.east
         own_altitude_m = self._px4.frame.to_global(*motion.place).altitude_m
         pitch = math.atan2(altitude_m - own_altitude_m, math.hypot(north, east))
-        _, (min_pitch_deg, _max_pitch_deg), _ = _LIMITS
-        return (0.0, max(math.radians(min_pitch_deg), pitch), math.atan2(east, north))
+        _, (min_pitch_deg, max_pitch_deg), _ = _LIMITS
+        pitch = max(math.radians(min_pitch_deg), min(math.radians(max_pitch_deg), pitch))
+        return (0.0, pitch, math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
         """Set the angles and the rates at which they change.
@@ -338,7 +339,7 @@ class Px4CameraTrigger:
             px4.call_later(_GEOTAG_DELAY_S, lambda: self._send_captured(number))
 
     def _send_captured(self, number: int) -> None:
-        """Send CAMERA_IMAGE_CAPTURED for an image; nothing while the position is unknown."""
+        """Send CAMERA_IMAGE_CAPTURED for an image, with the true position."""
         px4, pose = self._px4, pose_of(self._px4)
         if pose is None:
             return

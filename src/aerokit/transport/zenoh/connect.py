@@ -85,7 +85,8 @@ class ZenohConnect(NetworkLink):
         self._open_timeout_s = open_timeout_s
         # True until a beacon shows that this client has control, so that the request is repeated.
         self._takes_control = control == "take"
-        self._tracker = VehicleSideTracker(random.getrandbits(32), "never" if control == "never" else "free")
+        self._nonce = random.getrandbits(32)  # distinguishes this link from others that use the same client name
+        self._tracker = VehicleSideTracker(self._nonce, "never" if control == "never" else "free")
         self._vehicle_tokens: set[str] = set()  # keys of the vehicle sides that are alive, as reported by the network
         self._publisher: Any = None  # None while the link is not open
         self._first_beacon = asyncio.Event()  # set once the vehicle side was found
@@ -126,7 +127,8 @@ class ZenohConnect(NetworkLink):
     def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
         """Declare the subscribers, the token and the publisher of this client.
 
-        This function and its callbacks run on threads of zenoh, so each callback posts its sample to the event loop.
+        This function runs on a thread of the loop's executor. Its callbacks run on threads of zenoh, so each of them
+        posts its sample to the event loop.
         """
 
         # A sample that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
@@ -146,7 +148,7 @@ class ZenohConnect(NetworkLink):
         keys, client = self._keys, self.client
         on_frames = callback_for(self._on_frames)
         liveliness = session.liveliness()
-        self._declared = [
+        declared = [
             session.declare_subscriber(keys.to_all_clients, on_frames),
             session.declare_subscriber(keys.from_vehicle(client), on_frames),
             session.declare_subscriber(keys.notices(client), callback_for(self._on_notice)),
@@ -155,9 +157,9 @@ class ZenohConnect(NetworkLink):
             liveliness.declare_subscriber(KeySpace(keys.fleet, "*").vehicle_token(), on_liveliness, history=True),
             liveliness.declare_token(keys.client_token(client)),
         ]
-        self._publisher = session.declare_publisher(
-            keys.to_vehicle(client), congestion_control=zenoh.CongestionControl.DROP
-        )
+        publisher = session.declare_publisher(keys.to_vehicle(client), congestion_control=zenoh.CongestionControl.DROP)
+        if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
+            self._declared, self._publisher = declared, publisher
 
     def _on_release(self, session: Any) -> None:
         self._publisher = None
@@ -194,7 +196,8 @@ class ZenohConnect(NetworkLink):
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
         """Report that the vehicle side has refused messages of this client."""
         notice = RefusalNotice.decode(data)
-        if notice is None:
+        # A notice with another nonce is for a program that uses the same client name.
+        if notice is None or notice.nonce not in (None, self._nonce):
             return
         self._drop(notice.count)
         if isinstance(self._receiver, OrderRefusalListener):

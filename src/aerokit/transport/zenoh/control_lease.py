@@ -160,7 +160,8 @@ class ClientFilter:
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
 
-        ``nonce`` distinguishes programs that use the same client name by mistake; only the first program gets control.
+        ``nonce`` distinguishes programs that use the same client name by mistake. The program that used the name first
+        gets control, until it is silent for `LEASE_TIMEOUT_S` or another one takes control.
         """
         is_namesake = self._is_namesake(nonce, mode, now)
         if not is_namesake:
@@ -292,7 +293,7 @@ class FreshnessChecker:
     def __init__(self, epoch: int) -> None:
         self.epoch: int = epoch
         self.late: int = 0
-        """Datagrams refused because their stamp was too old, or from another vehicle side."""
+        """Datagrams refused because their stamp was too old, invalid, missing, or for another vehicle side."""
         self.duplicates: int = 0
         """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0  # number of the last beacon

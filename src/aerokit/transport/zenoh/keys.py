@@ -163,6 +163,8 @@ class RefusalNotice(Snapshot):
     """Frames by which a vehicle would reject the command: COMMAND_ACK or MISSION_ACK, and STATUSTEXT."""
     count: int = 1
     """Refused messages since the last notice."""
+    nonce: int | None = None
+    """Nonce of the refused stamp; other programs with the same client name ignore the notice. None: for all."""
 
     def encode(self) -> bytes:
         fields = {
@@ -173,6 +175,7 @@ class RefusalNotice(Snapshot):
             "holder": self.lease_holder,
             "answer": self.answer.hex(),
             "count": self.count,
+            "nonce": self.nonce,
         }
         return json.dumps(fields).encode()
 
@@ -183,17 +186,20 @@ class RefusalNotice(Snapshot):
         if fields.get("event") != "order_refused":
             return None
         message, reason, holder = fields.get("message"), fields.get("reason"), fields.get("holder")
+        if not (isinstance(message, str) and isinstance(reason, str)):
+            return None
         try:
             answer = bytes.fromhex(str(fields.get("answer", "")))
         except ValueError:
             return None
-        count = fields.get("count")
+        count, nonce = fields.get("count"), fields.get("nonce")
         return cls(
-            str(message),
-            str(reason),
+            message,
+            reason,
             holder if isinstance(holder, str) else None,
             answer,
             count if _is_u32(count) else 1,  # type: ignore[arg-type]
+            nonce if _is_u32(nonce) else None,  # type: ignore[arg-type]
         )
 
 

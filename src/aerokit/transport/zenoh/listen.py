@@ -28,8 +28,10 @@ from aerokit.transport.zenoh.session import (
     NetworkOptions,
     attachment_of,
     call,
+    open_in_thread,
     open_session,
     payload_of,
+    zenoh_errors,
 )
 
 MAX_CLIENTS = 64
@@ -114,20 +116,22 @@ class ZenohListen(NetworkLink):
 
     async def _connect(self) -> None:
         """Open the session, and serve clients unless another program already serves this name."""
-        self._queue = LoopQueue(call)
-        self._session = await open_session(self.address, self._options, partial(self._find_rivals, self._queue))
+        self._rival_found.clear()
+        self._queue = queue = LoopQueue(call)
+        self._session = session = await open_session(self.address, self._options, partial(self._find_rivals, queue))
         self._released.clear()
         if self._may_have_rival:
             with anyio.move_on_after(_RIVAL_TIMEOUT_S):
                 await self._rival_found.wait()
                 # After a time-out, the block ends in the line above. This line is reached only if a beacon arrived.
                 raise LinkOpenError(f"cannot open {self.address}: another program serves this name")
+        with zenoh_errors(self.address, self._zenoh):
+            await open_in_thread(partial(self._serve, queue, session), _nothing)
         self._is_serving = True
-        self._serve(self._queue)
         self._send_beacon()
 
     def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        """Find out whether the name may be in use, and subscribe to beacons. Runs on a thread of its own.
+        """Find out whether the name may be in use, and subscribe to beacons. Runs on an executor's thread.
 
         A liveliness token alone does not prove that the name is in use, because the token of a killed program remains
         for a while. A beacon proves it.
@@ -139,16 +143,18 @@ class ZenohListen(NetworkLink):
                 queue.post(partial(self._on_beacon, payload))
 
         self._zenoh = zenoh
-        self._declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
+        declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
         tokens = session.liveliness().get(self._keys.vehicle_token(), timeout=_RIVAL_QUERY_TIMEOUT_S)
-        self._may_have_rival = bool(list(tokens))
+        may_have_rival = bool(list(tokens))
+        if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
+            self._declared, self._may_have_rival = declared, may_have_rival
 
-    def _serve(self, queue: LoopQueue[Callable[[], object]]) -> None:
-        """Declare the subscribers, publisher and token that clients need.
+    def _serve(self, queue: LoopQueue[Callable[[], object]], session: Any) -> None:
+        """Declare the subscribers, publisher and token that clients need. Runs on an executor's thread.
 
         The callbacks run on threads of zenoh, so they post to the event loop.
         """
-        zenoh, session, keys = self._zenoh, self._session, self._keys
+        zenoh, keys = self._zenoh, self._keys
 
         def on_datagram(sample: Any) -> None:
             payload = payload_of(sample)
@@ -160,14 +166,15 @@ class ZenohListen(NetworkLink):
             queue.post(partial(self._on_client_joined if has_joined else self._remove_client, _client_of(sample)))
 
         liveliness = session.liveliness()
-        self._publisher = session.declare_publisher(
-            keys.to_all_clients, congestion_control=zenoh.CongestionControl.DROP
-        )
-        self._declared += [
+        publisher = session.declare_publisher(keys.to_all_clients, congestion_control=zenoh.CongestionControl.DROP)
+        declared = [
             session.declare_subscriber(keys.to_vehicle(), on_datagram),
             liveliness.declare_subscriber(keys.client_token(), on_liveliness, history=True),
             liveliness.declare_token(keys.vehicle_token(self._freshness.epoch)),
         ]
+        if queue is self._queue:  # See `_find_rivals`.
+            self._publisher = publisher
+            self._declared += declared
 
     def _on_release(self, session: Any) -> None:
         self._publisher = None
@@ -192,15 +199,15 @@ class ZenohListen(NetworkLink):
         stamp = Stamp.decode(attachment)
         late_before = self._freshness.late
         if not self._freshness.accepts(name, stamp, now) or stamp is None:
-            # A duplicate needs no notice, because its first copy was processed.
+            # A duplicate or overtaken datagram gets no notice, because its first copy or a newer one was processed.
             is_late = self._freshness.late > late_before
             if is_late:
-                self._send_notices(name, client.refuse_late(data, now))
+                self._send_notices(name, client.refuse_late(data, now), stamp)
             return
         if stamp.mode == "take":
             self._lease.take(name, now)
         accepted, notices = client.receive(data, stamp.mode, now, stamp.nonce)
-        self._send_notices(name, notices)
+        self._send_notices(name, notices, stamp)
         if accepted:
             self._deliver(accepted, name)
 
@@ -255,9 +262,11 @@ class ZenohListen(NetworkLink):
         self._put(self._keys.beacon, self._freshness.make_beacon(now, self._lease.holder(now)).encode(), b"")
         self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
-    def _send_notices(self, client: str, notices: list[RefusalNotice]) -> None:
+    def _send_notices(self, client: str, notices: list[RefusalNotice], stamp: Stamp | None) -> None:
+        """Send notices to the program that sent a datagram with this stamp; without a valid stamp, to all namesakes."""
+        nonce = None if stamp is None else stamp.nonce
         for notice in notices:
-            self._put(self._keys.notices(client), notice.encode(), b"")
+            self._put(self._keys.notices(client), notice.replace(nonce=nonce).encode(), b"")
 
     def _put(self, key: str, data: bytes, attachment: bytes) -> None:
         drop = self._zenoh.CongestionControl.DROP
@@ -273,6 +282,10 @@ class ZenohListen(NetworkLink):
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
+
+
+def _nothing(_: object) -> None:
+    pass
 
 
 def _client_of(sample: Any) -> str:

@@ -8,7 +8,7 @@ import json
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Generic, TypeVar
 
 from aerokit._internal.values import Snapshot
@@ -186,8 +186,15 @@ async def open_session(address: str, options: NetworkOptions, declare: Callable[
             raise
         return session
 
-    try:
+    with zenoh_errors(address, zenoh):
         return await open_in_thread(work, lambda session: close_session(session, _nothing))
+
+
+@contextlib.contextmanager
+def zenoh_errors(address: str, zenoh: Any) -> Iterator[None]:
+    """Convert errors of zenoh while a link is opened to LinkOpenError."""
+    try:
+        yield
     except zenoh.ZError as error:
         raise LinkOpenError(f"cannot open {address}: {_reason(error)}") from None
 

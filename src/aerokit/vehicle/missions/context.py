@@ -11,9 +11,10 @@ import anyio
 from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import ConnectionClosed
 from aerokit.events import MissionCurrentChanged, MissionFinished, MissionItemReached
-from aerokit.mavlink.enums import MissionState
-from aerokit.mavlink.messages import MissionCurrent
+from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MissionState
+from aerokit.mavlink.messages import MissionAck, MissionCurrent
 from aerokit.position import position_with_altitude
+from aerokit.protocols.exchange import is_addressed_to
 from aerokit.vehicle.state.condition import MissionProgress
 
 if TYPE_CHECKING:
@@ -50,14 +51,18 @@ class PlanCache:
     def __init__(self) -> None:
         self.items: tuple[MissionItem, ...] | None = None
         self.updated_at: float = -math.inf
+        self.plan_id: int = 0  # the vehicle's id of these items; 0 if it reports none
+        self.changes: int = 0  # number of calls of `set` and `forget`
         # True if the vehicle offers the plan as a file; None until tried.
         self.has_file: bool | None = None
 
-    def set(self, items: Sequence[MissionItem], now: float) -> None:
-        self.items, self.updated_at = tuple(items), now
+    def set(self, items: Sequence[MissionItem], now: float, plan_id: int = 0) -> None:
+        self.items, self.updated_at, self.plan_id = tuple(items), now, plan_id
+        self.changes += 1
 
     def forget(self, now: float) -> None:
-        self.items, self.updated_at = None, now
+        self.items, self.updated_at, self.plan_id = None, now, 0
+        self.changes += 1
 
 
 class PlanContext:
@@ -79,7 +84,8 @@ class PlanContext:
         self._current: Frame | None = None  # the last MISSION_CURRENT, decoded when it is needed
         session = vehicle_context.session
         session.at_close(
-            session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id)
+            session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id),
+            session.connection.bus.attach(MissionAck, self._on_ack, system_id=session.system_id),
         )
         self.tracker: MissionTracker = MissionTracker(session)
 
@@ -109,6 +115,15 @@ class PlanContext:
         ids_by_mission_type = (current.mission_id, current.fence_id, current.rally_points_id)
         return ids_by_mission_type[mission_type]
 
+    def version(self, mission_type: int) -> tuple[int, int]:
+        """Return a value that changes with the vehicle's plan, as far as this program receives the change.
+
+        It consists of the number of transfers, also of other stations on a shared link, and of the plan's id (PX4
+        only).
+        """
+        cache = self.caches[mission_type]
+        return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
+
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
         """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""
         received, started_at = asyncio.Event(), self.now()
@@ -128,6 +143,22 @@ class PlanContext:
     def _on_current(self, frame: Frame) -> None:
         if self.session.telemetry.accepts(frame):
             self._current = frame
+
+    def _on_ack(self, ack: MissionAck) -> None:
+        """Forget a plan when the vehicle accepts one of another station. This is received only on a shared link.
+
+        Another station may have the same ids as this program (255 and 190 by default), so an answer outside of a
+        transfer is not for this program either.
+        """
+        frame, connection = ack.received_frame, self.session.connection
+        is_from_autopilot = frame is not None and frame.component_id == self.session.component_id
+        is_addressed = is_addressed_to(ack, connection.source_system, connection.source_component)
+        is_ours = is_addressed and self.lock.locked()
+        if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:
+            return
+        for mission_type, cache in enumerate(self.caches):
+            if ack.mission_type in (mission_type, MavMissionType.ALL):
+                cache.forget(self.now())
 
 
 class MissionTracker:

@@ -348,8 +348,13 @@ class MissionControl(VehiclePlan["Mission"]):
         A :meth:`pause` by another task does not end the wait, but a pilot who then changes to another mode than that of
         the mission does. Cancelling this call does not stop the vehicle, and no
         command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
-        a download, unless the vehicle reports another number of items. If the item is unknown, the mode after the
+        a download, unless another station has replaced the mission since. If the item is unknown, the mode after the
         completion shows whether the vehicle lands.
+
+        A replaced mission is noticed when the call begins, by another number of items, by another mission id (PX4 1.15
+        and later), or by the vehicle's answer to the other station (only on a link shared with that station). A mission
+        with the same number of items that arrives at ArduPilot over another link, or as a file, is not noticed: call
+        :meth:`download` first if another station may replace missions.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -365,9 +370,11 @@ class MissionControl(VehiclePlan["Mission"]):
         """
         vehicle_context, session = self._vehicle_context, self._session
         mode = vehicle_context.sender.mode_for("mission.wait_finished", "mission")
-        items_with_home = self._context.caches[MavMissionType.MISSION].items or ()
-        items = items_with_home[self._context.offset_of(MavMissionType.MISSION) :]
-        if self._tracker.count.latest not in (None, len(items)):
+        cache = self._context.caches[MavMissionType.MISSION]
+        items = (cache.items or ())[self._context.offset_of(MavMissionType.MISSION) :]
+        _, plan_id = self._version
+        has_other_id = cache.plan_id != 0 and plan_id != cache.plan_id
+        if has_other_id or self._tracker.count.latest not in (None, len(items)):
             items = ()  # Another ground station has replaced the mission, so its items are unknown.
         end = MissionEndDetector(vehicle_context, self._tracker, mode, items)
         with session.streaming("mission_current", "landed_state", "position"), end.ground.watching():

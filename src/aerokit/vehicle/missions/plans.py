@@ -123,6 +123,10 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
             await transfer.clear()
             self._on_count(0)
 
+    @property
+    def _version(self) -> tuple[int, int]:
+        return self._context.version(self._get_plan_type().MISSION_TYPE)
+
     def _get_plan_type(self) -> type[PlanT]:
         """Return the class of the plan, imported on demand."""
         raise NotImplementedError

@@ -287,7 +287,7 @@ class PlanTransfer(Generic[PlanT]):
                 self._cache.set(items, self._context.now())
                 return items
         received = await self._channel.receive()
-        self._cache.set(received.items, self._context.now())
+        self._cache.set(received.items, self._context.now(), received.opaque_id)
         return received.items
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
@@ -316,7 +316,7 @@ class PlanTransfer(Generic[PlanT]):
         """Send all items; read them back to verify them, or if the vehicle's answers to the upload were ambiguous."""
         result = await self._channel.send(items)
         if result.is_confirmed:
-            self._cache.set(items, self._context.now())
+            self._cache.set(items, self._context.now(), result.opaque_id)
         if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
         received = await self._read(method)
@@ -361,7 +361,7 @@ class PlanTransfer(Generic[PlanT]):
             checksum = mission_checksum(items)
             # Another station may have just replaced the plan, so the next report must have the same checksum.
             if reported == checksum and await self._context.wait_for_plan_id(self._mission_type, checksum):
-                self._cache.set(items, self._context.now())
+                self._cache.set(items, self._context.now(), checksum)
                 return True
         if not autopilot.writes_partial_missions or not self._is_worthwhile(self._changed_seqs(items), len(items)):
             return False
@@ -417,7 +417,7 @@ class PlanTransfer(Generic[PlanT]):
         checksum = mission_checksum(items)
         if not await self._context.wait_for_plan_id(self._mission_type, checksum):
             return False  # The checksum did not arrive in time.
-        self._cache.set(items, self._context.now())
+        self._cache.set(items, self._context.now(), checksum)
         return True
 
     def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import asyncio
 import math
 import os
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING, Literal
 
 import anyio
 
-from aerokit.errors import FileError, FileTimeout, RemoteProtocolError
+from aerokit.errors import AerokitError, FileError, FileTimeout, RemoteProtocolError
 from aerokit.mavlink.enums import MavCmd, MavFtpErr, MavProtocolCapability
 from aerokit.mavlink.messages import FileTransferProtocol, ParamValue
 from aerokit.parameters import Parameter, ParameterTable
 from aerokit.parameters.pack import HASH_NAME
 from aerokit.parameters.parameter import same_value
-from aerokit.protocols.exchange import RoundTrip, is_addressed_to
-from aerokit.vehicle.parameters.store import ParameterStore
+from aerokit.protocols.exchange import IDLE_TIMEOUT_S, RoundTrip, is_addressed_to
+from aerokit.vehicle.parameters.store import IN_FLIGHT_S, ParameterStore
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -56,7 +56,8 @@ class ParameterAccess:
 
     def __init__(self, transfers: Transfers, files: Files) -> None:
         self._transfers, self._files = transfers, files
-        self.store: ParameterStore = ParameterStore(transfers)
+        self.store: ParameterStore = ParameterStore(transfers, self._read_later)
+        self._read_later_names: set[str] = set()  # names that `_read_later` will read
         self._download_lock = asyncio.Lock()
         self._write_lock = asyncio.Lock()
         self._has_pack: bool | None = None  # True if the vehicle offers all parameters in one file; None until tried
@@ -249,6 +250,19 @@ class ParameterAccess:
         with self._boosted(after_s=boost_after_s):
             return await transfers.run(exchange)
 
+    def _read_later(self, name: str, time: float) -> None:
+        """Read a parameter in the background at a time of the loop's clock, so that the store has its true value."""
+
+        async def read() -> None:
+            await anyio.sleep(time - self._transfers.connection.now())
+            self._read_later_names.discard(name)
+            with suppress(AerokitError):
+                await self.read([name], IDLE_TIMEOUT_S)
+
+        if name not in self._read_later_names:
+            self._read_later_names.add(name)
+            self._transfers.background.start(read, f"aerokit read of {name}")
+
     @contextmanager
     def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
         """Raise the rate at which ArduPilot handles parameters, by SET_MESSAGE_INTERVAL of PARAM_VALUE.
@@ -330,6 +344,10 @@ class ParameterAccess:
             # A late answer with the previous value must not replace the new one in the store.
             if name in old_values and answer.value != old_values[name]:
                 self.store.mark_replaced(name, old_values[name])
+            stored = self.store.get(name)
+            if stored is not None and not same_value(stored.value, answer.value):
+                # Another value arrived after the answer, while other parameters were written. It may be a late one.
+                self._read_later(name, transfers.connection.now() + IN_FLIGHT_S)
         return answers
 
     def _forget_written(self, names: Iterable[str]) -> None:

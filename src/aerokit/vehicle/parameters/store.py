@@ -18,6 +18,8 @@ from aerokit.parameters.parameter import MAX_PARAMETERS, same_value
 from aerokit.protocols.parameter_list import merge_update
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from aerokit.autopilots.telemetry import AutopilotVersion
     from aerokit.connection.bus import Detach
     from aerokit.vehicle.session.transfers import Transfers
@@ -29,8 +31,10 @@ IN_FLIGHT_S = 1.0
 class ParameterStore:
     """The known parameters by name. Publishes :class:`ParameterChanged` when a known value changes."""
 
-    def __init__(self, transfers: Transfers) -> None:
+    def __init__(self, transfers: Transfers, on_discarded: Callable[[str, float], None]) -> None:
         self._transfers = transfers
+        # Called with the name and the time from which on values are accepted, after a message was ignored.
+        self._on_discarded = on_discarded
         self._known: dict[str, Parameter] = {}
         # The known parameters as a table; None until it is built again after a change.
         self._table: ParameterTable | None = ParameterTable()
@@ -67,7 +71,8 @@ class ParameterStore:
         """Ignore messages with this previous value for ``IN_FLIGHT_S`` seconds, because a write has just replaced it.
 
         ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
-        value. An answer with the previous value may therefore arrive after the confirmation of the write.
+        value. An answer with the previous value may therefore arrive after the confirmation of the write. Another
+        station may also have restored the previous value, so ``on_discarded`` is called after each ignored message.
         """
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
@@ -126,7 +131,9 @@ class ParameterStore:
             return  # A faulty vehicle may send new names without end.
         replaced_value = self.replaced_value(name)
         if old is not None and replaced_value is not None and same_value(received.value, replaced_value):
-            return  # This message is from before the last write.
+            # This message is from before the last write, or another station has undone the write.
+            self._on_discarded(name, self._replaced[name][1])
+            return
         new = received if old is None else merge_update(old, received, self.bytewise)
         self._known[name] = new
         self._table = None

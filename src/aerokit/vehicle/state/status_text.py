@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
+from aerokit.autopilots.failsafe_texts import failsafe_kind
 from aerokit.vehicle.state.condition import StatusText
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from aerokit.mavlink.messages import Statustext
 
@@ -40,6 +41,8 @@ class StatusTextAssembler:
         # Maps the sender and the id of a text to the chunks received so far.
         self._incomplete: dict[tuple[_Sender, int], _IncompleteText] = {}
         self._recent: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
+        # Texts about failsafes, which other texts must not displace while the failsafe is active.
+        self._failsafes: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
     def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
         """Add one message. Return the texts that it completes, and truncated texts whose next chunk is overdue.
@@ -52,24 +55,39 @@ class StatusTextAssembler:
             texts = [StatusText(message.severity, _text(chunk), now)]
         else:
             texts = list(self._add_chunk(message, chunk, now))
-        self._recent.extend(texts)
+        self._store(texts)
         return truncated_texts + texts
 
     def expire(self, now: float) -> list[StatusText]:
         """Remove the incomplete texts whose next chunk has not arrived for two seconds; return them as truncated."""
         overdue = [key for key, text in self._incomplete.items() if now - text.last_chunk_at > CHUNK_TIMEOUT_S]
         texts = [self._incomplete.pop(key).truncated(now) for key in overdue]
-        self._recent.extend(texts)
+        self._store(texts)
         return texts
 
     def recent(self, since: float = float("-inf")) -> tuple[StatusText, ...]:
         """Return the last texts (64 at most) received at or after ``since``, oldest first."""
         return tuple(text for text in self._recent if text.at >= since)
 
+    def about_failsafes(self) -> tuple[StatusText, ...]:
+        """Return the last texts (64 at most) about failsafes and problems in flight since the last failsafe ended."""
+        return tuple(self._failsafes)
+
+    def clear_failsafes(self) -> None:
+        """Discard the texts about failsafes, because the failsafe has ended. They are still among the recent texts."""
+        self._failsafes.clear()
+
     def clear(self) -> None:
         """Discard incomplete and recent texts."""
         self._incomplete.clear()
         self._recent.clear()
+        self.clear_failsafes()
+
+    def _store(self, texts: Iterable[StatusText]) -> None:
+        for text in texts:
+            self._recent.append(text)
+            if failsafe_kind(text.text):
+                self._failsafes.append(text)
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
         """Add a chunk to its text. Yield the text if it is complete, and before it a text whose end was lost."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit.autopilots import Autopilot, autopilot_for
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.heartbeats import is_autopilot
-from aerokit.mavlink.enums import MavLandedState
+from aerokit.mavlink.enums import MavLandedState, MavState
 from aerokit.mavlink.message import decoder_of, offset_of
 from aerokit.vehicle.state.field import MESSAGE_IDS, Context, MessageSource, StreamedMessage, message_type
 from aerokit.vehicle.state.states import DEFAULT_RATES_HZ, LAZY, SOURCES, STATES, States
@@ -169,6 +169,13 @@ class Telemetry(States):
         """Return the status texts received at or after this time (64 at most), oldest first."""
         return self._texts.recent(at)
 
+    def texts_about_failsafes(self) -> tuple[StatusText, ...]:
+        """Return the last status texts (64 at most) about failsafes and problems in flight, oldest first.
+
+        Texts from before the end of the last failsafe are left out.
+        """
+        return self._texts.about_failsafes()
+
     # ------------------------------------------------------------------------ updating cells
 
     def _cell_of(self, name: str) -> StateCell[Any]:
@@ -290,6 +297,8 @@ class Telemetry(States):
         if not self._knows_autopilot:
             self._learn_autopilot(heartbeat)
         self._context.base_mode = heartbeat.base_mode
+        if heartbeat.system_status < MavState.CRITICAL <= (self.system_status.latest or MavState.UNINIT):
+            self._texts.clear_failsafes()
         return True
 
     def _learn_autopilot(self, heartbeat: messages.Heartbeat) -> None:

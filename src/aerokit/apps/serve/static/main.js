@@ -14,7 +14,7 @@ const page = { vehicles: new Map(), selected: undefined, receivedAt: 0, atSecond
 const selected = () => page.vehicles.get(page.selected);
 
 const map = new MapView(byId("map"), {
-  picked: (place, y) => { pick(false); orders.goTo(place, targetAltitude(page.running(page.selected)) ?? heightNow(), y); }, chosen: choose, changed: draw,
+  picked: (place, y) => { pick(false); orders.goTo(place, targetAltitude(page.running(page.selected)) ?? heightNow(), y); }, chosen: (id) => { if (!previewed) choose(id); }, changed: draw,
 });
 const big = new BigValues(byId("tiles-of-state"));
 const table = new StateTable();
@@ -138,10 +138,13 @@ function pick(isOn) {
 // The plan of the open upload dialog, until it closes; of its parts, the vehicle keeps those that the file does not have.
 let previewed = null;
 
+// Beside the dialog, which is not modal, only the map can be used.
 function preview(plan) {
+  if (plan) pick(false);
   if (plan && !previewed) map.showAll();
   else if (!plan && previewed) map.showBefore();
   previewed = plan;
+  document.querySelectorAll("header, #banner, #notice, main > :not(#map-box)").forEach((each) => { each.inert = Boolean(plan); });
 }
 
 function shownPlan(vehicle) {
@@ -184,7 +187,7 @@ byId("zoom-in").onclick = () => map.leaflet.zoomIn(0.6);
 byId("zoom-out").onclick = () => map.leaflet.zoomOut(0.6);
 byId("fit").onclick = () => { Object.assign(map, { isMoved: false, follows: null, isFitted: false }); draw(); };
 byId("follow").onclick = () => { map.follows = map.follows === null ? page.selected : null; map.isMoved = true; };
-window.addEventListener("keydown", (event) => { if (event.key === "Escape") pick(false); });
+window.addEventListener("keydown", (event) => { if (event.key === "Escape") { pick(false); if (previewed) byId("dialog").close(); } });
 
 // ------------------------------------------------------------------------------------------- showing
 

@@ -202,7 +202,8 @@ export class Orders {
     if (dialog.open) dialog.close();
     this.target = wanted.target ?? null;
     this.page.preview(wanted.preview ?? null);
-    dialog.showModal();
+    if (wanted.preview) dialog.show();
+    else dialog.showModal();
     check();
     this.page.changed();
     (inputs.length ? inputs[0][1] : token ?? cancel).focus();

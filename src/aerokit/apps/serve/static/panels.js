@@ -10,7 +10,7 @@ export class MissionPanel {
     this.changed = changed;
     this.missions = new Map();
     this.fences = new Map();
-    this.counts = new Map();
+    this.reloadedFor = new Map(); // the states for which missions were read again
     this.body = element("tbody", {});
     this.note = element("span", { class: "note" });
     const load = element("button", { type: "button", onclick: () => this.load(this.vehicle, true) }, "Read from vehicle");
@@ -45,7 +45,7 @@ export class MissionPanel {
     try {
       const found = await ask("GET", `api/vehicles/${id}/mission${query}`);
       const what = found.items.length ? `${found.items.length} items` : "the vehicle has no mission";
-      this.missions.set(id, { items: found.items, note: `${what}, read at ${clock(Date.now() / 1000 - found.age_s)}`, isRead: true });
+      this.missions.set(id, { items: found.items, note: `${what}, read at ${clock(Date.now() / 1000 - found.age_s)}`, version: found.version });
     } catch (error) {
       this.missions.set(id, { items: [], note: `reading failed: ${error.message}` });
     }
@@ -54,11 +54,13 @@ export class MissionPanel {
     await this.loadFence(id, query);
   }
 
-  // Reads the mission again, once, when the vehicle reports another number of items.
-  reloadIfChanged(vehicle, mission) {
-    const id = vehicle.system_id, count = vehicle.mission_items ?? null;
-    if (!mission.isRead || count === null || count === mission.items.length || this.counts.get(id) === count) return;
-    this.counts.set(id, count);
+  // Reads the mission again, once, when the server knows of another number of items or another version of the mission.
+  reloadIfChanged(vehicle, { items, version }) {
+    const id = vehicle.system_id, { mission_items: count, mission_version: newest } = vehicle, state = `${count} ${newest}`;
+    if (!version || this.reloadedFor.get(id) === state) return;
+    const isNewer = newest[0] > version[0] || (newest[0] === version[0] && newest[1] !== version[1]);
+    if (!isNewer && (count ?? items.length) === items.length) return;
+    this.reloadedFor.set(id, state);
     this.reload(id);
   }
 
@@ -365,12 +367,15 @@ export class OrderPanel {
     this.drawn = true;
     const shown = [...this.records.values()].reverse();
     this.node.replaceChildren(...shown.map((each) => element("div", { class: "text" },
-      element("time", {}, clock(each.given_unix_s)),
+      element("time", {}, ...times(each).map((text) => element("div", {}, text))),
       element("span", {}, `vehicle ${each.system_id}: `, element("span", { class: shownState(each) }, ...unbroken(this.outcome(each))),
         each.problem && !each.replaced_by ? element("div", { class: "detail" }, inWords(each.problem)) : null))));
     if (!shown.length) this.node.replaceChildren(element("p", { class: "note" }, "no orders yet"));
   }
 }
+
+// When an order was given and when it reached its end, which may be the same second.
+const times = (record) => [...new Set([record.given_unix_s, record.ended_unix_s].filter(Boolean).map(clock))].map((text, index) => (index ? `– ${text}` : text));
 
 // An order that the next one replaced has not failed.
 export const shownState = (record) => (record.replaced_by ? "replaced" : record.state);
