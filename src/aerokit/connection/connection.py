@@ -550,18 +550,24 @@ class Connection:
     def _encode_and_write(self, encoder: FrameEncoder, message: Message, to: int | None) -> None:
         self.raise_if_ended()
         data = self._encode(encoder, message)
-        self._write(data, message, to)
-        self._observers.notify_sent(data)
+        if self._write(data, message, to):
+            self._observers.notify_sent(data)
 
     def _encode(self, encoder: FrameEncoder, message: Message) -> bytes:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
-    def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
-        """Write a frame to the peers of its target. If ``message`` is None, the target is unknown: all peers get it."""
+    def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
+        """Write a frame to the peers of its target. If ``message`` is None, the target is unknown: all peers get it.
+
+        Return False if the target has no peer, so that nothing was sent.
+        """
         system_id = getattr(message, "target_system", 0) if to is None else to
-        for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
+        peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)
+        for peer in peers:
             self.link.write(data, peer)
-        self._observers.record_sent(data, self._clock())
+        if peers:
+            self._observers.record_sent(data, self._clock())
+        return bool(peers)
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
         """Number, frame and write a message to one peer, e.g. a probe over each of several links."""
