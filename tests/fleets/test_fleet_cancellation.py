@@ -66,6 +66,21 @@ async def test_link_lost_while_members_are_searched_raises() -> None:
         assert now() - began < 5.0
 
 
+async def test_function_error_that_ends_block_holds_finished_members() -> None:
+    async def fly(member: Member) -> None:
+        if member.name == "north/1":
+            await member.vehicle.go_to(north(5)(member))
+        else:
+            await anyio.sleep(30)
+            raise KeyError("mine")
+
+    with pytest.raises(KeyError, match="mine"):
+        async with open_stage(2) as stage:
+            await stage.take_off()
+            await stage.fleet.do(fly)
+    assert stage.modes_ordered("north/1") == ["BRAKE"]
+
+
 async def test_exception_in_block_propagates_and_members_hold_concurrently() -> None:
     began = 0.0
     copters: list[SimulatedCopter] = []

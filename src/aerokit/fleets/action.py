@@ -133,6 +133,7 @@ class FleetAction:
             await tasks.aclose()
         if self.program_error is not None:
             self._hold_finished_members()
+            await asyncio.sleep(0)  # The orders are sent before the error may end the fleet's block.
             raise self.program_error
         return self.result_so_far()
 
