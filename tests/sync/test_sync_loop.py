@@ -226,7 +226,10 @@ def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object
     return observed
 
 
-def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
+@pytest.mark.parametrize(
+    ("method", "call"), [("run_shielded", "self._run(True, True,"), ("run_exit", "self._run(False, True,")]
+)
+def test_clean_up_completes_wherever_ctrl_c_arrives(method: str, call: str) -> None:
     """Interrupt at every line of aerokit except the calls themselves, where it cannot be noticed yet."""
     done: list[int] = []
 
@@ -236,7 +239,7 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
             done.append(1)
 
     def use(loops: list[LoopThread]) -> None:
-        loops[0].run_shielded(work)
+        getattr(loops[0], method)(work)
 
     def interrupted(place: Place | None) -> set[Place]:
         loop = LoopThread()
@@ -258,7 +261,7 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
                 left_undone.add(linecache.getline(*place).strip())
     assert len(was_come_to) > 20
     assert left_undone == {
-        "return self._run(True, function, *args, **kwargs)",
+        f"return {call} function, *args, **kwargs)",
         "call: _Call[T] | None = None",
         "try:",
     }
