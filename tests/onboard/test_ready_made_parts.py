@@ -199,6 +199,25 @@ async def test_video_that_is_stopped_while_it_starts_ends() -> None:
     assert acks[-1].result == MavResult.ACCEPTED
 
 
+async def test_video_whose_start_was_cancelled_is_stopped() -> None:
+    class SlowEye(Eye):
+        async def start_video(self) -> None:
+            self.calls.append("start")
+            await asyncio.sleep(60.0)
+
+    eye = SlowEye()
+    async with payload_and_station() as (component, station):
+        component.add_camera(eye)
+        station.connection.send(station.command_long(MavCmd.VIDEO_START_CAPTURE))
+        await asyncio.sleep(0.05)
+        cancel = m.CommandCancel(*station.target, MavCmd.VIDEO_START_CAPTURE)
+        cancelled = await station.ask(cancel, m.CommandAck)
+        stopped = await station.command(MavCmd.VIDEO_STOP_CAPTURE)
+        await station.command(MavCmd.VIDEO_STOP_CAPTURE)
+    assert (cancelled.result, stopped.result) == (MavResult.CANCELLED, MavResult.ACCEPTED)
+    assert eye.calls == ["start", "stop"]
+
+
 async def test_video_zoom_tracking_and_storage_call_the_program() -> None:
     eye = Eye()
     async with device_and_client(100, MavType.CAMERA) as (component, vehicle):

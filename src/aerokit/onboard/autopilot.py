@@ -26,7 +26,7 @@ class AutopilotDriver:
 
     Override the coroutines for the commands that the vehicle has; other commands are UNSUPPORTED. A coroutine returns
     when the vehicle has started to execute the command, or raises an exception to refuse it. HEARTBEAT reports the new
-    armed state and mode after the coroutine has returned.
+    armed state and mode after the coroutine has returned. A command to disarm cancels a running :meth:`arm`.
     """
 
     async def arm(self, force: bool) -> None:

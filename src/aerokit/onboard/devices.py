@@ -36,7 +36,7 @@ class WinchDriver:
     """Base class for your program's winch; pass an instance to :meth:`OnboardComponent.add_winch`.
 
     Override the coroutines for the actions that the winch has; other actions are UNSUPPORTED. A coroutine returns when
-    the action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command.
+    the action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command. HOLD cancels it, too.
     """
 
     async def relax(self) -> None:

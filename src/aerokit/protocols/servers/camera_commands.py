@@ -128,6 +128,7 @@ class _Videos:
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self._must_stop = False  # True from a command to stop until the next command to start
+        self._was_cancelled = False  # True if a start was cancelled, so that the camera may be recording
 
     async def start(self, command: ReceivedCommand) -> int:
         """Start recording. Param 2 is the rate in Hz at which CAMERA_CAPTURE_STATUS is sent during the recording."""
@@ -142,7 +143,11 @@ class _Videos:
         if camera.free_mib <= 0:
             return MavResult.FAILED
         self._must_stop = False
-        await camera.start_video()
+        try:
+            await camera.start_video()
+        except BaseException as error:
+            self._was_cancelled = not isinstance(error, Exception)
+            raise
         status_interval_s = 1.0 / command.param2 if command.param2 else 0.0  # 0 requests no status.
         captures.record(status_interval_s)
         if self._must_stop:  # The command to stop arrived while the camera was starting.
@@ -155,8 +160,9 @@ class _Videos:
         return MavResult.ACCEPTED
 
     async def _stop_recording(self) -> None:
-        if self._camera.captures.is_recording:
+        if self._camera.captures.is_recording or self._was_cancelled:
             await self._camera.stop_video()
+            self._was_cancelled = False
             self._camera.captures.stop_recording()
             self._camera.host.send(self._camera.captures.status())
 
