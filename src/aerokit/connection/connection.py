@@ -536,6 +536,7 @@ class Connection:
             return
         self._end_signal.error = error  # Set first, so that sinks of the following events find the connection closed.
         self._receiver.close()
+        self._observers.flush()  # The task that flushes ends, but the program may continue for long.
         # Only a lost link is published as an event: a program that closes the connection itself needs none.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
