@@ -15,7 +15,8 @@ from onboard_peers import autopilot_and_client, payload_and_station
 from aerokit.errors import BusyError, CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavType
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavParamType, MavResult, MavType
+from aerokit.missions import MissionItem
 from aerokit.onboard import CommandRequest, CommandResult, Param, Range
 from aerokit.protocols.servers.commands import MAX_RESULTS
 
@@ -166,6 +167,21 @@ async def test_command_from_before_blocked_loop_is_not_executed(blocked_s: float
         assert calls == is_executed
         await station.command(MavCmd.USER_1, 2)
         assert calls == is_executed + 1
+
+
+async def test_orders_without_command_from_before_blocked_loop_are_not_executed() -> None:
+    currents: list[int] = []
+    async with payload_and_station() as (payload, station):
+        payload.parameters.add("SPEED", 1.0)
+        payload.missions.replace([MissionItem(16, 6, x=number, y=number) for number in range(3)])
+        payload.missions.on_set_current(currents.append)
+        await asyncio.sleep(1.0)
+        station.connection.send(m.ParamSet(*station.target, "SPEED", 2.0, MavParamType.REAL32))
+        station.connection.send(m.MissionSetCurrent(*station.target, 2))
+        station.connection.send(m.MissionClearAll(*station.target, 0))
+        block_loop(10.0)
+        await asyncio.sleep(1.0)
+        assert (payload.parameters["SPEED"], currents, len(payload.missions.items())) == (1.0, [], 3)
 
 
 async def test_results_of_many_senders_are_bounded() -> None:
