@@ -142,6 +142,35 @@ async def test_error_of_storage_is_reported_and_connection_stays_open() -> None:
     assert "no card" in texts[0].text
 
 
+async def test_stream_that_fails_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(Eye):
+        is_broken = True
+
+        def storage(self) -> Storage:
+            if self.is_broken:
+                raise OSError("no card")
+            return super().storage()
+
+    eye = Broken()
+    request = MavCmd.SET_MESSAGE_INTERVAL, m.CameraCaptureStatus.ID, 100_000
+    async with payload_and_station() as (component, station):
+        component.add_camera(eye)
+        refused = await station.command(*request)
+        eye.is_broken = False
+        with station.collecting(m.CameraCaptureStatus) as received:
+            await asyncio.sleep(1.0)
+            assert received == []
+            accepted = await station.command(*request)
+            caplog.clear()
+            eye.is_broken = True
+            await asyncio.sleep(1.0)
+            assert len([record for record in caplog.records if record.exc_info]) == 1
+            eye.is_broken = False
+            await asyncio.sleep(1.0)
+    assert (refused.result, accepted.result) == (MavResult.FAILED, MavResult.ACCEPTED)
+    assert len(received) >= 10
+
+
 async def test_digicam_control_during_photo_is_rejected() -> None:
     async with payload_and_station() as (component, station):
         component.add_camera(Eye())
