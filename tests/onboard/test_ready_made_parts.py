@@ -470,6 +470,27 @@ async def test_hold_stops_winch_that_pays_out() -> None:
     assert (spool.is_held, spool.length_m) == (True, 0.0)
 
 
+async def test_repeated_hold_stops_winch_that_pays_out_again() -> None:
+    """The first transmission of the second order to hold was lost."""
+
+    class Holding(Spool):
+        holds = 0
+
+        async def hold(self) -> None:
+            self.holds += 1
+
+    spool = Holding()
+    pay_out, hold = WinchActions.RELATIVE_LENGTH_CONTROL, WinchActions.HOLD
+    async with payload_and_station(component_id=169, type=MavType.WINCH) as (component, station):
+        component.add_winch(spool)
+        await station.command(MavCmd.DO_WINCH, 1, hold)
+        station.connection.send(station.command_long(MavCmd.DO_WINCH, 1, pay_out, 50, 1))
+        await asyncio.sleep(0.05)
+        ack = await station.command(MavCmd.DO_WINCH, 1, hold, confirmation=1)
+        await asyncio.sleep(60.0)
+    assert (ack.result, spool.holds, spool.length_m) == (MavResult.ACCEPTED, 2, 0.0)
+
+
 class Model(AutopilotDriver):
     def __init__(self) -> None:
         self.calls: list[object] = []

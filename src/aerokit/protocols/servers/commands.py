@@ -213,14 +213,14 @@ class RunningCommands:
     ) -> RunningCommand | None:
         """Register a command that is to be executed. If it must not be executed, answer the sender and return None.
 
-        ``is_stop`` cancels a running command with the same MAV_CMD.
+        ``is_stop`` cancels a running command with the same MAV_CMD. Such a command may be executed twice.
         """
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
         ended = self._ended.get((command.command, command.sender))
-        if ended is not None:
+        if ended is not None and not is_stop:  # The first transmission of a new command to stop may have been lost.
             ended_command, outcome, ended_at = ended
             if _is_repeated(command, ended_command) and self._host.now - ended_at <= RESULT_MAX_AGE_S:
                 self._server.answer(command, *outcome)
