@@ -397,6 +397,14 @@ async def test_gimbal_denies_place_that_it_does_not_know(latitude: float, frame:
     assert head.places == []
 
 
+@pytest.mark.parametrize("system_id", [0, math.nan, 256])
+async def test_gimbal_denies_to_follow_impossible_system(system_id: float) -> None:
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(LookingHead())
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        assert (await station.command(MavCmd.DO_SET_ROI_SYSID, system_id)).result == MavResult.DENIED
+
+
 async def test_gimbal_denies_infinite_angles() -> None:
     head = Head()
     async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):

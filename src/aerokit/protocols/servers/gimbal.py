@@ -240,7 +240,10 @@ class GimbalRequests:
         """Follow the vehicle whose system id is param 1."""
         if (refusal := self._refusal(command.param2, command)) is not None:
             return refusal
-        self._gimbal.follow(to_int(command.param1))
+        system_id = to_int(command.param1)
+        if not 1 <= system_id <= 255:
+            return MavResult.DENIED
+        self._gimbal.follow(system_id)
         return MavResult.ACCEPTED
 
     def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
