@@ -18,6 +18,7 @@ from aerokit.errors import AerokitError, FileError, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import (
     MavCmd,
+    MavFtpOpcode,
     MavMissionResult,
     MavMissionType,
     MavParamError,
@@ -30,6 +31,7 @@ from aerokit.onboard import CommandRequest
 from aerokit.onboard.files import DirectoryFiles
 from aerokit.position import Position
 from aerokit.protocols.servers.files import FileFault, FileTree
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 
 pytestmark = pytest.mark.anyio
 
@@ -328,3 +330,24 @@ def test_block_that_is_written_in_part_is_refused(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         file.close()
+
+
+async def test_file_of_unfinished_checksum_is_closed_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").write_bytes(bytes(2_000_000))
+    opened: list[Any] = []
+    open_file = DirectoryFiles.open
+
+    def open_and_keep(files: DirectoryFiles, path: str, **options: bool) -> Any:
+        opened.append(open_file(files, path, **options))
+        return opened[-1]
+
+    monkeypatch.setattr(DirectoryFiles, "open", open_and_keep)
+    async with payload_and_station() as (payload, station):
+        payload.serve_files(tmp_path)
+        request = FtpPacket(1, MavFtpOpcode.CALCFILECRC, 0, 2, data=b"/a", client=station.target)
+        station.connection.send(request.message())
+        await asyncio.sleep(0.001)
+        assert not opened[0]._file.closed
+    assert opened[0]._file.closed
