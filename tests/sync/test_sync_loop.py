@@ -19,6 +19,7 @@ import anyio
 import pytest
 
 from aerokit.errors import ConnectionClosed, LinkOpenError
+from aerokit.sync.blocks import BlockTwin
 from aerokit.sync.loop_thread import LoopThread
 
 LIMIT_S = 100.0
@@ -293,3 +294,32 @@ def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
             thread.join(LIMIT_S)
             assert not thread.is_alive()
     assert lost == []
+
+
+def test_block_is_left_if_ctrl_c_comes_before_its_exit(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Block:
+        is_left = False
+
+        async def __aenter__(self) -> Block:
+            return self
+
+        async def __aexit__(self, *_: object) -> None:
+            self.is_left = True
+
+    start, interruptions = LoopThread._start, [KeyboardInterrupt]
+
+    def interrupted_start(loop: LoopThread, call: Any) -> None:
+        if interruptions:
+            raise interruptions.pop()
+        start(loop, call)
+
+    loop, block = LoopThread(), Block()
+    twin: BlockTwin[Any] = BlockTwin(loop, block)
+    try:
+        twin.__enter__()
+        monkeypatch.setattr(LoopThread, "_start", interrupted_start)
+        with pytest.raises(KeyboardInterrupt):
+            twin.__exit__(None, None, None)
+    finally:
+        loop.close()
+    assert block.is_left
