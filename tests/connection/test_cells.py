@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import math
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -329,6 +330,17 @@ async def test_feed_is_notified_of_watchers_and_asked_by_readers() -> None:
     assert feed.cell._latest == 6
     feed.cell.changes()
     assert feed.reported == [True, False] * 3  # each was dropped at once
+
+
+async def test_iterator_dropped_on_another_thread_reports_on_the_loop() -> None:
+    feed = LazyFeed()
+    iterators = [feed.cell.changes()]
+    thread = threading.Thread(target=iterators.clear)
+    thread.start()
+    thread.join()
+    assert feed.reported == [True]
+    await asyncio.sleep(0.01)
+    assert feed.reported == [True, False]
 
 
 async def test_repr_is_readable() -> None:

@@ -214,6 +214,20 @@ async def test_crash_loses_at_most_a_second(tmp_path: Path) -> None:
         assert senders(path)[1] > 50  # it is in the file before anything is closed
 
 
+async def test_lost_link_leaves_whole_recording_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    near, far = memory_link_pair()
+    async with open_connection(near, record=path) as connection, open_connection(far, heartbeat=None) as other:
+        await anyio.sleep(1.5)
+        for _ in range(20):
+            other.send(ATTITUDE)
+        await anyio.sleep(0.1)
+        other.close()
+        await anyio.sleep(0.1)
+        assert not connection.is_open
+        assert senders(path)[255] >= 20  # although the block has not been left
+
+
 async def test_unwritable_file_is_refused_before_opening(tmp_path: Path) -> None:
     near, far = memory_link_pair()
     with pytest.raises(LinkOpenError, match=r"cannot record to .*No such file or directory"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import AbstractAsyncContextManager
+from pathlib import Path
 
 import anyio
 import pytest
@@ -134,8 +135,8 @@ async def test_lost_hardware_request_is_repeated() -> None:
         assert choice_of(connection).candidates[1].is_doubted
 
 
-async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
-    """The other vehicle reports its hardware id only after ours has failed."""
+async def test_wrongly_used_vehicle_is_ignored_once_known(tmp_path: Path) -> None:
+    """The other vehicle reports its hardware id only after ours has failed. An order is not recorded as sent."""
     twins = Twins(b"A" * 18, NOBODY)
     async with twins.connected() as connection, aerokit.connect(connection) as flying:
         await flying.wait_ready()
@@ -149,11 +150,18 @@ async def test_wrongly_used_vehicle_is_ignored_once_known() -> None:
         twins.reported.messages.clear()
         taken: list[m.Heartbeat] = []
         connection.bus.attach(m.Heartbeat, taken.append)
-        connection.send(m.CommandLong(1, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0))
+        sent: list[bytes] = []
+        connection.observe_sent_frames(sent.append)
+        connection.record(tmp_path / "flight.tlog")
+        order = m.CommandLong(1, 1, 400, 0, 1.0, 0, 0, 0, 0, 0, 0)
+        connection.send(order)
         await anyio.sleep(3)
         assert twins.reported.of(m.CommandLong) == []
         assert taken == []
         assert not twins.theirs.is_armed
+    recorded = (tmp_path / "flight.tlog").read_bytes()
+    assert order.encode().rstrip(b"\0") not in b"".join(sent) + recorded
+    assert sent
 
 
 # ------------------------------------------------------------------------------ LinkChoice alone

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import anyio
 import pytest
+from flight_harness import block_loop
 from several_harness import DEAD, GOOD, EventLog, Radios, ReceivedMessages, over
 
 import aerokit
@@ -420,3 +421,18 @@ async def stand_still(copter: SimulatedCopter, radios: Radios, *, is_silent: boo
         copter.booted_at += 0.1
     for index in range(2 if is_silent else 0):
         radios.mend(index)
+
+
+@pytest.mark.parametrize("blocked_s", [2.0, 40.0])
+async def test_blocked_loop_is_no_silence_of_a_link(blocked_s: float) -> None:
+    radios = Radios(2)
+    async with (
+        over(radios, SimulatedCopter(boot_time_s=0.0)) as connection,
+        aerokit.connect(connection) as vehicle,
+    ):
+        await vehicle.wait_ready()
+        await anyio.sleep(5.0)
+        changes = EventLog(connection, events.MemberLinkStateChanged, events.LinkSelected)
+        block_loop(blocked_s)
+        await anyio.sleep(5.0)
+        assert changes.all == []

@@ -10,13 +10,16 @@ import pytest
 from fleet_stage import open_stage
 from flight_harness import attached_sinks, now, waiting_on_cells
 
-from aerokit.errors import OperationRejected
-from aerokit.fleets.events import PolicyCompleted
+from aerokit.connection.opening import open_connection
+from aerokit.errors import LinkLost, OperationRejected
+from aerokit.fleets.events import PolicyApplied, PolicyCompleted
 from aerokit.fleets.formation import Formation
 from aerokit.fleets.members import Member, MemberState
+from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission, land, take_off
 from aerokit.sim import SimulatedCopter
+from aerokit.transport import memory_link_pair
 
 pytestmark = pytest.mark.anyio
 
@@ -36,6 +39,46 @@ async def test_fleet_exit_during_action_makes_members_hold() -> None:
     result = await asyncio.wait_for(flying, 5)
     assert len(result.failed) == 3
     assert {copter.mode.name for copter in copters.values()} == {"BRAKE"}
+
+
+async def test_fleet_exit_at_policy_ends_action() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        copters = stage.copters
+        flying = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(3)
+        with stage.fleet.events(PolicyApplied) as events:
+            stage.pilot_takes("north/1")
+            await events.get(20)
+    result = await asyncio.wait_for(flying, 5)
+    assert (set(result.failed), set(result.stopped)) == ({"north/1"}, {"north/2", "north/3"})
+    assert [copter.mode.name for copter in copters.values()] == ["LOITER", "BRAKE", "BRAKE"]
+
+
+async def test_link_lost_while_members_are_searched_raises() -> None:
+    near, far = memory_link_pair()
+    async with open_connection(far) as other:
+        asyncio.get_running_loop().call_later(3.0, other.close)
+        began = now()
+        with pytest.raises(LinkLost):
+            async with fleet(near):
+                raise AssertionError
+        assert now() - began < 5.0
+
+
+async def test_function_error_that_ends_block_holds_finished_members() -> None:
+    async def fly(member: Member) -> None:
+        if member.name == "north/1":
+            await member.vehicle.go_to(north(5)(member))
+        else:
+            await anyio.sleep(30)
+            raise KeyError("mine")
+
+    with pytest.raises(KeyError, match="mine"):
+        async with open_stage(2) as stage:
+            await stage.take_off()
+            await stage.fleet.do(fly)
+    assert stage.modes_ordered("north/1") == ["BRAKE"]
 
 
 async def test_exception_in_block_propagates_and_members_hold_concurrently() -> None:

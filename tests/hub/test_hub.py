@@ -21,12 +21,14 @@ from aerokit import Signing, SigningKey
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.hub import Endpoint, EndpointStatistics, Hub, HubEvent
 from aerokit.hub import message_rules as kinds
+from aerokit.mavlink.dialect import STANDARD, Dialect
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.messages import (
     Attitude,
     CommandLong,
     GlobalPositionInt,
     Heartbeat,
+    LandingTarget,
     ParamRequestList,
     ParamValue,
     SetupSigning,
@@ -109,6 +111,21 @@ async def test_commands_are_not_forwarded_after_blocked_loop() -> None:
         station.send(ORDER)
         await settle()
         assert copter.received == ["HEARTBEAT", "COMMAND_LONG"]
+
+
+@pytest.mark.parametrize("dialect", [STANDARD, Dialect("own", [Heartbeat, CommandLong, LandingTarget])])
+@virtual
+async def test_orders_of_any_dialect_are_not_forwarded_late(dialect: Dialect) -> None:
+    copter, station = Program(1, 1), Program(255, 190)
+    hub = Hub([copter.endpoint("a"), station.endpoint("b")], dialect=dialect)
+    async with copter, station, hub:
+        copter.send(COPTER)
+        await anyio.sleep(1.0)
+        station.send(ORDER, LandingTarget(0, 0, 12, 0.1, 0.1, 3.0, 0.0, 0.0))
+        block_loop(10.0)
+        await anyio.sleep(1.0)
+        assert copter.received == []
+        assert of(hub, "b").dropped == {"late": 2}
 
 
 @virtual

@@ -277,6 +277,17 @@ def test_sharing_ends_with_connection_but_not_vice_versa() -> None:
     run_virtual(run())
 
 
+def test_connection_is_shared_once_and_vehicle_gets_no_echo() -> None:
+    async def play(on: Stage) -> None:
+        with pytest.raises(InvalidArgument, match="shares it already"):
+            await on.hub.share(on.connection, name="again")
+        on.vehicle.send(COPTER, Attitude(0, 0, 0, 0, 0, 0, 0))
+        await settle()
+        assert "ATTITUDE" not in on.vehicle.received
+
+    on_stage(play)
+
+
 def test_blocking_twin_shares() -> None:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]

@@ -12,7 +12,7 @@ from aerokit.connection.opening import open_connection
 from aerokit.errors import BusyError, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavState, MavType
-from aerokit.onboard import Identity
+from aerokit.onboard import CommandRequest, Identity
 from aerokit.onboard.events import MAX_STORED_EVENTS
 from aerokit.transport import memory_link_pair
 
@@ -135,4 +135,35 @@ async def test_invalid_id_is_refused(arguments: dict[str, int]) -> None:
     near, _ = memory_link_pair()
     with pytest.raises(InvalidArgument):
         async with aerokit.component(near, **arguments):  # type: ignore[arg-type]
+            pass
+
+
+async def test_ids_of_component_that_closes_are_not_free() -> None:
+    has_started, may_end = asyncio.Event(), asyncio.Event()
+    near, far = memory_link_pair()
+    async with open_connection(near) as connection, open_connection(far) as other:
+
+        async def run() -> None:
+            async with aerokit.component(connection=connection) as component:
+
+                @component.command(MavCmd.USER_1)
+                async def wait(_: CommandRequest) -> None:
+                    has_started.set()
+                    try:
+                        await asyncio.sleep(60.0)
+                    finally:
+                        await may_end.wait()
+
+                other.send(m.CommandLong(1, 191, MavCmd.USER_1, 0, 0, 0, 0, 0, 0, 0, 0))
+                await has_started.wait()
+
+        task = asyncio.create_task(run())
+        await has_started.wait()
+        await asyncio.sleep(0.1)
+        with pytest.raises(BusyError):
+            async with aerokit.component(connection=connection):
+                pass
+        may_end.set()
+        await task
+        async with aerokit.component(connection=connection):
             pass

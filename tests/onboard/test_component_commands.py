@@ -15,8 +15,9 @@ from onboard_peers import autopilot_and_client, payload_and_station
 from aerokit.errors import BusyError, CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavResult, MavType
-from aerokit.onboard import CommandRequest, Param, Range
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavParamType, MavResult, MavType
+from aerokit.missions import MissionItem
+from aerokit.onboard import CommandRequest, CommandResult, Param, Range
 from aerokit.protocols.servers.commands import MAX_RESULTS
 
 pytestmark = pytest.mark.anyio
@@ -166,6 +167,21 @@ async def test_command_from_before_blocked_loop_is_not_executed(blocked_s: float
         assert calls == is_executed
         await station.command(MavCmd.USER_1, 2)
         assert calls == is_executed + 1
+
+
+async def test_orders_without_command_from_before_blocked_loop_are_not_executed() -> None:
+    currents: list[int] = []
+    async with payload_and_station() as (payload, station):
+        payload.parameters.add("SPEED", 1.0)
+        payload.missions.replace([MissionItem(16, 6, x=number, y=number) for number in range(3)])
+        payload.missions.on_set_current(currents.append)
+        await asyncio.sleep(1.0)
+        station.connection.send(m.ParamSet(*station.target, "SPEED", 2.0, MavParamType.REAL32))
+        station.connection.send(m.MissionSetCurrent(*station.target, 2))
+        station.connection.send(m.MissionClearAll(*station.target, 0))
+        block_loop(10.0)
+        await asyncio.sleep(1.0)
+        assert (payload.parameters["SPEED"], currents, len(payload.missions.items())) == (1.0, [], 3)
 
 
 async def test_results_of_many_senders_are_bounded() -> None:
@@ -359,3 +375,46 @@ async def test_text_of_denied_command_has_all_digits() -> None:
         with station.collecting(m.Statustext) as texts:
             await station.command(MavCmd.USER_1, 1000000.5)
     assert texts[0].text.startswith("drop: count = 1000000.5 is not allowed")
+
+
+@pytest.mark.parametrize("value", [300, -1, CommandResult(progress=1000), CommandResult(detail=1 << 40)])
+@pytest.mark.parametrize("is_coroutine", [True, False])
+async def test_impossible_result_is_failed_and_connection_stays_open(value: object, is_coroutine: bool) -> None:
+    async with payload_and_station() as (payload, station):
+
+        async def drop_later(_: CommandRequest) -> object:
+            return value
+
+        def drop(_: CommandRequest) -> object:
+            return value
+
+        payload.command(MavCmd.USER_1)(drop_later if is_coroutine else drop)
+        ack = await station.command(MavCmd.USER_1)
+        assert payload.connection.is_open
+    assert ack.result == MavResult.FAILED
+
+
+async def test_command_while_component_closes_is_cancelled() -> None:
+    has_started, may_end = asyncio.Event(), asyncio.Event()
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        async def drop(_: CommandRequest) -> None:
+            has_started.set()
+            try:
+                await asyncio.sleep(60.0)
+            finally:
+                await may_end.wait()
+
+        @payload.command(MavCmd.USER_2)
+        async def other(_: CommandRequest) -> None:
+            raise AssertionError
+
+        station.connection.send(station.command_long(MavCmd.USER_1))
+        await has_started.wait()
+        closing = asyncio.create_task(payload._aclose())
+        await asyncio.sleep(0)
+        ack = await station.command(MavCmd.USER_2)
+        may_end.set()
+        await closing
+    assert ack.result == MavResult.CANCELLED

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,22 @@ from onboard_peers import autopilot_and_client, device_and_client, payload_and_s
 from aerokit._internal.files import write_atomically
 from aerokit.errors import AerokitError, FileError, InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavParamError, MavParamExtType, MavType, ParamAck
+from aerokit.mavlink.enums import (
+    MavCmd,
+    MavFtpOpcode,
+    MavMissionResult,
+    MavMissionType,
+    MavParamError,
+    MavParamExtType,
+    MavType,
+    ParamAck,
+)
 from aerokit.missions import Mission, MissionItem, waypoint
 from aerokit.onboard import CommandRequest
+from aerokit.onboard.files import DirectoryFiles
 from aerokit.position import Position
+from aerokit.protocols.servers.files import FileFault, FileTree
+from aerokit.protocols.servers.ftp_packets import FtpPacket
 
 pytestmark = pytest.mark.anyio
 
@@ -289,3 +302,52 @@ async def test_mission_refused_by_program_is_not_stored(raises: bool) -> None:
         with pytest.raises(AerokitError):
             await vehicle.mission.upload(MISSION)
         assert node.missions.items() == ()
+
+
+@pytest.mark.parametrize("is_coroutine", [True, False])
+async def test_impossible_mission_result_is_error_and_connection_stays_open(is_coroutine: bool) -> None:
+    async with payload_and_station() as (payload, station):
+
+        async def check_later(kind: str, items: tuple[MissionItem, ...]) -> int:
+            return 300
+
+        payload.missions.on_upload(check_later if is_coroutine else lambda kind, items: 300)
+        ack = await station.ask(m.MissionCount(*station.target, 0, MavMissionType.MISSION), m.MissionAck)
+        assert payload.connection.is_open
+    assert ack.type == MavMissionResult.ERROR
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit of file sizes")
+def test_block_that_is_written_in_part_is_refused(tmp_path: Path) -> None:
+    import resource
+
+    file = DirectoryFiles(tmp_path, FileTree(), is_writable=True).open("/a", writing=True, create=True)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(FileFault):
+            file.write(0, bytes(200))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        file.close()
+
+
+async def test_file_of_unfinished_checksum_is_closed_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").write_bytes(bytes(2_000_000))
+    opened: list[Any] = []
+    open_file = DirectoryFiles.open
+
+    def open_and_keep(files: DirectoryFiles, path: str, **options: bool) -> Any:
+        opened.append(open_file(files, path, **options))
+        return opened[-1]
+
+    monkeypatch.setattr(DirectoryFiles, "open", open_and_keep)
+    async with payload_and_station() as (payload, station):
+        payload.serve_files(tmp_path)
+        request = FtpPacket(1, MavFtpOpcode.CALCFILECRC, 0, 2, data=b"/a", client=station.target)
+        station.connection.send(request.message())
+        await asyncio.sleep(0.001)
+        assert not opened[0]._file.closed
+    assert opened[0]._file.closed

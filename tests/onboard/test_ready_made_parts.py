@@ -11,8 +11,10 @@ from onboard_peers import autopilot_and_client, device_and_client, payload_and_s
 
 from aerokit.errors import AerokitError, BusyError, CommandRejected, InvalidArgument, OperationRejected
 from aerokit.mavlink import messages as m
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import (
     CameraZoomType,
+    GimbalManagerFlags,
     MavArmAuthDeniedReason,
     MavCmd,
     MavFrame,
@@ -106,6 +108,107 @@ async def test_series_waits_for_slow_camera(delay_s: float) -> None:
     assert indices == [0, 1, 2, 3]
 
 
+async def test_photo_that_no_message_can_carry_is_failed() -> None:
+    class LongNames(Eye):
+        async def take_photo(self, index: int) -> Photo:
+            return Photo("x" * 400)
+
+    async with payload_and_station() as (component, station):
+        component.add_camera(LongNames())
+        image = await station.ask(station.command_long(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1, 1), m.CameraImageCaptured)
+        assert component.connection.is_open
+    assert image.capture_result == 0
+
+
+async def test_error_of_storage_is_reported_and_connection_stays_open() -> None:
+    class Broken(Eye):
+        is_broken = False
+
+        def storage(self) -> Storage:
+            if self.is_broken:
+                raise OSError("no card")
+            return super().storage()
+
+    eye = Broken()
+    async with payload_and_station() as (component, station):
+        component.add_camera(eye)
+        await station.command(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1, 1)
+        eye.is_broken = True
+        with station.collecting(m.Statustext) as texts:
+            await asyncio.sleep(1.0)
+            ack = await station.command(MavCmd.REQUEST_MESSAGE, m.CameraCaptureStatus.ID)
+        assert component.connection.is_open
+    assert ack.result == MavResult.FAILED
+    assert "no card" in texts[0].text
+
+
+async def test_stream_that_fails_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(Eye):
+        is_broken = True
+
+        def storage(self) -> Storage:
+            if self.is_broken:
+                raise OSError("no card")
+            return super().storage()
+
+    eye = Broken()
+    request = MavCmd.SET_MESSAGE_INTERVAL, m.CameraCaptureStatus.ID, 100_000
+    async with payload_and_station() as (component, station):
+        component.add_camera(eye)
+        refused = await station.command(*request)
+        eye.is_broken = False
+        with station.collecting(m.CameraCaptureStatus) as received:
+            await asyncio.sleep(1.0)
+            assert received == []
+            accepted = await station.command(*request)
+            caplog.clear()
+            eye.is_broken = True
+            await asyncio.sleep(1.0)
+            assert len([record for record in caplog.records if record.exc_info]) == 1
+            eye.is_broken = False
+            await asyncio.sleep(1.0)
+    assert (refused.result, accepted.result) == (MavResult.FAILED, MavResult.ACCEPTED)
+    assert len(received) >= 10
+
+
+async def test_digicam_control_during_photo_is_rejected() -> None:
+    async with payload_and_station() as (component, station):
+        component.add_camera(Eye())
+        await station.command(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1, 1)
+        ack = await station.command(MavCmd.DO_DIGICAM_CONTROL, 0, 0, 0, 0, 1)
+        await asyncio.sleep(1.0)
+        next_ack = await station.command(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1, 2)
+    assert (ack.result, next_ack.result) == (MavResult.TEMPORARILY_REJECTED, MavResult.ACCEPTED)
+
+
+async def test_series_after_stopped_slow_one_keeps_its_interval() -> None:
+    eye = Eye()
+    eye.delay_s = 1.3
+    async with payload_and_station() as (component, station):
+        component.add_camera(eye)
+        await station.command(MavCmd.IMAGE_START_CAPTURE, 0, 0.5, 0)
+        await asyncio.sleep(1.0)
+        await station.command(MavCmd.IMAGE_STOP_CAPTURE)
+        await asyncio.sleep(2.0)
+        eye.delay_s = 0.1
+        with station.collecting(m.CameraImageCaptured) as images:
+            await station.command(MavCmd.IMAGE_START_CAPTURE, 0, 10.0, 0)
+            await asyncio.sleep(5.0)
+    assert len(images) == 1
+
+
+async def test_photo_with_number_of_another_station_is_taken() -> None:
+    async with payload_and_station() as (component, station):
+        component.add_camera(Eye())
+        command = station.command_long(MavCmd.IMAGE_START_CAPTURE, 0, 0, 1, 1)
+        with station.collecting(m.CameraImageCaptured) as images:
+            station.connection.send(command)
+            await asyncio.sleep(1.0)
+            station.connection.send_as(FrameEncoder(200, 190), command)
+            await asyncio.sleep(1.0)
+    assert len(images) == 2
+
+
 async def test_video_that_is_stopped_while_it_starts_ends() -> None:
     class SlowEye(Eye):
         async def start_video(self) -> None:
@@ -123,6 +226,25 @@ async def test_video_that_is_stopped_while_it_starts_ends() -> None:
             await asyncio.sleep(1.0)
     assert eye.calls == ["start", "stop"]
     assert acks[-1].result == MavResult.ACCEPTED
+
+
+async def test_video_whose_start_was_cancelled_is_stopped() -> None:
+    class SlowEye(Eye):
+        async def start_video(self) -> None:
+            self.calls.append("start")
+            await asyncio.sleep(60.0)
+
+    eye = SlowEye()
+    async with payload_and_station() as (component, station):
+        component.add_camera(eye)
+        station.connection.send(station.command_long(MavCmd.VIDEO_START_CAPTURE))
+        await asyncio.sleep(0.05)
+        cancel = m.CommandCancel(*station.target, MavCmd.VIDEO_START_CAPTURE)
+        cancelled = await station.ask(cancel, m.CommandAck)
+        stopped = await station.command(MavCmd.VIDEO_STOP_CAPTURE)
+        await station.command(MavCmd.VIDEO_STOP_CAPTURE)
+    assert (cancelled.result, stopped.result) == (MavResult.CANCELLED, MavResult.ACCEPTED)
+    assert eye.calls == ["start", "stop"]
 
 
 async def test_video_zoom_tracking_and_storage_call_the_program() -> None:
@@ -181,6 +303,21 @@ async def test_settings_of_definition_file_are_served() -> None:
     assert eye.calls == [("CAM_MODE", 1)]
 
 
+async def test_setting_whose_function_raises_is_failed_and_unchanged() -> None:
+    class Stuck(Eye):
+        def on_setting(self, name: str, value: object) -> None:
+            raise RuntimeError("the lens is stuck")
+
+    async with device_and_client(100, MavType.CAMERA) as (component, vehicle):
+        component.add_camera(Stuck(definition=own_definition()))
+        settings = vehicle.component(100).settings
+        await settings.download()
+        for _ in range(2):
+            with pytest.raises(AerokitError):
+                await settings.set("CAM_MODE", 1)
+        assert await settings.get("CAM_MODE") == 0
+
+
 class Head(GimbalDriver):
     def __init__(self) -> None:
         super().__init__(pitch_deg=(-90.0, 20.0), yaw_deg=(-160.0, 160.0))
@@ -216,6 +353,67 @@ async def test_gimbal_denies_program_that_is_not_in_control() -> None:
         ack = await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, -30, 0, math.nan, math.nan, 0, 0, 154)
         place = await station.command(MavCmd.DO_SET_ROI_LOCATION)
     assert (ack.result, place.result) == (MavResult.DENIED, MavResult.UNSUPPORTED)
+    assert head.targets == []
+
+
+class LookingHead(Head):
+    def __init__(self) -> None:
+        super().__init__()
+        self.places: list[Position | None] = []
+
+    def look_at(self, position: Position | None) -> None:
+        self.places.append(position)
+
+
+async def test_gimbal_that_was_pointed_follows_no_longer() -> None:
+    head = LookingHead()
+    position = m.GlobalPositionInt(0, 473977000, 85456000, 500_000, 0, 0, 0, 0, 0)
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(head)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        await station.command(MavCmd.DO_SET_ROI_SYSID, 255)
+        station.connection.send(position)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, -30, 0, math.nan, math.nan, 0, 0, 154)
+        station.connection.send(position)
+        await asyncio.sleep(0.1)
+    assert (len(head.places), len(head.targets)) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("latitude", "frame"),
+    [(math.nan, None), (500.0, None), (47, MavFrame.GLOBAL_RELATIVE_ALT_INT), (2**31 - 1, MavFrame.GLOBAL_INT)],
+)
+async def test_gimbal_denies_place_that_it_does_not_know(latitude: float, frame: int | None) -> None:
+    head = LookingHead()
+    place = MavCmd.DO_SET_ROI_LOCATION
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(head)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        command: m.CommandLong | m.CommandInt = station.command_long(place, 0, 0, 0, 0, latitude, 8.0, 30.0)
+        if frame is not None:
+            command = m.CommandInt(*station.target, frame, place, 0, 0, 0, 0, 0, 0, int(latitude), 80000000, 30.0)
+        ack = await station.ask(command, m.CommandAck)
+    assert ack.result == MavResult.DENIED
+    assert head.places == []
+
+
+@pytest.mark.parametrize("system_id", [0, math.nan, 256])
+async def test_gimbal_denies_to_follow_impossible_system(system_id: float) -> None:
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(LookingHead())
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        assert (await station.command(MavCmd.DO_SET_ROI_SYSID, system_id)).result == MavResult.DENIED
+
+
+async def test_gimbal_denies_infinite_angles() -> None:
+    head = Head()
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(head)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        ack = await station.command(
+            MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, 0, math.inf, math.nan, math.nan, GimbalManagerFlags.YAW_LOCK, 0, 154
+        )
+    assert ack.result == MavResult.DENIED
     assert head.targets == []
 
 
@@ -259,6 +457,48 @@ async def test_winch_pays_out_and_retracts() -> None:
     assert spool.length_m == 0.0
 
 
+async def test_hold_stops_winch_that_pays_out() -> None:
+    class Holding(Spool):
+        is_held = False
+
+        async def hold(self) -> None:
+            self.is_held = True
+
+    spool = Holding()
+    pay_out, hold = WinchActions.RELATIVE_LENGTH_CONTROL, WinchActions.HOLD
+    async with payload_and_station(component_id=169, type=MavType.WINCH) as (component, station):
+        component.add_winch(spool)
+        station.connection.send(station.command_long(MavCmd.DO_WINCH, 1, pay_out, 50, 1))
+        await asyncio.sleep(0.05)
+        with station.collecting(m.CommandAck) as acks:
+            station.connection.send(station.command_long(MavCmd.DO_WINCH, 1, pay_out, 20, 1))
+            station.connection.send_as(FrameEncoder(200, 190), station.command_long(MavCmd.DO_WINCH, 1, hold))
+            await asyncio.sleep(60.0)
+    assert [ack.result for ack in acks] == [MavResult.TEMPORARILY_REJECTED, MavResult.CANCELLED, MavResult.ACCEPTED]
+    assert (spool.is_held, spool.length_m) == (True, 0.0)
+
+
+async def test_repeated_hold_stops_winch_that_pays_out_again() -> None:
+    """The first transmission of the second order to hold was lost."""
+
+    class Holding(Spool):
+        holds = 0
+
+        async def hold(self) -> None:
+            self.holds += 1
+
+    spool = Holding()
+    pay_out, hold = WinchActions.RELATIVE_LENGTH_CONTROL, WinchActions.HOLD
+    async with payload_and_station(component_id=169, type=MavType.WINCH) as (component, station):
+        component.add_winch(spool)
+        await station.command(MavCmd.DO_WINCH, 1, hold)
+        station.connection.send(station.command_long(MavCmd.DO_WINCH, 1, pay_out, 50, 1))
+        await asyncio.sleep(0.05)
+        ack = await station.command(MavCmd.DO_WINCH, 1, hold, confirmation=1)
+        await asyncio.sleep(60.0)
+    assert (ack.result, spool.holds, spool.length_m) == (MavResult.ACCEPTED, 2, 0.0)
+
+
 class Model(AutopilotDriver):
     def __init__(self) -> None:
         self.calls: list[object] = []
@@ -294,6 +534,27 @@ async def test_autopilot_executes_commands_and_reports_them_in_heartbeat() -> No
     assert model.calls == ["arm", 7, 12.5, "disarm"]
     assert heartbeat.base_mode & MavModeFlag.SAFETY_ARMED
     assert raised.value.result == MavResult.UNSUPPORTED
+
+
+async def test_disarm_ends_arming_that_takes_long() -> None:
+    class Slow(Model):
+        async def arm(self, force: bool) -> None:
+            await asyncio.sleep(5.0)
+            self.calls.append("arm")
+
+    model = Slow()
+    async with payload_and_station(component_id=1, type=MavType.QUADROTOR) as (component, station):
+        component.add_autopilot(model)
+        station.connection.send(station.command_long(MavCmd.COMPONENT_ARM_DISARM, 1))
+        await asyncio.sleep(0.05)
+        with station.collecting(m.CommandAck) as acks, station.connection.subscribe(m.Heartbeat) as heartbeats:
+            station.connection.send(station.command_long(MavCmd.COMPONENT_ARM_DISARM, 0))
+            await asyncio.sleep(10.0)
+            heartbeat = heartbeats.get_nowait()
+    assert [ack.result for ack in acks] == [MavResult.ACCEPTED]
+    assert model.calls == ["disarm"]
+    assert heartbeat is not None
+    assert not heartbeat.base_mode & MavModeFlag.SAFETY_ARMED
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -15,12 +16,17 @@ from aerokit.errors import CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType
 from aerokit.onboard import AutopilotDriver, CameraDriver, CommandRequest, OnboardComponent, Photo, Range
+from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS
 
 
 @contextmanager
-def autopilot_and_client() -> Iterator[tuple[aerokit.sync.OnboardComponent, aerokit.sync.Vehicle]]:
+def autopilot_and_client(
+    parameters_file: Path | None = None,
+) -> Iterator[tuple[aerokit.sync.OnboardComponent, aerokit.sync.Vehicle]]:
     kind, generic = MavType.QUADROTOR, MavAutopilot.GENERIC
-    with aerokit.sync.component("udpin:127.0.0.1:0", component_id=1, type=kind, autopilot=generic) as node:
+    with aerokit.sync.component(
+        "udpin:127.0.0.1:0", component_id=1, type=kind, autopilot=generic, parameters_file=parameters_file
+    ) as node:
         port = node.aio.connection.link.address.rpartition(":")[2]
         with aerokit.sync.connect(f"udpout:127.0.0.1:{port}", rates={}) as vehicle:
             yield node, vehicle
@@ -46,6 +52,29 @@ def test_plain_function_runs_in_thread_and_reports_progress() -> None:
             vehicle.command(MavCmd.USER_1, 13)
     assert raised.value.result == MavResult.DENIED
     assert len(set(threads) - {threading.get_ident()}) >= 1
+
+
+def test_sixteen_waiting_functions_do_not_keep_parameters_from_being_saved(tmp_path: Path) -> None:
+    may_end, begun = threading.Event(), threading.Semaphore(0)
+
+    def wait(_: CommandRequest) -> None:
+        begun.release()
+        assert may_end.wait(30)
+
+    path = tmp_path / "parameters.json"
+    with autopilot_and_client(parameters_file=path) as (node, vehicle):
+        node.parameters.add("SPEED", 1.0)
+        for number in range(MAX_RUNNING_COMMANDS):
+            node.command(31_010 + number)(wait)
+            vehicle.send(m.CommandLong(vehicle.system_id, 1, 31_010 + number, 0, 0, 0, 0, 0, 0, 0, 0))
+        try:
+            assert all(begun.acquire(timeout=10) for _ in range(MAX_RUNNING_COMMANDS))
+            vehicle.parameters.set("SPEED", 2.0)
+            while node.aio.parameters._save_task is not None:
+                vehicle.parameters.get("SPEED")
+        finally:
+            may_end.set()
+    assert "2.0" in path.read_text()
 
 
 class SlowVehicle(AutopilotDriver):

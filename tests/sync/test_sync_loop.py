@@ -19,6 +19,7 @@ import anyio
 import pytest
 
 from aerokit.errors import ConnectionClosed, LinkOpenError
+from aerokit.sync.blocks import BlockTwin
 from aerokit.sync.loop_thread import LoopThread
 
 LIMIT_S = 100.0
@@ -226,7 +227,10 @@ def interrupted_at(place: Place | None, use: Callable[[list[LoopThread]], object
     return observed
 
 
-def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
+@pytest.mark.parametrize(
+    ("method", "call"), [("run_shielded", "self._run(True, True,"), ("run_exit", "self._run(False, True,")]
+)
+def test_clean_up_completes_wherever_ctrl_c_arrives(method: str, call: str) -> None:
     """Interrupt at every line of aerokit except the calls themselves, where it cannot be noticed yet."""
     done: list[int] = []
 
@@ -236,7 +240,7 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
             done.append(1)
 
     def use(loops: list[LoopThread]) -> None:
-        loops[0].run_shielded(work)
+        getattr(loops[0], method)(work)
 
     def interrupted(place: Place | None) -> set[Place]:
         loop = LoopThread()
@@ -258,7 +262,7 @@ def test_run_shielded_completes_wherever_ctrl_c_arrives() -> None:
                 left_undone.add(linecache.getline(*place).strip())
     assert len(was_come_to) > 20
     assert left_undone == {
-        "return self._run(True, function, *args, **kwargs)",
+        f"return {call} function, *args, **kwargs)",
         "call: _Call[T] | None = None",
         "try:",
     }
@@ -290,3 +294,32 @@ def test_ctrl_c_is_never_lost_and_leaves_no_threads() -> None:
             thread.join(LIMIT_S)
             assert not thread.is_alive()
     assert lost == []
+
+
+def test_block_is_left_if_ctrl_c_comes_before_its_exit(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Block:
+        is_left = False
+
+        async def __aenter__(self) -> Block:
+            return self
+
+        async def __aexit__(self, *_: object) -> None:
+            self.is_left = True
+
+    start, interruptions = LoopThread._start, [KeyboardInterrupt]
+
+    def interrupted_start(loop: LoopThread, call: Any) -> None:
+        if interruptions:
+            raise interruptions.pop()
+        start(loop, call)
+
+    loop, block = LoopThread(), Block()
+    twin: BlockTwin[Any] = BlockTwin(loop, block)
+    try:
+        twin.__enter__()
+        monkeypatch.setattr(LoopThread, "_start", interrupted_start)
+        with pytest.raises(KeyboardInterrupt):
+            twin.__exit__(None, None, None)
+    finally:
+        loop.close()
+    assert block.is_left

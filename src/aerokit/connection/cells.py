@@ -7,6 +7,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Generic, NoReturn, Protocol, TypeVar
 
 from aerokit._internal.arguments import checked
@@ -322,6 +323,7 @@ class Changes(AsyncIterator[T]):
     """
 
     def __init__(self, cell: StateCell[T], *, every_arrival: bool) -> None:
+        self._loop = asyncio.get_running_loop()  # `__del__` needs it, and may run on another thread.
         cell._follow()
         self._cell = cell
         self._every_arrival = every_arrival
@@ -332,8 +334,13 @@ class Changes(AsyncIterator[T]):
 
     # A reader may leave its loop at any time. Only garbage collection then shows that the iteration has ended.
     def __del__(self) -> None:
-        if hasattr(self, "_cell"):  # False if __init__ raised
+        if not hasattr(self, "_cell"):  # __init__ raised.
+            return
+        if asyncio._get_running_loop() is self._loop:
             self._cell._unfollow()
+        else:  # In the blocking API, or if the collector runs on another thread.
+            with suppress(RuntimeError):  # The event loop may be closed.
+                self._loop.call_soon_threadsafe(self._cell._unfollow)
 
     @property
     def missed(self) -> int:

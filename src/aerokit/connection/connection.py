@@ -537,6 +537,7 @@ class Connection:
             return
         self._end_signal.error = error  # Set first, so that sinks of the following events find the connection closed.
         self._receiver.close()
+        self._observers.flush()  # The task that flushes ends, but the program may continue for long.
         # Only a lost link is published as an event: a program that closes the connection itself needs none.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)
@@ -551,18 +552,24 @@ class Connection:
     def _encode_and_write(self, encoder: FrameEncoder, message: Message, to: int | None) -> None:
         self.raise_if_ended()
         data = self._encode(encoder, message)
-        self._write(data, message, to)
-        self._observers.notify_sent(data)
+        if self._write(data, message, to):
+            self._observers.notify_sent(data)
 
     def _encode(self, encoder: FrameEncoder, message: Message) -> bytes:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
-    def _write(self, data: bytes, message: Message | None, to: int | None) -> None:
-        """Write a frame to the peers of system ``to``, or of the target of ``message``; without both, to all peers."""
+    def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
+        """Write a frame to the peers of system ``to``, or of the target of ``message``; without both, to all peers.
+
+        Return False if there is no such peer, so that nothing was sent.
+        """
         system_id = getattr(message, "target_system", 0) if to is None else to
-        for peer in self._routes.peers_of(system_id, getattr(message, "target_component", 0), message):
+        peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)
+        for peer in peers:
             self.link.write(data, peer)
-        self._observers.record_sent(data, self._clock())
+        if peers:
+            self._observers.record_sent(data, self._clock())
+        return bool(peers)
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
         """Number, frame and write a message to one peer, e.g. a probe over each of several links."""

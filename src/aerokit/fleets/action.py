@@ -133,6 +133,7 @@ class FleetAction:
             await tasks.aclose()
         if self.program_error is not None:
             self._hold_finished_members()
+            await asyncio.sleep(0)  # The orders are sent before the error may end the fleet's block.
             raise self.program_error
         return self.result_so_far()
 
@@ -265,9 +266,11 @@ class FleetAction:
         self._pending_policy_orders = len(self._policy_orders)
         for member in available:
             if member.name in self._policy_orders:
-                self._context.background.start(
+                task = self._context.background.start(
                     partial(self._send_order, member, self._policy_orders[member.name]), f"aerokit policy {member.name}"
                 )
+                if task is not None:  # Not in the task itself: if the fleet closes at once, it never begins.
+                    task.add_done_callback(partial(self._on_order_end, member.name))
         # The running actions are cancelled one loop iteration later, after the policy's orders have begun. By then, the
         # policy's orders have superseded the orders of the actions, so that the cancelled actions do not send a hold.
         # The actions of available members whose order is skipped are cancelled, too.
@@ -310,11 +313,14 @@ class FleetAction:
             if not isinstance(error, AerokitError):
                 raise
             member.refresh()  # the order may have failed because of a lost link or a takeover
-        finally:
-            self._pending_policy_orders -= 1
-            if not self._pending_policy_orders:
-                self._publish_completed()
-                self._check_finished()
+
+    def _on_order_end(self, name: str, task: asyncio.Task[None]) -> None:
+        if task.cancelled():
+            self._policy_order_errors.setdefault(name, "the fleet was closed")
+        self._pending_policy_orders -= 1
+        if not self._pending_policy_orders:
+            self._publish_completed()
+            self._check_finished()
 
     def _publish_completed(self) -> None:
         assert self._policy_trigger is not None

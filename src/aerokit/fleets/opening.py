@@ -247,6 +247,7 @@ async def find_systems(
 
     Raises:
         ConnectFailed: not enough vehicles were found in time.
+        LinkLost, ConnectionClosed: a link that is searched has ended.
     """
     searched = [name for name in networks if requested[name] is None]
     # The system ids of each network: first those that were requested, then those that are found. The inner dicts serve
@@ -284,11 +285,14 @@ async def find_systems(
             connection = networks[name]
             connection.raise_if_ended()
             detachments.append(connection.bus.attach_event(VehicleFound, partial(on_found, name)))
+            detachments.append(connection.on_end(lambda _: changed.set()))
             for source, heartbeat in connection.heartbeats.items():
                 on_found(name, discovery_event(heartbeat, connection.now(), *source))
         with anyio.move_on_after(timeout):
             with warn_while_waiting(timeout, describe_progress):
                 while not is_complete():
+                    for name in searched:
+                        networks[name].raise_if_ended()
                     changed = anyio.Event()
                     await changed.wait()
             if searched and count is None:

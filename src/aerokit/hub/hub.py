@@ -154,11 +154,17 @@ class Hub:
         for these ids go to the program.
 
         Raises:
-            InvalidArgument: an endpoint has this name already.
+            InvalidArgument: an endpoint has this name, or this hub shares the connection already.
             ConnectionClosed, LinkLost: the hub is closed, or the connection has ended.
         """
         self._raise_unless_open()
         connection.raise_if_ended()
+        links = [attachment.link for attachment in self._attachments.values() if attachment.is_open]
+        if name not in self._attachments and any(
+            isinstance(link, SharedLink) and link.connection is connection for link in links
+        ):
+            # Each of two endpoints would send the vehicle what the other one receives from it.
+            raise InvalidArgument("connection = … is not allowed: this hub shares it already")
         return (await self._add(Endpoint(SharedLink(connection), name=name))).statistics()
 
     def on_event(self, listener: Callable[[HubEvent], object]) -> Callable[[], None]:

@@ -231,6 +231,12 @@ class TargetFields:
             return False
         return kind_of(self._dialect[message_id].NAME, has_target=True) is MessageKind.ORDER
 
+    def is_command(self, message_id: int) -> bool:
+        """Like :meth:`is_order`, but include messages without a target, such as LANDING_TARGET."""
+        if self.is_unknown(message_id):
+            return False
+        return kind_of(self._dialect[message_id].NAME, has_target=True) is MessageKind.ORDER
+
     def target_of(self, frame: Frame) -> tuple[int, int]:
         """Return the system id and component id of a frame's target; 0 means all."""
         message_id = frame.message_id

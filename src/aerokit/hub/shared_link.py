@@ -30,7 +30,7 @@ class SharedLink(Link):
     """
 
     def __init__(self, connection: Connection) -> None:
-        self._connection = connection
+        self.connection = connection
         self._ids = connection.source_system, connection.source_component
         self._targets = TargetFields(connection.bus.dialect)
         self._receiver: Receiver | None = None  # None while the link is not open
@@ -45,12 +45,12 @@ class SharedLink(Link):
         """See `Link.open`. Raises ConnectionClosed or LinkLost if the connection has ended."""
         if self._receiver is not None:
             raise BusyError(f"{self.address} is open; a link can be opened only once")
-        self._connection.raise_if_ended()
+        self.connection.raise_if_ended()
         self._receiver = receiver
         self._detachments = [
-            self._connection.observe_frames(self._on_frame),
-            self._connection.observe_sent_frames(self._on_sent),
-            self._connection.on_end(self._on_end),
+            self.connection.observe_frames(self._on_frame),
+            self.connection.observe_sent_frames(self._on_sent),
+            self.connection.on_end(self._on_end),
         ]
 
     def write(self, data: bytes, peer: Peer = None) -> None:
@@ -66,18 +66,18 @@ class SharedLink(Link):
                 continue
             try:
                 gateway = self._current_gateway()
-                signed = raw if gateway is None else gateway.sign(raw, self._connection.unix_time())
+                signed = raw if gateway is None else gateway.sign(raw, self.connection.unix_time())
                 if signed is None:
                     self.dropped_writes += 1
                 else:
-                    self._connection.write_raw(signed)
+                    self.connection.write_raw(signed)
             except AerokitError:  # The connection has ended, or the frame cannot be signed.
                 self.dropped_writes += 1
 
     @property
     def unsent_bytes(self) -> int:
         """See `Link.unsent_bytes`; includes bytes that this program itself has sent over the connection."""
-        return self._connection.unsent_bytes
+        return self.connection.unsent_bytes
 
     def close(self) -> None:
         self._receiver = None
@@ -99,7 +99,7 @@ class SharedLink(Link):
                 " other's answers; give this program other ids (source_system=, source_component=)",
                 *self._ids,
             )
-            self._connection.bus.publish(DuplicateSender(self._connection.now(), *self._ids))
+            self.connection.bus.publish(DuplicateSender(self.connection.now(), *self._ids))
 
     def _on_frame(self, frame: Frame, peer: Peer) -> None:
         """Pass a received frame of the connection to the hub, without its signature."""
@@ -129,11 +129,11 @@ class SharedLink(Link):
 
     def _current_gateway(self) -> SigningGateway | None:
         """Return the gateway for the connection's present signing key; None if the connection does not sign."""
-        signing: Signing | None = self._connection.signing
+        signing: Signing | None = self.connection.signing
         if signing is None:
             self._gateway = None
         elif self._gateway is None or self._gateway.signing is not signing:
-            self._gateway = SigningGateway(signing, self._connection.bus.dialect.extras, _ignore)
+            self._gateway = SigningGateway(signing, self.connection.bus.dialect.extras, _ignore)
         return self._gateway
 
 

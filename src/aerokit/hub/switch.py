@@ -189,7 +189,7 @@ class Switch:
         """Count the commands among the frames as dropped, and return the other frames."""
         remaining = []
         for frame in frames:
-            if self._targets.is_order(frame.message_id):
+            if self._targets.is_command(frame.message_id):
                 port.drop_late(frame, self._targets.target_of(frame), arrived_at)
             else:
                 remaining.append(frame)

@@ -26,7 +26,7 @@ class AutopilotDriver:
 
     Override the coroutines for the commands that the vehicle has; other commands are UNSUPPORTED. A coroutine returns
     when the vehicle has started to execute the command, or raises an exception to refuse it. HEARTBEAT reports the new
-    armed state and mode after the coroutine has returned.
+    armed state and mode after the coroutine has returned. A command to disarm cancels a running :meth:`arm`.
     """
 
     async def arm(self, force: bool) -> None:
@@ -116,7 +116,8 @@ def add_autopilot(
         return run
 
     add = services.commands.add
-    add(MavCmd.COMPONENT_ARM_DISARM, arm_disarm)
+    # Disarming does not wait until an order to arm has been executed.
+    add(MavCmd.COMPONENT_ARM_DISARM, arm_disarm, is_stop=lambda command: command.param1 == 0)
     add(MavCmd.DO_SET_MODE, set_mode)
     add(MavCmd.NAV_TAKEOFF, take_off)
     add(MavCmd.NAV_LAND, without_arguments("land"))

@@ -252,7 +252,9 @@ class CameraAdapter(CameraDevice):
             shot = None
             try:
                 photo = await self._call(self._camera.take_photo, self.captures.image_count)
-                shot = _shot(photo, time_boot_ms, unix_time)
+                new_shot = _shot(photo, time_boot_ms, unix_time)
+                new_shot(image_index=0, capture_result=1).encode()  # Raises InvalidArgument if a field does not fit.
+                shot = new_shot
             except Exception as error:
                 self._host.report_error("take_photo", error)
             finally:

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import inspect
 import math
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.arguments import checks_arguments
+from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavFrame, MavResult
+from aerokit.mavlink.messages import CommandAck
 from aerokit.missions.item import command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
-from aerokit.protocols.servers.commands import CommandDispatcher, Outcome, RunningCommands
+from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, Outcome, RunningCommands
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,6 +30,7 @@ if TYPE_CHECKING:
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
 _AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
+MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # One takes a picture of a series, another one checks a mission.
 RELATIVE_FRAMES: frozenset[int] = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
 
 
@@ -94,14 +99,23 @@ class CommandRequest:
 
 
 def outcome_of(value: object) -> Outcome:
-    """Convert the return value of a handler: None and True mean ACCEPTED, False FAILED, a number is a MAV_RESULT."""
+    """Convert the return value of a handler: None and True mean ACCEPTED, False FAILED, a number is a MAV_RESULT.
+
+    Raises:
+        TypeError: COMMAND_ACK cannot carry the value.
+    """
     if value is None or value is True:
         return Outcome(MavResult.ACCEPTED)
+    outcome = Outcome(MavResult.FAILED)
     if isinstance(value, CommandResult):
-        return Outcome(value.result, progress=value.progress, detail=value.detail)
-    if isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
-        return Outcome(int(value))
-    return Outcome(MavResult.FAILED)
+        outcome = Outcome(value.result, progress=value.progress, detail=value.detail)
+    elif isinstance(value, int) and value is not False:  # False, which is an int too, means FAILED.
+        outcome = Outcome(int(value))
+    try:
+        CommandAck(0, *outcome).encode()
+    except InvalidArgument as error:
+        raise TypeError(f"the function returned {short_repr(value)}, which is no result: {error}") from None
+    return outcome
 
 
 def overrides(driver: object, base: type, name: str) -> bool:
@@ -133,15 +147,28 @@ class ComponentCommands:
         self._host, self._tasks = host, tasks
         # Tasks that wait for a handler in a thread. They cannot be cancelled, because a thread cannot be stopped.
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
+        # The loop has only a few threads of its own. Handlers that wait there would keep parameters from being saved.
+        self._threads: ThreadPoolExecutor | None = None  # None before the first call in a thread
         host.knows_command = self.handlers.__contains__
 
-    def add(self, command: int, function: Callable[..., Any]) -> None:
-        """Register a handler.
+    def add(
+        self,
+        command: int,
+        function: Callable[..., Any],
+        *,
+        is_stop: Callable[[ReceivedCommand], bool] = lambda _: False,
+    ) -> None:
+        """Register a handler. A command for which ``is_stop`` returns True cancels the one that the handler executes.
 
         Raises:
             InvalidArgument: the command already has a handler, or an annotation of the function is not supported.
         """
-        self.add_handlers({command: partial(self._execute, function, arguments_of(function))})
+
+        def execute(received: ReceivedCommand) -> None:
+            self._execute(function, arguments, received, is_stop=is_stop(received))
+
+        arguments = arguments_of(function)
+        self.add_handlers({command: execute})
 
     def add_handlers(self, handlers: Mapping[int, CommandHandler]) -> None:
         """Register handlers of a protocol server, which check the parameters themselves.
@@ -183,8 +210,11 @@ class ComponentCommands:
     async def _call_in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         task = asyncio.current_task()
         self._tasks_in_threads.add(task)
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="aerokit command")
+        call = partial(contextvars.copy_context().run, function, *arguments)
         try:
-            result = await asyncio.to_thread(function, *arguments)
+            result = await asyncio.get_running_loop().run_in_executor(self._threads, call)
         finally:
             self._tasks_in_threads.discard(task)
         return await result if inspect.isawaitable(result) else result
@@ -200,19 +230,29 @@ class ComponentCommands:
     def cancel_all(self) -> None:
         self._running.cancel_all()
 
+    def close(self) -> None:
+        """End the threads that run no handler."""
+        if self._threads is not None:
+            self._threads.shutdown(wait=False)
+
     def _execute(
-        self, function: Callable[..., Any], arguments: tuple[CommandArgument, ...], command: ReceivedCommand
+        self,
+        function: Callable[..., Any],
+        arguments: tuple[CommandArgument, ...],
+        command: ReceivedCommand,
+        *,
+        is_stop: bool = False,
     ) -> None:
         """Call a handler, and acknowledge the command when the handler returns, raises or is cancelled."""
         task: asyncio.Task[Any] | None = None
         is_cancelled = False
 
         # `cancel` is called after this method has returned, when `returned` and `running` below are set.
-        def cancel() -> None:
+        def cancel() -> bool:
             """Cancel the handler, because the sender of the command or the end of the component requires it."""
             nonlocal is_cancelled
             if task in self._tasks_in_threads:
-                return  # The command cannot be cancelled. Its sender gets the result.
+                return False  # The command cannot be cancelled. Its sender gets the result.
             if task is not None:
                 task.cancel()
             elif not is_cancelled:  # The task has not started yet.
@@ -220,8 +260,9 @@ class ComponentCommands:
                 if inspect.iscoroutine(returned):
                     returned.close()
                 self._running.finish(running, Outcome(MavResult.CANCELLED))
+            return True
 
-        started = self._running.start(command, cancel)
+        started = self._running.start(command, cancel, is_stop=is_stop)
         if started is None:  # start() has answered already: the command is a repetition, or another command is running.
             return
         running = started  # Unlike `started`, this is never None, which type checkers require in the closures.
@@ -237,11 +278,12 @@ class ComponentCommands:
         try:
             values = [argument.convert(request.params[argument.number - 1]) for argument in arguments]
             returned = self.begin(function, request, *values)
+            outcome = None if inspect.isawaitable(returned) else outcome_of(returned)
         except Exception as error:
             self._finish_with_error(running, function, error)
             return
-        if not inspect.isawaitable(returned):
-            self._running.finish(running, outcome_of(returned))
+        if outcome is not None:
+            self._running.finish(running, outcome)
             return
 
         async def run() -> None:
@@ -251,7 +293,8 @@ class ComponentCommands:
             task = asyncio.current_task()
             await self._finish_when_done(running, function, returned)
 
-        self._tasks.start(run, f"aerokit {command_name(command.command)}")
+        if self._tasks.start(run, f"aerokit {command_name(command.command)}") is None:  # The component is closing.
+            cancel()
 
     async def _finish_when_done(
         self, running: RunningCommand, function: Callable[..., Any], returned: Awaitable[Any]

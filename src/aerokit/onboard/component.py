@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -64,7 +65,8 @@ class OnboardComponent:
     ) -> None:
         self._host = ComponentHost(connection, system_id, component_id, accepts)
         self._heartbeat = heartbeat
-        self._tasks = BackgroundTasks(connection.fail)
+        # An error in values of the program must not close the connection, which may also fly a vehicle.
+        self._tasks = BackgroundTasks(partial(self._host.report_error, "component"))
         self.parameters: ComponentParameters = ComponentParameters(self._host, parameters_file, bytewise=bytewise)
         """Parameters that this component offers."""
         self._services = ComponentServices(self._host, self._tasks, self.parameters)
@@ -102,6 +104,7 @@ class OnboardComponent:
             try:
                 await run_shielded(self.parameters.aclose())  # A cancelled program must save its parameters too.
             finally:
+                self._commands.close()
                 self._ftp.close()
                 self._host.close()
 

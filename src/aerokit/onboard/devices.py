@@ -36,7 +36,7 @@ class WinchDriver:
     """Base class for your program's winch; pass an instance to :meth:`OnboardComponent.add_winch`.
 
     Override the coroutines for the actions that the winch has; other actions are UNSUPPORTED. A coroutine returns when
-    the action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command.
+    the action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command. HOLD cancels it, too.
     """
 
     async def relax(self) -> None:
@@ -140,7 +140,8 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
         voltage = current = math.nan
         return m.WinchStatus(time_us, length, speed, tension, voltage, current, _TEMPERATURE_UNKNOWN, report.flags)
 
-    services.commands.add(MavCmd.DO_WINCH, do_winch)
+    # The line must stop at once, although an action that takes long is a command with the same MAV_CMD.
+    services.commands.add(MavCmd.DO_WINCH, do_winch, is_stop=lambda command: command.param2 == WinchActions.HOLD)
     services.add_message(m.WinchStatus, status, STATUS_HZ)
 
 

@@ -10,7 +10,7 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from aerokit.protocols.servers.files import EFBIG, EINVAL, EISDIR, ENOENT, EROFS, Entry, FileFault, FileHandle
+from aerokit.protocols.servers.files import EFBIG, EINVAL, EISDIR, ENOENT, ENOSPC, EROFS, Entry, FileFault, FileHandle
 
 if TYPE_CHECKING:
     from aerokit.protocols.servers.files import FileTree
@@ -59,7 +59,8 @@ class _DiskFile(FileHandle):
         if not self._file.writable():
             raise FileFault(EROFS)
         self._file.seek(offset)
-        self._file.write(data)
+        if self._file.write(data) != len(data):  # The disk became full in the middle of the block.
+            raise FileFault(ENOSPC)
 
     @_raises_file_fault
     def close(self) -> None:

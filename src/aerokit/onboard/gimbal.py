@@ -137,6 +137,9 @@ class GimbalAdapter(GimbalMount):
     def heading(self) -> float:
         return math.radians(self._gimbal.heading())
 
+    def home_altitude_m(self) -> float:
+        raise InvalidArgument("the altitude of home is unknown: send the altitude above sea level (MAV_FRAME_GLOBAL)")
+
     def point(self, angles: Angles, flags: int, *, locked: bool) -> None:
         roll, pitch, yaw = (max(low, min(high, angle)) for angle, (low, high) in zip(angles, self.limits, strict=True))
         if locked:  # A locked yaw is relative to north, but the yaw limits are relative to the nose.
@@ -155,6 +158,7 @@ class GimbalAdapter(GimbalMount):
         self._gimbal.point(target)
         self.flags = flags
         self._is_yaw_locked = target.yaw_locked
+        self._followed_system_id = 0  # A newer command ends the following.
 
     def look_at(self, place: Place | None) -> None:
         if place is None:

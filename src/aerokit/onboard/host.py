@@ -28,6 +28,15 @@ MAX_TEXT_SIZE = 254
 MAX_COMMAND_AGE_S = 5.0
 """Maximum age in seconds of a command that is executed. Senders give up earlier."""
 _COMMAND_MESSAGE_IDS = (m.CommandLong.ID, m.CommandInt.ID)
+# Messages that change something, like commands, and are not executed late either.
+_ORDER_MESSAGE_IDS = frozenset(
+    message_type.ID
+    for message_type in (
+        m.CommandLong, m.CommandInt, m.CommandCancel, m.ParamSet, m.ParamExtSet, m.MissionSetCurrent, m.MissionClearAll,
+        m.GimbalManagerSetAttitude, m.GimbalManagerSetPitchyaw, m.GimbalManagerSetManualControl,
+        m.GimbalDeviceSetAttitude,
+    )
+)  # fmt: skip
 
 
 class ComponentHost:
@@ -91,13 +100,13 @@ class ComponentHost:
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 
     def _is_late(self, message: Message) -> bool:
-        """Return True for a command that may have waited too long while the event loop was blocked."""
+        """Return True for an order that may have waited too long while the event loop was blocked."""
         frame = message.received_frame
         age_s = 0.0 if frame is None else self.now - frame.received_at
-        if message.ID not in _COMMAND_MESSAGE_IDS or age_s <= MAX_COMMAND_AGE_S:
+        if message.ID not in _ORDER_MESSAGE_IDS or age_s <= MAX_COMMAND_AGE_S:
             return False
         ids = (self.system_id, self.component_id)
-        logger.warning("component %d/%d: a command that may be %.0f s old was not executed", *ids, age_s)
+        logger.warning("component %d/%d: %s that may be %.0f s old was not executed", *ids, message.NAME, age_s)
         return True
 
     def send(self, message: Message, channel: Channel = None) -> None:

@@ -110,11 +110,12 @@ class ComponentMissions:
             check_items(items, mission_type)
             if function is not None:
                 verdict = self._commands.begin(function, kind, items)
+            result_now = None if inspect.isawaitable(verdict) else _result_of(verdict)
         except Exception as error:
             answer(self._report_refusal(kind, error))
             return
-        if not inspect.isawaitable(verdict):
-            answer(_result_of(verdict))
+        if result_now is not None:
+            answer(result_now)
             return
 
         async def answer_later() -> None:
@@ -155,6 +156,8 @@ def _result_of(verdict: object) -> int:
     if verdict is False:
         return MavMissionResult.DENIED
     if isinstance(verdict, int) and not isinstance(verdict, bool):
+        if not 0 <= verdict <= 255:
+            raise TypeError(f"the function returned {verdict}, which is no MAV_MISSION_RESULT")
         return int(verdict)
     return MavMissionResult.ACCEPTED
 

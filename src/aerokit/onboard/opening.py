@@ -134,8 +134,10 @@ async def component(
             onboard_component._start()
             yield onboard_component
         finally:
-            connection.components.discard(key)
-            await onboard_component._aclose()
+            try:
+                await onboard_component._aclose()
+            finally:  # The component answers until now, so another one with these ids would answer the same messages.
+                connection.components.discard(key)
 
 
 def _heartbeat(type_: int, autopilot: int) -> Heartbeat:

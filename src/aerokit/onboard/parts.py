@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavCmd, MavResult
+from aerokit.mavlink.enums import MavCmd, MavResult, ParamAck
 from aerokit.onboard.camera import CameraAdapter, CameraDriver
 from aerokit.onboard.commands import overrides
 from aerokit.onboard.gimbal import STATUS_INTERVAL_S, GimbalAdapter, GimbalDriver
 from aerokit.parameters import parse_definition
+from aerokit.parameters.parameter import setting_bytes
 from aerokit.protocols.servers.camera import camera_builders
 from aerokit.protocols.servers.camera_commands import camera_commands, legacy_requests
 from aerokit.protocols.servers.definitions import DefinedParameterServer
@@ -36,6 +37,19 @@ class DefinedSettings(DefinedParameterServer):
     ):
         self._on_change = on_change
         super().__init__(host, definition)
+        self._component = host
+
+    def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
+        """See `DefinedParameterServer.set`. If the program's function raises, the old value stays."""
+        old_value = self.values.get(name)
+        try:
+            return super().set(name, data, kind)
+        except Exception as error:
+            assert old_value is not None
+            self.values[name] = old_value
+            self._component.report_error(name, error)
+            wire_type = self.definition.settings[name].wire_type
+            return ParamAck.FAILED, setting_bytes(old_value, wire_type), wire_type
 
     def on_set(self, name: str, value: SettingValue) -> None:
         self._on_change(name, value)
@@ -59,7 +73,7 @@ def add_camera(services: ComponentServices, camera: CameraDriver) -> CameraAdapt
         if command == MavCmd.STORAGE_FORMAT and not overrides(camera, CameraDriver, "format_storage"):
             continue  # The command stays UNSUPPORTED.
         services.commands.add_raw(command, partial(_run_if_implemented, handler))
-    services.commands.add_handlers(legacy_requests(streams))
+    services.commands.add_guarded(legacy_requests(streams))
     return adapter
 
 

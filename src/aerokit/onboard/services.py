@@ -34,7 +34,7 @@ class ComponentServices:
         self.streams: MessageStreams = MessageStreams(
             host, min_interval_s=MIN_STREAM_INTERVAL_S, max_streams=MAX_STREAMS
         )
-        self.commands.handlers.update(self.streams.commands())
+        self.commands.add_guarded(self.streams.commands())
         self.memory: FileTree = FileTree()
 
     def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:

@@ -212,7 +212,7 @@ class BlockTwin(TwinOf[BlockT]):
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
         exit_block: Any = self.aio.__aexit__  # The type is Any, because each class names its parameters differently.
-        self._loop.run(exit_block, exc_type, exc, traceback)
+        self._loop.run_exit(exit_block, exc_type, exc, traceback)
 
 
 class StreamTwin(BlockTwin["SetpointStream[T]"], Generic[T]):

@@ -86,7 +86,7 @@ class LoopThread:
             BusyError: called on the loop's own thread, which would be a deadlock.
             ConnectionClosed: the loop was closed before or during the call.
         """
-        return self._run(False, function, *args, **kwargs)
+        return self._run(False, False, function, *args, **kwargs)
 
     def run_shielded(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Like :meth:`run`, for short clean-up functions that must not be interrupted.
@@ -94,11 +94,16 @@ class LoopThread:
         Ctrl-C waits for the function and then raises KeyboardInterrupt, with the function's error as its cause. A
         second Ctrl-C does not wait.
         """
-        return self._run(True, function, *args, **kwargs)
+        return self._run(True, True, function, *args, **kwargs)
+
+    def run_exit(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
+        """Like :meth:`run`, for the exit of a block: if Ctrl-C comes before it begins, it begins and is cancelled."""
+        return self._run(False, True, function, *args, **kwargs)
 
     def _run(
         self,
         is_shielded: bool,
+        must_start: bool,
         function: Callable[P, Awaitable[T]],
         /,  # Positional only, because the function itself may have arguments with these names.
         *args: P.args,
@@ -106,7 +111,7 @@ class LoopThread:
     ) -> T:
         """Run a function. If the wait is interrupted, cancel the call, and wait INTERRUPTED_CALL_TIMEOUT_S for its end.
 
-        A shielded call is started even after Ctrl-C, and its end is awaited without limit.
+        With ``must_start``, a call is started even after Ctrl-C. The end of a shielded call is awaited without limit.
         """
         call: _Call[T] | None = None
         try:
@@ -115,7 +120,7 @@ class LoopThread:
             self._start(call)
             self.wait_for(call)
         except BaseException as error:
-            if is_shielded and isinstance(error, KeyboardInterrupt):
+            if must_start and isinstance(error, KeyboardInterrupt):
                 # Clean-up must run even if Ctrl-C came before the call was started. A second start has no effect.
                 call = call or _Call(functools.partial(function, *args, **kwargs))
                 with contextlib.suppress(AerokitError):

@@ -288,13 +288,14 @@ class MultiLinkRoutes:
         """Update the counts of all links, send probes that are due, and choose the link for each system."""
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
+                # The counts are first, because frames may have waited while the event loop was blocked.
+                if counters := self._counters.get((system_id, link), {}).values():
+                    received = sum(counter.received for counter in counters)
+                    lost = sum(counter.lost for counter in counters)
+                    candidate.record_counts(received, lost, now)
                 if now - candidate.received_at > CANDIDATE_TIMEOUT_S:  # The system is no longer received here.
                     self._counters.pop((system_id, link), None)
                     continue
-                counters = self._counters.get((system_id, link), {}).values()
-                received = sum(counter.received for counter in counters)
-                lost = sum(counter.lost for counter in counters)
-                candidate.record_counts(received, lost, now)
                 self._probe(system_id, choice, candidate, now)
             self._choose(system_id, choice, now)
         self._states.update(now)

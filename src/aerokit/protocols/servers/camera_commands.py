@@ -67,13 +67,13 @@ class _Pictures:
 
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
-        self._last_sequence = 0
+        self._last_single: tuple[tuple[int, int], int] | None = None  # sender and sequence number of a single image
 
     async def start(self, command: ReceivedCommand) -> int:
         """Take images, if param 1 selects this camera.
 
-        A repeated command for a single image takes no further image: it has the sequence number (param 4) of the last
-        command.
+        A repeated command for a single image takes no further image: it has the sequence number (param 4) and the
+        sender of the last command.
         """
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
@@ -84,14 +84,15 @@ class _Pictures:
             return MavResult.UNSUPPORTED
         if not _selects_this(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
             return MavResult.DENIED
-        is_repeated = count == 1 and sequence > 0 and sequence == self._last_sequence
+        single = (command.sender, sequence) if count == 1 and sequence > 0 else None
+        is_repeated = single is not None and single == self._last_single
         if is_repeated:
             return MavResult.ACCEPTED
         if captures.is_busy:
             return MavResult.TEMPORARILY_REJECTED
         if not camera.has_space():
             return MavResult.FAILED
-        self._last_sequence = sequence if count == 1 else 0
+        self._last_single = single
         captures.take_series(interval_s, count)
         return MavResult.ACCEPTED
 
@@ -103,9 +104,9 @@ class _Pictures:
 
     async def digicam_control(self, command: ReceivedCommand) -> int:
         """Execute DO_DIGICAM_CONTROL, a command of the older camera protocol. Param 5 is 1 to take an image."""
-        if command.x == 1:
-            self._camera.captures.take()
-        return MavResult.ACCEPTED
+        if command.x != 1:
+            return MavResult.ACCEPTED
+        return await self.start(replace(command, param1=0.0, param2=0.0, param3=1.0, param4=0.0))
 
     async def format(self, command: ReceivedCommand) -> int:
         """Format the storage if param 2 is 1, and reset the image log if param 3 is 1."""
@@ -127,6 +128,7 @@ class _Videos:
     def __init__(self, camera: CameraDevice) -> None:
         self._camera = camera
         self._must_stop = False  # True from a command to stop until the next command to start
+        self._was_cancelled = False  # True if a start was cancelled, so that the camera may be recording
 
     async def start(self, command: ReceivedCommand) -> int:
         """Start recording. Param 2 is the rate in Hz at which CAMERA_CAPTURE_STATUS is sent during the recording."""
@@ -141,7 +143,11 @@ class _Videos:
         if camera.free_mib <= 0:
             return MavResult.FAILED
         self._must_stop = False
-        await camera.start_video()
+        try:
+            await camera.start_video()
+        except BaseException as error:
+            self._was_cancelled = not isinstance(error, Exception)
+            raise
         status_interval_s = 1.0 / command.param2 if command.param2 else 0.0  # 0 requests no status.
         captures.record(status_interval_s)
         if self._must_stop:  # The command to stop arrived while the camera was starting.
@@ -154,8 +160,9 @@ class _Videos:
         return MavResult.ACCEPTED
 
     async def _stop_recording(self) -> None:
-        if self._camera.captures.is_recording:
+        if self._camera.captures.is_recording or self._was_cancelled:
             await self._camera.stop_video()
+            self._was_cancelled = False
             self._camera.captures.stop_recording()
             self._camera.host.send(self._camera.captures.status())
 

@@ -200,6 +200,7 @@ class Captures:
         """Take ``count`` images (0: until `stop`), the first at once, then one every ``interval_s`` seconds."""
         self.interval_s = interval_s if count != 1 else 0.0
         self._remaining = count or _UNLIMITED
+        self._is_late = False
         self._series += 1
         self._begin_image(self._series)
 

@@ -176,9 +176,9 @@ class Outcome(NamedTuple):
 
 
 class RunningCommand:
-    """A command that is being executed; ``cancel`` is called by COMMAND_CANCEL."""
+    """A command that is being executed; COMMAND_CANCEL calls ``cancel``, which returns False if it has no effect."""
 
-    def __init__(self, command: ReceivedCommand, cancel: Callable[[], None]) -> None:
+    def __init__(self, command: ReceivedCommand, cancel: Callable[[], bool]) -> None:
         self.command = command
         self.progress: int = UNKNOWN_PROGRESS
         """Progress in percent; 255 if unknown."""
@@ -192,7 +192,8 @@ class RunningCommands:
 
     A repeated transmission (COMMAND_LONG with a confirmation) never executes a command twice: it is answered by
     IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with the same MAV_CMD
-    is TEMPORARILY_REJECTED while the first command runs. So is any new command while ``MAX_RUNNING_COMMANDS`` run.
+    is TEMPORARILY_REJECTED while the first command runs, unless it stops the first one. So is any new command while
+    ``MAX_RUNNING_COMMANDS`` run.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:
@@ -207,18 +208,25 @@ class RunningCommands:
     def __len__(self) -> int:
         return len(self._running)
 
-    def start(self, command: ReceivedCommand, cancel: Callable[[], None]) -> RunningCommand | None:
-        """Register a command that is to be executed. If it must not be executed, answer the sender and return None."""
+    def start(
+        self, command: ReceivedCommand, cancel: Callable[[], bool], *, is_stop: bool = False
+    ) -> RunningCommand | None:
+        """Register a command that is to be executed. If it must not be executed, answer the sender and return None.
+
+        ``is_stop`` cancels a running command with the same MAV_CMD. Such a command may be executed twice.
+        """
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
         ended = self._ended.get((command.command, command.sender))
-        if ended is not None:
+        if ended is not None and not is_stop:  # The first transmission of a new command to stop may have been lost.
             ended_command, outcome, ended_at = ended
             if _is_repeated(command, ended_command) and self._host.now - ended_at <= RESULT_MAX_AGE_S:
                 self._server.answer(command, *outcome)
                 return None
+        if running is not None and is_stop and self._end_for(running, command):
+            running = None
         if running is not None or len(self._running) >= MAX_RUNNING_COMMANDS:
             self._server.answer(command, MavResult.TEMPORARILY_REJECTED)
             return None
@@ -226,6 +234,16 @@ class RunningCommands:
         self._running[command.command] = started
         self._host.call_later(PROGRESS_DELAY_S, lambda: self._report_repeatedly(started))
         return started
+
+    def _end_for(self, running: RunningCommand, command: ReceivedCommand) -> bool:
+        """Cancel a running command, because ``command`` stops it. Return False if it cannot be cancelled."""
+        del self._running[command.command]
+        if not running.cancel():
+            self._running[command.command] = running
+            return False
+        if running.command.sender != command.sender:  # The same sender would take it for the answer to `command`.
+            self._server.answer(running.command, MavResult.CANCELLED)
+        return True
 
     def report(self, running: RunningCommand, percent: int) -> None:
         """Send IN_PROGRESS with this percentage now."""

@@ -53,6 +53,8 @@ class FtpPeer:
     reply: FtpPacket | None = None
     checksum_request: FtpPacket | None = None
     """CalcFileCRC32 request that is being executed."""
+    checksum_file: FileHandle | None = None
+    """File of the latest CalcFileCRC32 request; closed when the checksum is complete."""
 
 
 class SessionFtpServer(Generic[FilesT]):
@@ -112,6 +114,9 @@ class SessionFtpServer(Generic[FilesT]):
         for peer in self._peers.values():
             with suppress(FileFault):
                 self._close_all(peer)
+            if peer.checksum_file is not None:  # No later step will close it.
+                with suppress(FileFault):
+                    peer.checksum_file.close()
         self._peers.clear()
 
     def _on_message(self, message: FileTransferProtocol, channel: Channel) -> None:
@@ -384,7 +389,7 @@ class SessionFtpServer(Generic[FilesT]):
         is_repeated = peer.checksum_request is not None and request.repeats(peer.checksum_request)
         if not is_repeated:  # The running computation also answers a repeated request.
             file = self.files.open(path)
-            peer.checksum_request = request
+            peer.checksum_request, peer.checksum_file = request, file
             self._continue_crc32(peer, request, file, offset=0, checksum=0)
         return None
 

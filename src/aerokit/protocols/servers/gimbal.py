@@ -226,6 +226,9 @@ class GimbalRequests:
         gimbal = self._gimbal
         if (refusal := self._refusal(command.param1, command)) is not None:
             return refusal
+        scale = 1.0 if command.is_long else 1e-7
+        if not (abs(command.x * scale) <= 90.0 and abs(command.y * scale) <= 180.0):  # False for NaN, too.
+            return MavResult.DENIED
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         altitude = command.z
         if frame not in _ABSOLUTE_FRAMES:
@@ -237,7 +240,10 @@ class GimbalRequests:
         """Follow the vehicle whose system id is param 1."""
         if (refusal := self._refusal(command.param2, command)) is not None:
             return refusal
-        self._gimbal.follow(to_int(command.param1))
+        system_id = to_int(command.param1)
+        if not 1 <= system_id <= 255:
+            return MavResult.DENIED
+        self._gimbal.follow(system_id)
         return MavResult.ACCEPTED
 
     def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
@@ -254,15 +260,15 @@ class GimbalRequests:
     def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
         """Move to the rest position if ``flags`` contain RETRACT or NEUTRAL. Otherwise apply the angles or the rates.
 
-        The rates are applied if an angle is NaN. Return False if a rate is NaN, too.
+        The rates are applied if an angle is not finite (NaN: not given). Return False if a rate is not finite, too.
         """
         gimbal = self._gimbal
         locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
         if flags & (Flags.RETRACT | Flags.NEUTRAL):
             gimbal.point(_REST_ANGLES, flags, locked=False)
-        elif not any(map(math.isnan, angles)):
+        elif all(map(math.isfinite, angles)):
             gimbal.point(angles, flags, locked=locked)
-        elif not any(map(math.isnan, rates)):
+        elif all(map(math.isfinite, rates)):
             gimbal.turn(rates, flags, locked=locked)
         else:
             return False

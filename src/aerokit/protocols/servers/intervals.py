@@ -61,7 +61,11 @@ class MessageStreams:
             return False
         if running is None or running.interval_s != interval_s:
             self._streams[key] = _Stream(interval_s)
-            self._send_stream(key, self._streams[key])
+            try:
+                self._send_stream(key, self._streams[key])
+            except Exception:  # The requester gets the error as the answer, so nothing must be streamed to it.
+                del self._streams[key]
+                raise
         return True
 
     def _send_stream(self, key: tuple[Channel, int], stream: _Stream) -> None:
@@ -71,7 +75,12 @@ class MessageStreams:
         try:
             for message in self.builders[message_id](None):
                 self._host.send(message, channel)
-        finally:  # If a builder raises, the host reports the exception, and the stream continues.
+            stream.is_failing = False
+        except Exception:
+            if not stream.is_failing:  # The host reports the first failure only, and the stream continues.
+                stream.is_failing = True
+                raise
+        finally:
             self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
@@ -118,3 +127,4 @@ class MessageStreams:
 class _Stream:
     def __init__(self, interval_s: float) -> None:
         self.interval_s = interval_s
+        self.is_failing = False  # True if the builder has raised at its last call
