@@ -294,8 +294,8 @@ class Travel(SelectionBase):
             missing = [name for name in leg if not self.members[name].is_available]
             if missing:  # an unavailable member may be in the way of the others, so the flight ends
                 raise OperationRejected(
-                    f"{action}: {', '.join(missing)} became unavailable after the separation was planned; "
-                    + ("nothing was sent" if result is None else "the others stay in their layers")
+                    f"{action}: {', '.join(missing)} became unavailable after the altitudes were assigned; "
+                    + ("nothing was sent" if result is None else "the others stay at their assigned altitudes")
                 )
             result = await self._fly_to(
                 action, leg, speed_m_s, timeout, max_distance_m=max_distance_m, stagger_s=stagger_s

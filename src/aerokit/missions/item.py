@@ -275,9 +275,9 @@ def place_item(
             altitudes = _altitudes_of(position)
     if isinstance(longitude_deg, (Position, Home)):
         raise InvalidArgument(
-            f"longitude_deg = {short_repr(longitude_deg)} is not a number: the first argument, {latitude_deg!r}, was"
-            " taken for the latitude, and the place for the longitude; write the place first and the altitude by name:"
-            " (place, altitude_relative_m=…)"
+            f"longitude_deg = {short_repr(longitude_deg)} is not allowed: it must be a number; the first argument,"
+            f" {latitude_deg!r}, was taken for the latitude. Pass the place as the first argument, and the altitude by"
+            " name: (place, altitude_relative_m=…)"
         )
     z, frame = altitude_and_frame(*altitudes)
     if latitude_deg is None and longitude_deg is None and not is_needed:

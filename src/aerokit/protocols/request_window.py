@@ -59,7 +59,7 @@ class RequestWindow(Generic[KeyT]):
         self._fastest_s = math.inf
         self._duplicate_last = duplicate_last
         self._answered_at = -math.inf
-        self._silences = 0  # number of silences of the whole link since the last answer
+        self._silences = 0  # how many times in a row no request was answered in time
         self._next_silence_at = -math.inf  # earliest time at which a further silence is counted
         self._waiting: dict[KeyT, None] = {}
         # Requests that were sent, and neither answered nor queued again, in the order in which they were sent.
@@ -108,9 +108,10 @@ class RequestWindow(Generic[KeyT]):
         self._requests.pop(key, None)
 
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
-        """Record an answer. Queue the requests again that count as lost, and return them.
+        """Record an answer. Queue requests that are presumed lost once more, and return them.
 
-        The lost requests were sent at least ``overtaken`` transmissions before the answered request.
+        These were last sent at least ``overtaken`` transmissions before the first transmission of the answered request,
+        which the answer may belong to.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)

@@ -180,7 +180,7 @@ def _create_hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub
 
 @asynccontextmanager
 async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None]:
-    """Share the connection by the hub for the duration of an `async with` block; do nothing without a hub."""
+    """Let the hub share the connection with its clients during an `async with` block; do nothing without a hub."""
     if hub is None:
         yield
         return

@@ -277,7 +277,7 @@ class _DescentValues(Snapshot):
 
 
 def _descent_values(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _DescentValues | None:
-    """Return the values in a time span and before it; None if the series has no known value in the span."""
+    """Return range and median of the known values in a time span, and the median just before it; None without any."""
     values = series.between(name, begin_s, end_s)
     if not values:
         return None

@@ -82,7 +82,7 @@ class CameraOrders:
         return self._session.connection.now()
 
     def heartbeat_at(self) -> float:
-        """Loop time of the camera's last HEARTBEAT; -inf while the vehicle is silent."""
+        """Loop time of the camera's last HEARTBEAT; -inf while the autopilot is silent."""
         received_at = self._session.connection.last_heartbeat_at(self._session.system_id, self.component.component_id)
         return received_at if self._context.arbiter.is_state_recent else -math.inf
 

@@ -150,12 +150,12 @@ class Health:
     def unarmable_mode(self) -> list[str]:
         """Return a list with one text if the present mode does not allow arming, otherwise an empty list."""
         mode = self._telemetry.mode.latest
-        return [self.unarmable_text(mode)] if mode is not None and mode.name in self._modes_to_leave() else []
+        return [self.unarmable_text(mode)] if mode is not None and mode.name in self._unarmable_modes() else []
 
     def unarmable_text(self, mode: Mode) -> str:
-        """Return a sentence that says why this mode does not allow arming, and what does."""
+        """Return a text that says that the vehicle cannot arm in this mode, and with which option or mode it can."""
         option = self._autopilot.armable_by_option.get(mode.name)
-        armable_modes = ", ".join(sorted({*self._autopilot.modes.names} - self._modes_to_leave()))
+        armable_modes = ", ".join(sorted({*self._autopilot.modes.names} - self._unarmable_modes()))
         if option is None:
             text = f"{self._autopilot.firmware} cannot arm in {mode.name}, only in {armable_modes}"
         else:
@@ -164,8 +164,8 @@ class Health:
         when = "first" if option is None else "after a refusal"
         return text if arming_mode is None else f"{text}; arm() changes to {arming_mode.name} {when}"
 
-    def _modes_to_leave(self) -> frozenset[str]:
-        """Return the names of the modes that `arm` leaves, either before it arms or after a refusal."""
+    def _unarmable_modes(self) -> frozenset[str]:
+        """Return the names of the modes in which arming is impossible, or possible only with an option."""
         return self._autopilot.unarmable_modes.union(self._autopilot.armable_by_option)
 
     async def _refresh(self) -> None:

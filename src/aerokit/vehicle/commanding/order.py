@@ -229,7 +229,7 @@ class Order:
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """Cancel the order after a refusal or a missing ack; the device's previous order becomes valid again."""
+        """Record that the order was refused or not acknowledged: the device is still to follow its previous order."""
         self.is_withdrawn = True
 
     def commit(self) -> None:
