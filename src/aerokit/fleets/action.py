@@ -211,7 +211,10 @@ class FleetAction:
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _record_failure(self, member: Member, error: Exception) -> None:
-        """Record that a member failed. Unless the action is safe, ask the policy, until it has given orders once."""
+        """Record that a member failed, and ask the policy what the others do.
+
+        The policy is not asked about a safe action (such as a landing), nor after it has given orders.
+        """
         if member.name in self._failed:
             return
         self._failed[member.name] = error

@@ -34,7 +34,7 @@ SettingAnswer = Setting | ParameterRejected | ParameterTimeout
 """Answer to one request: the setting as the component reports it, or the error."""
 
 UNKNOWN_INDEX = 0xFFFF
-MAX_QUIET_S = 1.1  # A list has ended after this many seconds of silence, however long its pauses were before.
+MAX_QUIET_S = 1.1  # Maximum seconds of silence until a list counts as ended; fewer if its pauses were short so far.
 READ_WINDOW = 10
 # Seconds to wait after PARAM_ACK_IN_PROGRESS before the value is requested.
 PROGRESS_TIMEOUT_S = 5.0

@@ -232,7 +232,7 @@ class Page:
                     self.at_run_time.add((origin_module, origin_name))
 
     def wrapped_in_twin(self, expression: str, returns: ast.expr | None) -> str:
-        """Return the expression, wrapped in a twin if its type has one."""
+        """Return the expression, wrapped in the blocking class (twin) of its type if there is one."""
         optional_name = outer_name(without_none(returns))
         if optional_name in self._twins:
             return f"None if {expression} is None else {optional_name}(self._loop, {expression})"

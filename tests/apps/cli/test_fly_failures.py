@@ -137,7 +137,10 @@ def test_fly_mission_changed_during_question_is_not_flown(
 
     monkeypatch.setattr(flown_plan, "confirm", confirm)
     assert run_virtual(scenario()) == 5
-    assert "mission on the vehicle changed after the question was asked; nothing was started" in capsys.readouterr().err
+    assert (
+        "mission on the vehicle changed while aerokit waited for your confirmation; nothing was started"
+        in capsys.readouterr().err
+    )
     assert (copter.is_armed, copter.is_landed) == (False, True)
 
 

@@ -80,7 +80,7 @@ class PlanFlight(SupervisedFlight):
         self._check_disarmed()  # once more, because much may have happened before the user answered
         if self._needs_confirmation and await self._download_mission() != confirmed_mission:
             raise OperationRejected(
-                "the mission on the vehicle changed after the question was asked; nothing was started"
+                "the mission on the vehicle changed while aerokit waited for your confirmation; nothing was started"
             )
         self._print("arming")
         await self._arm()

@@ -218,7 +218,10 @@ def simplification_note(deviation_m: float) -> list[Part]:
 def drawn_track(
     places: Sequence[tuple[float, float]], max_rows: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
-    """Return the rows of a track to draw, including ``keep``, and the largest distance of any row from the line."""
+    """Choose the places of a track that are drawn.
+
+    Return their indices, which include ``keep``, and the largest distance of any place from the drawn line.
+    """
     if len(places) <= MAX_POINTS:  # short lines are drawn completely
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
         rows = list(range(len(places))) if has_known else []

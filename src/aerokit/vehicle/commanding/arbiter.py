@@ -270,7 +270,7 @@ class CommandArbiter:
         self._record_accepted(armed)
 
     def _record_accepted(self, armed: bool | None) -> None:
-        """Record when a command that arms was accepted, because HEARTBEAT reports the effect later."""
+        """Record the time at which an arming command was accepted, because HEARTBEAT reports the effect later."""
         if armed:
             self._arming_accepted_at = self._now()
 

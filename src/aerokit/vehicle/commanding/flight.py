@@ -85,7 +85,7 @@ class FlightActions(VehicleBase):
         if not self.telemetry.is_armed:
             raise OperationRejected("take_off: the vehicle is not armed: call arm() first; nothing was sent")
         landed = self.telemetry.landed_state
-        # During a take-off (TAKEOFF), PX4 accepts another altitude, and ArduPilot refuses the command itself.
+        # TAKEOFF is missing below: during a take-off, PX4 accepts another altitude, and ArduPilot rejects the command.
         is_flying = landed.latest in (MavLandedState.IN_AIR, MavLandedState.LANDING)
         if is_flying and landed.age <= POSITION_MAX_AGE_S:  # A mode change would abort a landing.
             raise OperationRejected(
