@@ -13,8 +13,8 @@ from flight_harness import Wire, attached_sinks, in_the_air, open_flight
 import aerokit
 from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
 from aerokit.mavlink.enums import CopterMode, MavCmd
-from aerokit.mavlink.messages import Heartbeat, SetMode
-from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.mavlink.messages import Heartbeat, SetMode, Statustext
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 from aerokit.vehicle.connect import vehicles_on
 
@@ -240,3 +240,95 @@ async def test_old_height_is_described_with_its_age() -> None:
         flight.copter.faults.drop_outgoing = 100_000
         await anyio.sleep(20.0)
         assert " 10.0 m above home 20 s ago," in flight.vehicle._context.describe_now()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda vehicle: vehicle.land(timeout=None, max_silence_s=None),
+        lambda vehicle: vehicle.set_heading(180.0),
+        lambda vehicle: vehicle.mission.wait_finished(max_silence_s=None),
+        lambda vehicle: vehicle.parameters.download(method="list"),
+        lambda vehicle: vehicle.files.read("@PARAM/param.pck"),
+    ],
+    ids=["land", "set_heading", "wait_finished", "parameters", "file"],
+)
+async def test_call_that_outlives_block_ends_with_it(call: Callable[[aerokit.Vehicle], Awaitable[object]]) -> None:
+    async def run(vehicle: aerokit.Vehicle) -> None:
+        await call(vehicle)
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            task = asyncio.create_task(run(vehicle))
+            await anyio.sleep(0.01)
+        left_at = anyio.current_time()
+        with pytest.raises(ConnectionClosed, match="the async with block of this vehicle was left"):
+            await task
+        assert anyio.current_time() - left_at < 0.1
+
+
+async def test_wait_ready_ends_with_vehicle_block() -> None:
+    async with simulated_link(SimulatedCopter()) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            task = asyncio.create_task(vehicle.wait_ready())
+            await anyio.sleep(1.0)
+        left_at = anyio.current_time()
+        with pytest.raises(ConnectionClosed):
+            await task
+        assert anyio.current_time() - left_at < 0.1
+
+
+async def test_autotune_polls_no_more_after_block() -> None:
+    async with simulated_link(SimulatedPx4()) as link:
+        wire = Wire(link)
+        async with aerokit.open_connection(wire) as connection:
+            async with aerokit.connect(connection) as vehicle:
+                await vehicle.wait_ready()
+                await vehicle.arm()
+                await vehicle.take_off(10.0)
+                task = asyncio.create_task(vehicle.autotune())
+                await anyio.sleep(3.0)
+            wire.clear()
+            with pytest.raises(ConnectionClosed):
+                await task
+            assert not wire.commands(MavCmd.DO_AUTOTUNE_ENABLE)
+
+
+async def test_call_on_left_vehicle_disturbs_no_other_flight() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
+        wire = Wire(link)
+        async with aerokit.open_connection(wire) as connection:
+            async with aerokit.connect(connection) as left_vehicle:
+                await left_vehicle.wait_ready()
+                await left_vehicle.arm()
+                await left_vehicle.take_off(10.0)
+            async with aerokit.connect(connection) as vehicle:
+                await vehicle.armed.wait_until(bool)
+                wire.clear()
+                with pytest.raises(SetpointStreamStopped):
+                    async with left_vehicle.guided.velocity() as stream:
+                        stream.set(VelocitySetpoint())
+                with pytest.raises(ConnectionClosed, match="nothing was sent"):
+                    await left_vehicle.arm(reason="by mistake")
+                assert not wire.mode_orders()
+                assert not wire.all(Statustext)
+
+
+async def test_streams_that_outlive_block_keep_connection_open() -> None:
+    async def stream(vehicle: aerokit.Vehicle) -> None:
+        with vehicle.streams(4.0):
+            await anyio.sleep(60.0)
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            copter.faults.drop_outgoing = 100_000
+            task = asyncio.create_task(stream(vehicle))
+            await anyio.sleep(1.0)
+        await anyio.sleep(30.0)
+        assert connection.is_open
+        task.cancel()

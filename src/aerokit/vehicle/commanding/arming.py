@@ -93,7 +93,7 @@ class ArmingActions(VehicleBase):
             # Shortly before the time-out, ask the vehicle once for the reasons, so that the error can contain them.
             ask_at = self.connection.now() + timeout - REASONS_TIMEOUT_S
             while self._health.missing_for_flight():
-                self.connection.raise_if_ended()
+                self._session.end.raise_if_ended()
                 if self.connection.now() >= ask_at:
                     ask_at = math.inf
                     await self._health.request_reasons(self.connection.now() - PREARM_REPORT_INTERVAL_S)
@@ -166,7 +166,7 @@ class ArmingActions(VehicleBase):
         self._arm_cleanup.stop()
         if reason:
             logger.info("arming vehicle %d: %s", self.system_id, reason)
-            self.connection.send(Statustext(severity=MavSeverity.INFO, text=reason, id=0, chunk_seq=0))
+            self._session.send(Statustext(severity=MavSeverity.INFO, text=reason, id=0, chunk_seq=0))
         started = self.connection.now()
         try:
             may_change_mode = mode is None
@@ -381,7 +381,7 @@ class ArmingActions(VehicleBase):
         started = self.connection.now()
         next_request_at = started
         while self._session.watch.reboots == reboots_before:
-            self.connection.raise_if_ended()
+            self._session.end.raise_if_ended()
             now = self.connection.now()
             if now >= next_request_at:
                 self._session.link_watch.request_time()

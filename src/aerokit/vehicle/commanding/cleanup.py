@@ -173,7 +173,7 @@ class FlightCleanup:
             return False
         session = self._session
         mode = session.autopilot.mode_for("hold", is_vtol=session.telemetry.is_vtol)
-        if mode is None or not session.connection.is_open:  # A hold cannot be sent.
+        if mode is None or session.end.error is not None:  # A hold cannot be sent, or another vehicle object may fly.
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:  # A hold must not be sent.
             return False

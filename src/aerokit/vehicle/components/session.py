@@ -96,7 +96,7 @@ class ComponentSession:
         return f"{prefix}last heartbeat of component {self.component_id} {age:.1f} s ago"
 
     def _close(self) -> None:
-        self.transfers.is_closed = True
+        self.transfers.close()
         self.rates.close()
 
 

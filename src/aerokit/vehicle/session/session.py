@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.autopilots import autopilot_for
+from aerokit.connection.bus import EndSignal
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import (
@@ -164,8 +165,8 @@ class VehicleSession:
         # Cells that are not part of the telemetry.
         self._cells: list[StateCell[Any]] = [self.link_quality]
         self._detach_callbacks: list[Detach] = []
-        # The error that ended the session; None while it runs.
-        self._ended_by: Exception | None = None
+        self.end: EndSignal = EndSignal()
+        """Signals the end of the connection, or of the vehicle's `async with` block."""
         self.on_reboot: list[Callable[[], None]] = [
             self.rates.request_again,
             self.commands.forget_results,
@@ -189,7 +190,7 @@ class VehicleSession:
     def close(self) -> None:
         """Stop sending and receiving; waiting calls raise ConnectionClosed."""
         self.is_closed = True
-        self.transfers.is_closed = True
+        self.transfers.close()
         self._on_end(ConnectionClosed("the async with block of this vehicle was left"))
         for detach in self._detach_callbacks:
             detach()
@@ -210,8 +211,8 @@ class VehicleSession:
         self._cells.append(cell)
         self.add_timeout_hint(cell)
         self.on_reboot.append(cell.forget)
-        if self._ended_by is not None:
-            cell.close(self._ended_by)
+        if self.end.error is not None:
+            cell.close(self.end.error)
 
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
         """Make time-out errors of these state cells mention rejected signatures, which are a likely cause."""
@@ -419,6 +420,8 @@ class VehicleSession:
         self.background.cancel()
         self.watch.end(error)
         self.telemetry.close(error)
-        self._ended_by = error
         for cell in self._cells:
             cell.close(error)
+        if self.end.error is None:
+            self.end.error = error
+            self.end.notify(error)
