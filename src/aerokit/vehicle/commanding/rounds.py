@@ -30,7 +30,8 @@ SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
 """Deviation in metres from which a reported radius counts as wrong.
 
-For CIRCLE_REPORT_S seconds after the command, PX4 may still report the previous circle.
+For CIRCLE_REPORT_S seconds after the command, PX4 may still report the previous circle, or send a text that refuses
+the ordered one.
 """
 LAG_ROUNDS = 0.02
 """Fraction of a round by which the count may lag although the vehicle is at the end of its path."""
@@ -142,7 +143,13 @@ class RoundFlight:
             """Return why the rounds cannot succeed: the mode, a status text that refuses them, or a wrong radius."""
             if reason := mode_failure():
                 return reason
-            refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
+            texts = session.telemetry.texts_since(order.given_at)
+            refusals = (
+                text.text
+                for text in texts
+                # A later refusal is about something else, e.g. a mission that another ground station uploads.
+                if text.at <= started + CIRCLE_REPORT_S and session.autopilot.is_refusal(text.text)
+            )
             # For a moment, PX4 may still report the previous circle.
             is_radius_reported = session.connection.now() > started + CIRCLE_REPORT_S
             # `fly_by_command` orders the vehicle to hold if there is a problem.
