@@ -13,7 +13,7 @@ from flight_harness import Wire, attached_sinks, in_the_air, open_flight
 import aerokit
 from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
 from aerokit.mavlink.enums import CopterMode, MavCmd
-from aerokit.mavlink.messages import Heartbeat, SetMode, Statustext
+from aerokit.mavlink.messages import CameraInformation, Heartbeat, SetMode, Statustext
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 from aerokit.vehicle.connect import vehicles_on
@@ -269,6 +269,20 @@ async def test_call_that_outlives_block_ends_with_it(call: Callable[[aerokit.Veh
         with pytest.raises(ConnectionClosed, match="the async with block of this vehicle was left"):
             await task
         assert anyio.current_time() - left_at < 0.1
+
+
+@pytest.mark.parametrize("component_id", [1, 100])
+async def test_subscription_ends_with_vehicle_block(component_id: int) -> None:
+    async def read(source: Any) -> None:
+        with source.subscribe(CameraInformation) as messages:
+            await messages.get(30.0)
+
+    async with simulated_link(SimulatedCopter()) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            reader = asyncio.create_task(read(vehicle if component_id == 1 else vehicle.component(component_id)))
+            await anyio.sleep(1.0)
+        with pytest.raises(ConnectionClosed):
+            await reader
 
 
 async def test_wait_ready_ends_with_vehicle_block() -> None:

@@ -55,6 +55,7 @@ class ComponentSession:
             self.rates,
             register_cell=session.register_cell,
             at_close=session.at_close,
+            end=session.end,
         )
         version: StateCell[AutopilotVersion] = session.connection.new_cell(
             "version", f"AUTOPILOT_VERSION of component {component_id}"

@@ -127,6 +127,8 @@ class VehicleSession:
         self.component_id: int = component_id
         self.vehicle_type: int = heartbeat.type
         self.autopilot: Autopilot = autopilot_for(heartbeat)
+        self.end: EndSignal = EndSignal()
+        """Signals the end of the connection, or of the vehicle's `async with` block."""
         self.telemetry: Telemetry = Telemetry(
             connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot
         )
@@ -143,7 +145,13 @@ class VehicleSession:
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups
         )
         self.subscriber: ComponentSubscriber = ComponentSubscriber(
-            connection, system_id, component_id, self.rates, register_cell=self.register_cell, at_close=self.at_close
+            connection,
+            system_id,
+            component_id,
+            self.rates,
+            register_cell=self.register_cell,
+            at_close=self.at_close,
+            end=self.end,
         )
         self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
         self.link_watch: LinkWatch = LinkWatch(
@@ -165,8 +173,6 @@ class VehicleSession:
         # Cells that are not part of the telemetry.
         self._cells: list[StateCell[Any]] = [self.link_quality]
         self._detach_callbacks: list[Detach] = []
-        self.end: EndSignal = EndSignal()
-        """Signals the end of the connection, or of the vehicle's `async with` block."""
         self.on_reboot: list[Callable[[], None]] = [
             self.rates.request_again,
             self.commands.forget_results,
