@@ -204,6 +204,46 @@ async def test_block_left_with_flight_in_other_task_holds(caplog: pytest.LogCapt
     assert "vehicle 1 was left: holding in BRAKE" in caplog.text
 
 
+@pytest.mark.parametrize("call", ["go_to", "loiter", "orbit"])
+async def test_block_left_before_order_is_acknowledged_holds(call: str) -> None:
+    simulated = SimulatedPx4(boot_time_s=0.0) if call == "orbit" else SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(simulated, latency_s=0.3) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            place = vehicle.position.value.offset(north_m=300)
+            arguments = {"radius_m": 10} if call == "orbit" else {}
+            task = asyncio.create_task(getattr(vehicle, call)(place, **arguments))
+            await anyio.sleep(0.2)
+        with pytest.raises(AerokitError):
+            await task
+        await anyio.sleep(10.0)
+        assert simulated.motion.north < 5.0
+
+
+async def test_block_left_while_follow_waits_for_target_ends_earlier_flight() -> None:
+    async def follow(vehicle: aerokit.Vehicle) -> None:
+        async with vehicle.follow(lambda: None):
+            pass
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            flight = asyncio.create_task(vehicle.go_to(vehicle.position.value.offset(north_m=300)))
+            await anyio.sleep(1.0)
+            following = asyncio.create_task(follow(vehicle))
+            await anyio.sleep(1.0)
+        await anyio.sleep(5.0)
+        assert copter.mode.number == CopterMode.BRAKE
+        for task in (flight, following):
+            with pytest.raises(AerokitError):
+                await task
+
+
 async def test_block_exit_waits_briefly_for_unanswered_hold() -> None:
     async with in_the_air() as flight:
         with anyio.move_on_after(1.0):

@@ -236,7 +236,7 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Register the order that a call awaits, so that `end_flights` can hold the vehicle meanwhile.
+        """Register the order that a call gives and awaits, so that `end_flights` can hold the vehicle meanwhile.
 
         If the vehicle hits the ground, this block orders the hold itself, because the target of the order may still be
         in the air.
@@ -272,7 +272,8 @@ class FlightCleanup:
         self.check_no_stream()
         order = self._arbiter.order(mode)
         try:
-            yield order
+            with self.flying(order):
+                yield order
             self._sender.raise_if_ended(order)
             if not self._arbiter.is_state_recent:
                 raise HeartbeatTimeout(

@@ -104,11 +104,12 @@ class RoundFlight:
         hold_mode = context.sender.mode_for(self._operation, "hold")
         order = context.arbiter.order(mode, hold_mode)
         try:
-            with context.arbiter.changing_mode():
-                send = self._session.commands.send_int
-                await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
-            with cleanup.flying(order), self._session.streaming("position"):
-                await self._await_rounds(order, mode, stay_s, radius_m)
+            with cleanup.flying(order):
+                with context.arbiter.changing_mode():
+                    send = self._session.commands.send_int
+                    await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
+                with self._session.streaming("position"):
+                    await self._await_rounds(order, mode, stay_s, radius_m)
             if holds_at_end:
                 await cleanup.stop_in(hold_mode, order)
             elif radius_m:
