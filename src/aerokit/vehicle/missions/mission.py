@@ -340,7 +340,8 @@ class MissionControl(VehiclePlan["Mission"]):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
             raise
-        self._is_paused = False
+        if self._order is order:  # Otherwise, another task has paused the mission again.
+            self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end, including a landing at its end.
