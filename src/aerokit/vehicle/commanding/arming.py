@@ -21,6 +21,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity, MavState
 from aerokit.mavlink.messages import Statustext
+from aerokit.vehicle.commanding.arbiter import STEERING
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
@@ -180,13 +181,20 @@ class ArmingActions(VehicleBase):
     ) -> None:
         """Arm in the present mode. If a parameter may forbid this, change the mode after a refusal, and arm then."""
         began_at = self.connection.now()
+        order_before, arm_commands_before = self._arbiter.latest(STEERING), self._arbiter.arm_commands_sent
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
+            # Another task may have ordered something else since, above all to disarm.
+            is_newest_order = (
+                self._arbiter.latest(STEERING) is order_before
+                and self._arbiter.arm_commands_sent == arm_commands_before + 1
+            )
             may_retry_in_other_mode = (
                 may_change_mode
                 and not has_computer_slept
+                and is_newest_order
                 # A set-point stream needs the mode that it has set, and the mode of an armed vehicle belongs to
                 # whoever has armed it.
                 and self._flight_cleanup.stop_stream is None
