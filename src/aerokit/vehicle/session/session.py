@@ -153,7 +153,9 @@ class VehicleSession:
             at_close=self.at_close,
             end=self.end,
         )
-        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
+        frame = heartbeat.received_frame
+        heartbeat_at = connection.now() if frame is None else frame.received_at
+        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._on_reboot, heartbeat_at)
         self.link_watch: LinkWatch = LinkWatch(
             connection, system_id, component_id, self._on_link_report, self.watch.on_time_answer
         )
