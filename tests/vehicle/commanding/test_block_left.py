@@ -244,6 +244,19 @@ async def test_block_left_while_follow_waits_for_target_ends_earlier_flight() ->
                 await task
 
 
+async def test_block_left_while_other_task_arms_disarms(caplog: pytest.LogCaptureFixture) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter, latency_s=0.3) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            task = asyncio.create_task(vehicle.arm())
+            await anyio.sleep(0.2)
+        await asyncio.wait((task,))
+        await anyio.sleep(3.0)
+        assert not copter.is_armed
+    assert "an abandoned arm command has armed the vehicle: aerokit disarms it again" in caplog.text
+
+
 async def test_block_exit_waits_briefly_for_unanswered_hold() -> None:
     async with in_the_air() as flight:
         with anyio.move_on_after(1.0):

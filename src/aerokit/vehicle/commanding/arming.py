@@ -213,7 +213,7 @@ class ArmingActions(VehicleBase):
         After any error but a refusal, `ArmCleanup` watches whether the vehicle arms late, and disarms it.
         """
         started, was_armed = self.connection.now(), self.telemetry.is_armed
-        with self._arbiter.auxiliary_order() as order:
+        with self._arbiter.auxiliary_order() as order, self._arm_cleanup.arming(order, was_armed):
             try:
                 await self._sender.send_arm(order, armed=True, force=force)
                 await self._await_armed(

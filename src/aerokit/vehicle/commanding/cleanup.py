@@ -314,6 +314,18 @@ class ArmCleanup:
         self._task = BackgroundTask(
             session, "aerokit late arming", warning_clause="while an arm command may still be executed"
         )
+        # The arm order that a call awaits in `arming`, and whether the vehicle was armed before it.
+        self._awaited: tuple[Order, bool] | None = None
+
+    @contextmanager
+    def arming(self, order: Order, was_armed: bool) -> Iterator[None]:
+        """Register the order that a call awaits, so that `finish` watches it if the vehicle's block ends meanwhile."""
+        self._awaited = order, was_armed
+        try:
+            yield
+        finally:
+            if self._awaited == (order, was_armed):
+                self._awaited = None
 
     def hint(self) -> str:
         """Return the hint for error texts that an arm command may still be executed."""
@@ -404,6 +416,8 @@ class ArmCleanup:
     async def finish(self) -> None:
         """At the end of the vehicle's `async with` block, wait briefly for the outcome of a cancelled arm order.
 
-        Log a warning if the outcome stays unknown.
+        Log a warning if the outcome stays unknown. An arm order that another task still awaits counts as cancelled.
         """
+        if self._awaited is not None:
+            self.watch(*self._awaited)
         await self._task.finish(ARM_CLOSE_TIMEOUT_S)
