@@ -16,6 +16,7 @@ from aerokit import events
 from aerokit import messages as m
 from aerokit.connection.bus import Subscription
 from aerokit.errors import (
+    AerokitError,
     CommandRejected,
     HeartbeatTimeout,
     InvalidArgument,
@@ -481,6 +482,17 @@ async def test_cancelled_start_holds() -> None:
             await flight.vehicle.mission.start()
         await anyio.sleep(2)
         assert CopterMode.BRAKE in flight.wire.mode_orders()
+
+
+async def test_block_left_during_start_holds() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        flight.copter.faults.lose_ack(MavCmd.MISSION_START)
+        start = asyncio.create_task(flight.vehicle.mission.start())
+        await anyio.sleep(0.1)
+    with pytest.raises(AerokitError):
+        await start
+    assert flight.copter.mode.number == CopterMode.BRAKE
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])

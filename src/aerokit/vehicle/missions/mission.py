@@ -292,8 +292,9 @@ class MissionControl(VehiclePlan["Mission"]):
         self._is_paused = False
         self._tracker.start()
         try:
-            await self._set_current(item, timeout, order, keeps_jump_counts=False)
-            await self._enter_mode(mode, order, timeout)
+            with vehicle_context.flight_cleanup.flying(order):
+                await self._set_current(item, timeout, order, keeps_jump_counts=False)
+                await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
@@ -335,7 +336,8 @@ class MissionControl(VehiclePlan["Mission"]):
         self._order = order
         self._tracker.start()
         try:
-            await self._enter_mode(mode, order, timeout)
+            with vehicle_context.flight_cleanup.flying(order):
+                await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
