@@ -244,6 +244,26 @@ async def test_block_left_while_follow_waits_for_target_ends_earlier_flight() ->
                 await task
 
 
+async def test_block_left_before_hold_of_stream_is_acknowledged_holds() -> None:
+    async def fly(vehicle: aerokit.Vehicle) -> None:
+        async with vehicle.guided.velocity() as stream:
+            await stream.fly(VelocitySetpoint(5.0), 2.0)
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            task = asyncio.create_task(fly(vehicle))
+            await anyio.sleep(1.9)
+            copter.faults.ignore(MavCmd.DO_SET_MODE, times=1)
+            await anyio.sleep(0.2)
+        with pytest.raises(AerokitError):
+            await task
+        assert copter.mode.number == CopterMode.BRAKE
+
+
 async def test_block_left_while_other_task_arms_disarms(caplog: pytest.LogCaptureFixture) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter, latency_s=0.3) as link, aerokit.open_connection(link) as connection:

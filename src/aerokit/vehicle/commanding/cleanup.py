@@ -128,7 +128,9 @@ class FlightCleanup:
     async def hold(self) -> None:
         """Order the vehicle to hold, see :meth:`aerokit.Vehicle.hold`."""
         mode = self._sender.mode_for("hold", "hold")
-        await self.stop_in(mode, self._arbiter.order(mode))
+        order = self._arbiter.order(mode)
+        with self.flying(order):
+            await self.stop_in(mode, order)
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order the vehicle to hold, even if it already is in the hold mode.

@@ -110,9 +110,9 @@ class RoundFlight:
                     await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
                 with self._session.streaming("position"):
                     await self._await_rounds(order, mode, stay_s, radius_m)
-            if holds_at_end:
-                await cleanup.stop_in(hold_mode, order)
-            elif radius_m:
+                if holds_at_end:
+                    await cleanup.stop_in(hold_mode, order)
+            if radius_m and not holds_at_end:
                 context.vehicle_position.record_circle(radius_m)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # also CommandTimeout and HeartbeatTimeout
             # The vehicle may have received the command, so it is ordered to hold.

@@ -297,7 +297,8 @@ class SteeringStream(ValueStream[ValueT]):
             cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
             order = self._context.arbiter.order(hold_mode)
             try:
-                await cleanup.stop_in(hold_mode, order)
+                with cleanup.flying(order):
+                    await cleanup.stop_in(hold_mode, order)
             except (anyio.get_cancelled_exc_class(), OperationTimeout):
                 # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
                 cleanup.hold_in_background(order)
