@@ -340,19 +340,19 @@ class ArmCleanup:
         if not self._is_newest_arm_command(order):
             return
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
-        self._task.start(partial(self._watch_arming, order, was_armed))
+        self._task.start(partial(self._watch_arming, order, was_armed, self._session.telemetry.mode.latest))
 
     def _is_newest_arm_command(self, order: Order) -> bool:
         """Return True if the order's command was sent, and the program has sent no arm or disarm command since."""
         return order.arm_command == self._arbiter.arm_commands_sent
 
-    async def _watch_arming(self, order: Order, was_armed: bool) -> None:
+    async def _watch_arming(self, order: Order, was_armed: bool, mode: Mode | None) -> None:
         """Disarm the vehicle if the abandoned order arms it within `ARM_WATCH_S`."""
         has_armed = False
         with anyio.move_on_after(ARM_WATCH_S):
             has_armed = await self._wait_until_armed(was_armed)
         if has_armed:
-            await self._undo_late_arming(order)
+            await self._undo_late_arming(order, mode)
 
     async def _wait_until_armed(self, was_armed: bool) -> bool:
         """Return True once the vehicle arms; False if the link ends first.
@@ -369,9 +369,9 @@ class ArmCleanup:
             return False
         return True
 
-    async def _undo_late_arming(self, order: Order) -> None:
+    async def _undo_late_arming(self, order: Order, mode: Mode | None) -> None:
         """Disarm the vehicle, which has armed after its arm order was abandoned, unless another party armed it."""
-        was_armed_by_order = await self._was_armed_by(order)
+        was_armed_by_order = await self._was_armed_by(order, mode)
         if not self._is_newest_arm_command(order) or self._session.telemetry.is_confirmed_disarmed:
             return
         if not was_armed_by_order:
@@ -388,17 +388,18 @@ class ArmCleanup:
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 
-    async def _was_armed_by(self, order: Order) -> bool:
+    async def _was_armed_by(self, order: Order, mode: Mode | None) -> bool:
         """Return True if this order, and not a pilot, has armed the vehicle. Called when HEARTBEAT has reported armed.
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
-        acknowledgement, the order armed it if the next HEARTBEAT reports armed and there was no takeover.
+        acknowledgement, the order armed it if the next HEARTBEAT reports armed and there was no takeover. ``mode`` is
+        the mode in which the order was abandoned, because an abandoned order does not notice a change of the mode.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
         if self._arbiter.slept_since(order.given_at) > 0:  # Another party had time to arm it while the computer slept.
             return False
-        was_taken_over = bool(order.end)
+        was_taken_over = bool(order.end) or self._session.telemetry.mode.latest != mode
         if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
