@@ -297,7 +297,8 @@ class Transfer(Exchange[ResultT]):
         self.target_component: int = target_component
         self.round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip
         self._idle_timeout_s = idle_timeout_s
-        self._on_progress = on_progress
+        self.on_progress: OnProgress | None = on_progress
+        """Called with each progress. It must not raise, because the next request is sent only after it."""
 
     def _start_clock(self, now: float) -> None:
         self._started_at = now
@@ -305,8 +306,8 @@ class Transfer(Exchange[ResultT]):
 
     def _report_progress(self, now: float, done: int, total: int | None) -> None:
         self._progress_at = now
-        if self._on_progress is not None:
-            self._on_progress(TransferProgress(done, total, now - self._started_at))
+        if self.on_progress is not None:
+            self.on_progress(TransferProgress(done, total, now - self._started_at))
 
     @property
     def _idle_deadline(self) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import anyio
 import pytest
 from flight_harness import Flight, in_the_air, now, open_flight, open_px4
@@ -147,6 +149,19 @@ async def test_pilot_between_refusal_and_repetition_ends_arming() -> None:
             with pytest.raises(OperationRejected):
                 await flight.vehicle.arm()
         assert len(flight.wire.commands(ARM)) == 1
+
+
+async def test_disarm_after_refusal_in_auto_ends_arming() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        await flight.vehicle.set_mode("AUTO")
+        arming = asyncio.create_task(flight.vehicle.arm())
+        await anyio.sleep(0.1)  # The call waits for the texts that explain the refusal.
+        await flight.vehicle.disarm()
+        with pytest.raises(CommandRejected):
+            await arming
+        assert len(flight.wire.commands(ARM)) == 2
+        assert flight.copter.mode.number == CopterMode.AUTO
 
 
 async def take_over_later(flight: Flight) -> None:

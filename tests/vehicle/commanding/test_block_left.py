@@ -13,8 +13,8 @@ from flight_harness import Wire, attached_sinks, in_the_air, open_flight
 import aerokit
 from aerokit.errors import AerokitError, ConnectionClosed, OperationRejected, SetpointStreamStopped
 from aerokit.mavlink.enums import CopterMode, MavCmd
-from aerokit.mavlink.messages import Heartbeat, SetMode
-from aerokit.sim import SimulatedCopter, simulated_link
+from aerokit.mavlink.messages import CameraInformation, Heartbeat, SetMode, Statustext
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 from aerokit.vehicle.connect import vehicles_on
 
@@ -204,6 +204,79 @@ async def test_block_left_with_flight_in_other_task_holds(caplog: pytest.LogCapt
     assert "vehicle 1 was left: holding in BRAKE" in caplog.text
 
 
+@pytest.mark.parametrize("call", ["go_to", "loiter", "orbit"])
+async def test_block_left_before_order_is_acknowledged_holds(call: str) -> None:
+    simulated = SimulatedPx4(boot_time_s=0.0) if call == "orbit" else SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(simulated, latency_s=0.3) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            place = vehicle.position.value.offset(north_m=300)
+            arguments = {"radius_m": 10} if call == "orbit" else {}
+            task = asyncio.create_task(getattr(vehicle, call)(place, **arguments))
+            await anyio.sleep(0.2)
+        with pytest.raises(AerokitError):
+            await task
+        await anyio.sleep(10.0)
+        assert simulated.motion.north < 5.0
+
+
+async def test_block_left_while_follow_waits_for_target_ends_earlier_flight() -> None:
+    async def follow(vehicle: aerokit.Vehicle) -> None:
+        async with vehicle.follow(lambda: None):
+            pass
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            flight = asyncio.create_task(vehicle.go_to(vehicle.position.value.offset(north_m=300)))
+            await anyio.sleep(1.0)
+            following = asyncio.create_task(follow(vehicle))
+            await anyio.sleep(1.0)
+        await anyio.sleep(5.0)
+        assert copter.mode.number == CopterMode.BRAKE
+        for task in (flight, following):
+            with pytest.raises(AerokitError):
+                await task
+
+
+async def test_block_left_before_hold_of_stream_is_acknowledged_holds() -> None:
+    async def fly(vehicle: aerokit.Vehicle) -> None:
+        async with vehicle.guided.velocity() as stream:
+            await stream.fly(VelocitySetpoint(5.0), 2.0)
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            task = asyncio.create_task(fly(vehicle))
+            await anyio.sleep(1.9)
+            copter.faults.ignore(MavCmd.DO_SET_MODE, times=1)
+            await anyio.sleep(0.2)
+        with pytest.raises(AerokitError):
+            await task
+        assert copter.mode.number == CopterMode.BRAKE
+
+
+async def test_block_left_while_other_task_arms_disarms(caplog: pytest.LogCaptureFixture) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter, latency_s=0.3) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            task = asyncio.create_task(vehicle.arm())
+            await anyio.sleep(0.2)
+        await asyncio.wait((task,))
+        await anyio.sleep(3.0)
+        assert not copter.is_armed
+    assert "an abandoned arm command has armed the vehicle: aerokit disarms it again" in caplog.text
+
+
 async def test_block_exit_waits_briefly_for_unanswered_hold() -> None:
     async with in_the_air() as flight:
         with anyio.move_on_after(1.0):
@@ -240,3 +313,109 @@ async def test_old_height_is_described_with_its_age() -> None:
         flight.copter.faults.drop_outgoing = 100_000
         await anyio.sleep(20.0)
         assert " 10.0 m above home 20 s ago," in flight.vehicle._context.describe_now()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda vehicle: vehicle.land(timeout=None, max_silence_s=None),
+        lambda vehicle: vehicle.set_heading(180.0),
+        lambda vehicle: vehicle.mission.wait_finished(max_silence_s=None),
+        lambda vehicle: vehicle.parameters.download(method="list"),
+        lambda vehicle: vehicle.files.read("@PARAM/param.pck"),
+    ],
+    ids=["land", "set_heading", "wait_finished", "parameters", "file"],
+)
+async def test_call_that_outlives_block_ends_with_it(call: Callable[[aerokit.Vehicle], Awaitable[object]]) -> None:
+    async def run(vehicle: aerokit.Vehicle) -> None:
+        await call(vehicle)
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            await vehicle.arm()
+            await vehicle.take_off(10.0)
+            task = asyncio.create_task(run(vehicle))
+            await anyio.sleep(0.01)
+        left_at = anyio.current_time()
+        with pytest.raises(ConnectionClosed, match="the async with block of this vehicle was left"):
+            await task
+        assert anyio.current_time() - left_at < 0.1
+
+
+@pytest.mark.parametrize("component_id", [1, 100])
+async def test_subscription_ends_with_vehicle_block(component_id: int) -> None:
+    async def read(source: Any) -> None:
+        with source.subscribe(CameraInformation) as messages:
+            await messages.get(30.0)
+
+    async with simulated_link(SimulatedCopter()) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            reader = asyncio.create_task(read(vehicle if component_id == 1 else vehicle.component(component_id)))
+            await anyio.sleep(1.0)
+        with pytest.raises(ConnectionClosed):
+            await reader
+
+
+async def test_wait_ready_ends_with_vehicle_block() -> None:
+    async with simulated_link(SimulatedCopter()) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            task = asyncio.create_task(vehicle.wait_ready())
+            await anyio.sleep(1.0)
+        left_at = anyio.current_time()
+        with pytest.raises(ConnectionClosed):
+            await task
+        assert anyio.current_time() - left_at < 0.1
+
+
+async def test_autotune_polls_no_more_after_block() -> None:
+    async with simulated_link(SimulatedPx4()) as link:
+        wire = Wire(link)
+        async with aerokit.open_connection(wire) as connection:
+            async with aerokit.connect(connection) as vehicle:
+                await vehicle.wait_ready()
+                await vehicle.arm()
+                await vehicle.take_off(10.0)
+                task = asyncio.create_task(vehicle.autotune())
+                await anyio.sleep(3.0)
+            wire.clear()
+            with pytest.raises(ConnectionClosed):
+                await task
+            assert not wire.commands(MavCmd.DO_AUTOTUNE_ENABLE)
+
+
+async def test_call_on_left_vehicle_disturbs_no_other_flight() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link:
+        wire = Wire(link)
+        async with aerokit.open_connection(wire) as connection:
+            async with aerokit.connect(connection) as left_vehicle:
+                await left_vehicle.wait_ready()
+                await left_vehicle.arm()
+                await left_vehicle.take_off(10.0)
+            async with aerokit.connect(connection) as vehicle:
+                await vehicle.armed.wait_until(bool)
+                wire.clear()
+                with pytest.raises(SetpointStreamStopped):
+                    async with left_vehicle.guided.velocity() as stream:
+                        stream.set(VelocitySetpoint())
+                with pytest.raises(ConnectionClosed, match="nothing was sent"):
+                    await left_vehicle.arm(reason="by mistake")
+                assert not wire.mode_orders()
+                assert not wire.all(Statustext)
+
+
+async def test_streams_that_outlive_block_keep_connection_open() -> None:
+    async def stream(vehicle: aerokit.Vehicle) -> None:
+        with vehicle.streams(4.0):
+            await anyio.sleep(60.0)
+
+    copter = SimulatedCopter(boot_time_s=0.0)
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            copter.faults.drop_outgoing = 100_000
+            task = asyncio.create_task(stream(vehicle))
+            await anyio.sleep(1.0)
+        await anyio.sleep(30.0)
+        assert connection.is_open
+        task.cancel()

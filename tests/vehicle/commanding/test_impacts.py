@@ -12,6 +12,7 @@ from flight_harness import Flight, in_the_air, now, open_flight, open_px4
 import aerokit
 from aerokit.connection.cells import Source
 from aerokit.errors import OperationRejected, SetpointStreamStopped
+from aerokit.events import ComputerSlept
 from aerokit.mavlink.enums import CopterMode, MavSeverity
 from aerokit.missions import Mission, waypoint
 from aerokit.position import Position
@@ -199,6 +200,23 @@ async def test_fast_descent_that_brakes_is_no_impact(simulated_vehicle: Callable
         await vehicle.take_off(60.0)
         await vehicle.go_to(vehicle.position.value.offset(up_m=-50.0))
         assert (vehicle.position.value.altitude_relative_m or 60.0) < 13.0
+
+
+async def test_sleep_after_fast_descent_is_no_impact() -> None:
+    """All velocities are then older, so that the last one seems to follow the descent at once."""
+    async with in_the_air(20.0) as flight:
+        flight.copter.faults.silent = True
+        telemetry = flight.vehicle.telemetry
+        detector = ImpactDetector(telemetry)
+        for sink_m_s in [*[0.0] * 5, 4.0, 8.0, 8.0, *[4.0] * 10, *[0.0] * 5]:
+            telemetry.velocity.set(Velocity(0.0, 0.0, sink_m_s), Source(1, 1, "the test"))
+            detector.update()
+            await anyio.sleep(0.1)
+        flight.vehicle.connection.bus.publish(ComputerSlept(now(), 0, 60.0))
+        detector.update()
+        telemetry.velocity.set(Velocity(0.0, 0.0, 0.0), Source(1, 1, "the test"))
+        detector.update()
+        assert not detector.describe()
 
 
 @pytest.mark.parametrize(

@@ -116,6 +116,21 @@ async def test_pilot_arming_after_mode_change_stays_armed(grounded: Flight, capl
     assert "it stays armed, because another party may have armed it" in caplog.text
 
 
+async def test_pilot_arming_after_mode_change_after_cancellation_stays_armed(grounded: Flight) -> None:
+    """The arm command was lost, and the next HEARTBEAT reports both actions of the pilot."""
+    grounded.copter.parameters["DISARM_DELAY"] = 0.0
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.ignore(ARM)
+    with anyio.move_on_after(0.1):
+        await grounded.vehicle.arm()
+    grounded.copter.faults.commands.clear()
+    grounded.copter.set_mode(CopterMode.STABILIZE)
+    assert grounded.copter.arming.arm()
+    await anyio.sleep(ARM_WATCH_S)
+    assert grounded.copter.is_armed
+    assert ordered(grounded) == [1]
+
+
 async def test_pilot_arming_while_computer_slept_stays_armed(grounded: Flight) -> None:
     """The arm command was lost. By the loop's clock, the next HEARTBEAT follows within a second."""
     await grounded.vehicle.set_mode("GUIDED")

@@ -27,7 +27,7 @@ from aerokit.errors import (
     OperationRejected,
     SetpointStreamStopped,
 )
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavVtolState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavSeverity, MavVtolState
 from aerokit.sim import (
     SimulatedCopter,
     SimulatedPlane,
@@ -196,6 +196,14 @@ async def test_orbit_px4_radius_too_large_reports_its_reason() -> None:
     async with hovering(SimulatedPx4(boot_time_s=0.0)) as (vehicle, _):
         with pytest.raises(OperationRejected, match="Orbit radius limit exceeded"):
             await vehicle.orbit(vehicle.position.value, radius_m=500)
+
+
+async def test_later_refusal_text_does_not_end_orbit() -> None:
+    """The text is about something else, such as a mission that another ground station uploads."""
+    simulated = SimulatedPx4(boot_time_s=0.0)
+    async with hovering(simulated) as (vehicle, _):
+        asyncio.get_running_loop().call_later(8.0, simulated.send_text, MavSeverity.WARNING, "Mission rejected")
+        await vehicle.orbit(vehicle.position.value, radius_m=10, speed_m_s=4)
 
 
 async def test_orbit_px4_flying_another_circle_is_held() -> None:

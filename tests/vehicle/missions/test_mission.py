@@ -16,6 +16,7 @@ from aerokit import events
 from aerokit import messages as m
 from aerokit.connection.bus import Subscription
 from aerokit.errors import (
+    AerokitError,
     CommandRejected,
     HeartbeatTimeout,
     InvalidArgument,
@@ -228,6 +229,32 @@ async def test_wait_finished_continues_through_pause() -> None:
         await mission.start(1)  # from another task
         assert not mission._tracker.is_complete
         await mission.wait_finished(timeout=60)
+
+
+async def test_wait_finished_continues_through_pause_at_once_after_resume() -> None:
+    """The pause is ordered in the moment in which the mode is reported, before `resume` returns."""
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission, pauses = flight.vehicle.mission, []
+
+        def pause_at_once(_: Any, mode: Any) -> None:
+            if mode.name == "AUTO":
+                pauses.append(asyncio.create_task(mission.pause()))
+
+        await mission.start()
+        await reaches(flight, 1)
+        await mission.pause()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(mission.wait_finished)
+            await anyio.sleep(1.0)
+            detach = flight.vehicle.mode.observe(pause_at_once)
+            flight.copter.faults.lose(m.Heartbeat, times=1)  # The acknowledgement arrives first.
+            await mission.resume()
+            detach()
+            await pauses[0]
+            await anyio.sleep(30.0)
+            assert flight.vehicle.mode_name == "BRAKE"
+            await mission.resume()
 
 
 async def test_pilot_mode_change_after_refused_pause_ends_wait_finished() -> None:
@@ -486,6 +513,17 @@ async def test_cancelled_start_holds() -> None:
             await flight.vehicle.mission.start()
         await anyio.sleep(2)
         assert CopterMode.BRAKE in flight.wire.mode_orders()
+
+
+async def test_block_left_during_start_holds() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        flight.copter.faults.lose_ack(MavCmd.MISSION_START)
+        start = asyncio.create_task(flight.vehicle.mission.start())
+        await anyio.sleep(0.1)
+    with pytest.raises(AerokitError):
+        await start
+    assert flight.copter.mode.number == CopterMode.BRAKE
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])

@@ -106,6 +106,17 @@ async def test_upload_progress() -> None:
     assert reported[-1].rate > 0
 
 
+@pytest.mark.parametrize("opened", [open_flight, open_px4])
+async def test_transfer_continues_if_progress_callback_raises(opened: Any, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(_: TransferProgress) -> None:
+        raise ZeroDivisionError
+
+    async with opened() as flight:
+        with anyio.fail_after(2.0):
+            await flight.vehicle.mission.upload(long_mission(3), method="items", verify=False, on_progress=fail)
+    assert "on_progress raised an exception; the transfer continues" in caplog.text
+
+
 # ----------------------------------------------------------------------------------------- changes
 
 

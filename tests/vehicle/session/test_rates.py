@@ -9,12 +9,13 @@ import anyio
 import pytest
 from flight_harness import Flight, open_flight, open_px4
 
+import aerokit
 from aerokit import messages as m
 from aerokit.errors import InvalidArgument
 from aerokit.events import StreamSlow, StreamUnavailable
 from aerokit.mavlink.enums import MavCmd, MavDataStream, MavResult
 from aerokit.mavlink.message import Message
-from aerokit.sim import SimulatedCopter
+from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
 
@@ -166,14 +167,14 @@ async def test_answered_timesync_is_requested_immediately_again() -> None:
     """Each unanswered request doubles the pause."""
     async with open_flight(rates={}) as flight, AsyncExitStack() as requests:
         await anyio.sleep(3.0)
-        for times, hz in ((3, 20.0), (1, 50.0)):
+        for times, hz in ((6, 20.0), (2, 50.0)):
             flight.wire.clear()
             flight.copter.faults.ignore(SET_INTERVAL, times=times)
             requests.enter_context(flight.vehicle.rate(m.RawImu, hz))
             await anyio.sleep(40.0)
             at = [when for when, message in flight.wire.sent if isinstance(message, m.CommandLong)]
             gaps = [later - earlier for earlier, later in itertools.pairwise(at)]
-            assert gaps == pytest.approx([3.0, 5.0, 9.0][:times], abs=1.01)
+            assert gaps[:times] == pytest.approx([1.0, 3.0, 1.0, 5.0, 1.0, 9.0][:times], abs=1.01)
 
 
 async def test_rate_refused_before_reboot_is_requested_again() -> None:
@@ -199,7 +200,16 @@ async def test_interval_after_failures_is_bounded() -> None:
         with flight.vehicle.rate(m.RawImu, 20.0):
             flight.vehicle._session.rates._streams[m.RawImu.ID].failures = 1100
             await anyio.sleep(70.0)
-            assert len(asked(flight, m.RawImu)) == 2
+            assert len(asked(flight, m.RawImu)) == 4  # Each request is sent twice.
+
+
+async def test_late_refusal_is_not_taken_for_next_stream() -> None:
+    """At first, no round trip is known, and the answers arrive after the time-out."""
+    async with simulated_link(SimulatedCopter(), latency_s=0.6) as link, aerokit.open_connection(link) as connection:
+        with connection.subscribe(StreamUnavailable, capacity=5) as events:
+            async with aerokit.connect(connection, rates={m.EstimatorStatus: 2.0, m.Attitude: 10.0}):
+                await anyio.sleep(10.0)
+            assert [event.message for event in iter(events.get_nowait, None)] == ["ESTIMATOR_STATUS"]
 
 
 # ------------------------------------------------------------------------------------- events

@@ -12,6 +12,7 @@ import anyio
 import pytest
 from flight_harness import Flight, block_loop, in_the_air, now, open_flight
 
+import aerokit
 from aerokit import messages as m
 from aerokit.connection.bus import Subscription
 from aerokit.connection.cells import Source
@@ -30,7 +31,7 @@ from aerokit.events import (
     VehicleSilent,
 )
 from aerokit.mavlink.enums import CopterMode
-from aerokit.sim import SimulatedCopter
+from aerokit.sim import SimulatedCopter, simulated_link
 
 pytestmark = pytest.mark.anyio
 
@@ -40,6 +41,18 @@ def drained(events: Subscription[Any]) -> list[Event]:
     while (event := events.get_nowait()) is not None:
         found.append(event)
     return found
+
+
+async def test_heartbeat_before_connect_is_as_old_as_received() -> None:
+    copter = SimulatedCopter()
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        await anyio.sleep(5.05)
+        copter.faults.silent = True
+        await anyio.sleep(1.0)
+        async with aerokit.connect(connection) as vehicle:
+            assert vehicle.heartbeat_age == vehicle.armed.age > 1.0
+            await anyio.sleep(3.0)
+            assert vehicle.is_silent
 
 
 # ---------------------------------------------------------------------------- modes and arming

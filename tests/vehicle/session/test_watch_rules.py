@@ -102,7 +102,7 @@ class Watched(Stage):
     def __init__(self) -> None:
         super().__init__()
         self.reported_reboots = 0
-        self.watch = VehicleWatch(self.connection, 1, 1, self._count)
+        self.watch = VehicleWatch(self.connection, 1, 1, self._count, heartbeat_at=self.at)
 
     def _count(self) -> None:
         self.reported_reboots += 1

@@ -21,6 +21,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.enums import MavCmd, MavLandedState, MavSeverity, MavState
 from aerokit.mavlink.messages import Statustext
+from aerokit.vehicle.commanding.arbiter import STEERING
 from aerokit.vehicle.commanding.context import VehicleBase
 from aerokit.vehicle.commanding.health import PREARM_REPORT_INTERVAL_S
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, ChangeSignal, await_progress
@@ -93,7 +94,7 @@ class ArmingActions(VehicleBase):
             # Shortly before the time-out, ask the vehicle once for the reasons, so that the error can contain them.
             ask_at = self.connection.now() + timeout - REASONS_TIMEOUT_S
             while self._health.missing_for_flight():
-                self.connection.raise_if_ended()
+                self._session.end.raise_if_ended()
                 if self.connection.now() >= ask_at:
                     ask_at = math.inf
                     await self._health.request_reasons(self.connection.now() - PREARM_REPORT_INTERVAL_S)
@@ -166,7 +167,7 @@ class ArmingActions(VehicleBase):
         self._arm_cleanup.stop()
         if reason:
             logger.info("arming vehicle %d: %s", self.system_id, reason)
-            self.connection.send(Statustext(severity=MavSeverity.INFO, text=reason, id=0, chunk_seq=0))
+            self._session.send(Statustext(severity=MavSeverity.INFO, text=reason, id=0, chunk_seq=0))
         started = self.connection.now()
         try:
             may_change_mode = mode is None
@@ -180,13 +181,20 @@ class ArmingActions(VehicleBase):
     ) -> None:
         """Arm in the present mode. If a parameter may forbid this, change the mode after a refusal, and arm then."""
         began_at = self.connection.now()
+        order_before, arm_commands_before = self._arbiter.latest(STEERING), self._arbiter.arm_commands_sent
         try:
             await self._arm_in_present_mode(force, timeout, max_silence_s)
         except CommandRejected:
             has_computer_slept = self._arbiter.slept_since(began_at) > 0
+            # Another task may have ordered something else since, above all to disarm.
+            is_newest_order = (
+                self._arbiter.latest(STEERING) is order_before
+                and self._arbiter.arm_commands_sent == arm_commands_before + 1
+            )
             may_retry_in_other_mode = (
                 may_change_mode
                 and not has_computer_slept
+                and is_newest_order
                 # A set-point stream needs the mode that it has set, and the mode of an armed vehicle belongs to
                 # whoever has armed it.
                 and self._flight_cleanup.stop_stream is None
@@ -205,7 +213,7 @@ class ArmingActions(VehicleBase):
         After any error but a refusal, `ArmCleanup` watches whether the vehicle arms late, and disarms it.
         """
         started, was_armed = self.connection.now(), self.telemetry.is_armed
-        with self._arbiter.auxiliary_order() as order:
+        with self._arbiter.auxiliary_order() as order, self._arm_cleanup.arming(order, was_armed):
             try:
                 await self._sender.send_arm(order, armed=True, force=force)
                 await self._await_armed(
@@ -381,7 +389,7 @@ class ArmingActions(VehicleBase):
         started = self.connection.now()
         next_request_at = started
         while self._session.watch.reboots == reboots_before:
-            self.connection.raise_if_ended()
+            self._session.end.raise_if_ended()
             now = self.connection.now()
             if now >= next_request_at:
                 self._session.link_watch.request_time()

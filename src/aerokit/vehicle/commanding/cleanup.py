@@ -128,7 +128,9 @@ class FlightCleanup:
     async def hold(self) -> None:
         """Order the vehicle to hold, see :meth:`aerokit.Vehicle.hold`."""
         mode = self._sender.mode_for("hold", "hold")
-        await self.stop_in(mode, self._arbiter.order(mode))
+        order = self._arbiter.order(mode)
+        with self.flying(order):
+            await self.stop_in(mode, order)
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
         """Order the vehicle to hold, even if it already is in the hold mode.
@@ -173,7 +175,7 @@ class FlightCleanup:
             return False
         session = self._session
         mode = session.autopilot.mode_for("hold", is_vtol=session.telemetry.is_vtol)
-        if mode is None or not session.connection.is_open:  # A hold cannot be sent.
+        if mode is None or session.end.error is not None:  # A hold cannot be sent, or another vehicle object may fly.
             return False
         if session.telemetry.is_confirmed_disarmed or order.end:  # A hold must not be sent.
             return False
@@ -236,7 +238,7 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Register the order that a call awaits, so that `end_flights` can hold the vehicle meanwhile.
+        """Register the order that a call gives and awaits, so that `end_flights` can hold the vehicle meanwhile.
 
         If the vehicle hits the ground, this block orders the hold itself, because the target of the order may still be
         in the air.
@@ -272,7 +274,8 @@ class FlightCleanup:
         self.check_no_stream()
         order = self._arbiter.order(mode)
         try:
-            yield order
+            with self.flying(order):
+                yield order
             self._sender.raise_if_ended(order)
             if not self._arbiter.is_state_recent:
                 raise HeartbeatTimeout(
@@ -313,6 +316,18 @@ class ArmCleanup:
         self._task = BackgroundTask(
             session, "aerokit late arming", warning_clause="while an arm command may still be executed"
         )
+        # The arm order that a call awaits in `arming`, and whether the vehicle was armed before it.
+        self._awaited: tuple[Order, bool] | None = None
+
+    @contextmanager
+    def arming(self, order: Order, was_armed: bool) -> Iterator[None]:
+        """Register the order that a call awaits, so that `finish` watches it if the vehicle's block ends meanwhile."""
+        self._awaited = order, was_armed
+        try:
+            yield
+        finally:
+            if self._awaited == (order, was_armed):
+                self._awaited = None
 
     def hint(self) -> str:
         """Return the hint for error texts that an arm command may still be executed."""
@@ -325,19 +340,19 @@ class ArmCleanup:
         if not self._is_newest_arm_command(order):
             return
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
-        self._task.start(partial(self._watch_arming, order, was_armed))
+        self._task.start(partial(self._watch_arming, order, was_armed, self._session.telemetry.mode.latest))
 
     def _is_newest_arm_command(self, order: Order) -> bool:
         """Return True if the order's command was sent, and the program has sent no arm or disarm command since."""
         return order.arm_command == self._arbiter.arm_commands_sent
 
-    async def _watch_arming(self, order: Order, was_armed: bool) -> None:
+    async def _watch_arming(self, order: Order, was_armed: bool, mode: Mode | None) -> None:
         """Disarm the vehicle if the abandoned order arms it within `ARM_WATCH_S`."""
         has_armed = False
         with anyio.move_on_after(ARM_WATCH_S):
             has_armed = await self._wait_until_armed(was_armed)
         if has_armed:
-            await self._undo_late_arming(order)
+            await self._undo_late_arming(order, mode)
 
     async def _wait_until_armed(self, was_armed: bool) -> bool:
         """Return True once the vehicle arms; False if the link ends first.
@@ -354,9 +369,9 @@ class ArmCleanup:
             return False
         return True
 
-    async def _undo_late_arming(self, order: Order) -> None:
+    async def _undo_late_arming(self, order: Order, mode: Mode | None) -> None:
         """Disarm the vehicle, which has armed after its arm order was abandoned, unless another party armed it."""
-        was_armed_by_order = await self._was_armed_by(order)
+        was_armed_by_order = await self._was_armed_by(order, mode)
         if not self._is_newest_arm_command(order) or self._session.telemetry.is_confirmed_disarmed:
             return
         if not was_armed_by_order:
@@ -373,19 +388,21 @@ class ArmCleanup:
             except AerokitError as error:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 
-    async def _was_armed_by(self, order: Order) -> bool:
+    async def _was_armed_by(self, order: Order, mode: Mode | None) -> bool:
         """Return True if this order, and not a pilot, has armed the vehicle. Called when HEARTBEAT has reported armed.
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
         acknowledgement, the order armed it if a HEARTBEAT within `ARM_HEARTBEAT_DELAY_S` reports armed and the order
-        has not ended.
+        has not ended. ``mode`` is the mode in which the order was abandoned, because an abandoned order does not notice
+        a change of the mode.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
         # While the computer slept, another party had time to arm the vehicle.
         if self._arbiter.slept_since(order.given_at) > 0:
             return False
-        if not order.end and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
+        has_ended = bool(order.end) or self._session.telemetry.mode.latest != mode
+        if not has_ended and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)
@@ -404,6 +421,8 @@ class ArmCleanup:
     async def finish(self) -> None:
         """At the end of the vehicle's `async with` block, wait briefly for the outcome of a cancelled arm order.
 
-        Log a warning if the outcome stays unknown.
+        Log a warning if the outcome stays unknown. An arm order that another task still awaits counts as cancelled.
         """
+        if self._awaited is not None:
+            self.watch(*self._awaited)
         await self._task.finish(ARM_CLOSE_TIMEOUT_S)

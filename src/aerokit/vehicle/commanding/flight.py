@@ -99,8 +99,8 @@ class FlightActions(VehicleBase):
         )
         order = self._arbiter.order(*(mode for mode in modes if mode is not None))
         try:
-            await self._begin_take_off(plan, order)
             with self._flight_cleanup.flying(order):
+                await self._begin_take_off(plan, order)
                 await self._await_altitude(altitude_m, timeout, max_silence_s, order)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the command, so it is ordered to hold.

@@ -86,6 +86,9 @@ class ImpactDetector:
         velocity = cell.latest
         if velocity is None or cell.updated_at == self._updated_at:
             return
+        if cell.updated_at < self._updated_at:  # The computer slept: the velocity is older now, and not a new one.
+            self._updated_at, self._sank_fast_at = cell.updated_at, -math.inf
+            return
         # An impact may be shorter than the interval between two received velocities. It then shows in two consecutive
         # velocities, so these are compared even if the interval is long.
         interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)

@@ -69,6 +69,8 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
     check_range("rate_hz", rate_hz, 0, 1000, above=True)
     tasks = BackgroundTasks(session.connection.fail)
     with ExitStack() as cleanup:
+        # Otherwise, the next request would fail, and end the connection of other vehicles, too.
+        cleanup.callback(session.end.on_end(lambda _: tasks.cancel()))
         if session.autopilot.stream_groups:
             monitor = _StreamMonitor(session, cleanup)
             tasks.start(lambda: _request_repeatedly(session, rate_hz, monitor), "aerokit streams")

@@ -69,7 +69,7 @@ async def await_progress(
         HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds (None: silence is ignored).
         OperationTimeout: ``timeout`` seconds have passed, or ``stall_reason()`` reports that the vehicle does not move;
             the error text includes ``describe()``.
-        ConnectionClosed, LinkLost: the connection ended.
+        ConnectionClosed, LinkLost: the connection or the vehicle's `async with` block ended.
     """
     started = session.connection.now()
     telemetry = session.telemetry
@@ -80,7 +80,7 @@ async def await_progress(
     with ChangeSignal(session, *cells) as changes:
         while True:
             now = session.connection.now()
-            session.connection.raise_if_ended()
+            session.end.raise_if_ended()
             if not is_done():
                 done_since = None
             elif done_since is None:
@@ -116,7 +116,7 @@ def _height_when_disarmed(session: VehicleSession) -> str:
 
 
 class ChangeSignal:
-    """Wakes a waiter when any of these cells changes, or the connection ends."""
+    """Wakes a waiter when any of these cells changes, or the session ends."""
 
     def __init__(self, session: VehicleSession, *cells: StateCell[Any], every_arrival: bool = False) -> None:
         self._session, self._cells, self._every_arrival = session, cells, every_arrival
@@ -126,7 +126,7 @@ class ChangeSignal:
     def __enter__(self) -> Self:
         wake = self._changed.set
         detach_cells = [cell.observe(lambda *_: wake(), every_arrival=self._every_arrival) for cell in self._cells]
-        self._detach_callbacks = [*detach_cells, self._session.connection.on_end(lambda _: wake())]
+        self._detach_callbacks = [*detach_cells, self._session.end.on_end(lambda _: wake())]
         return self
 
     def __exit__(self, *_: object) -> None:

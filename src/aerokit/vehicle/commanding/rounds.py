@@ -30,7 +30,8 @@ SETPOINT_INTERVAL_S, SETPOINT_RATE_HZ, VALID_FOR_S = 0.1, 20.0, 1.0
 RADIUS_ERROR_M, CIRCLE_REPORT_S = 0.5, 2.0
 """Deviation in metres from which a reported radius counts as wrong.
 
-For CIRCLE_REPORT_S seconds after the command, PX4 may still report the previous circle.
+For CIRCLE_REPORT_S seconds after the command, PX4 may still report the previous circle, or send a text that refuses
+the ordered one.
 """
 LAG_ROUNDS = 0.02
 """Fraction of a round by which the count may lag although the vehicle is at the end of its path."""
@@ -103,14 +104,15 @@ class RoundFlight:
         hold_mode = context.sender.mode_for(self._operation, "hold")
         order = context.arbiter.order(mode, hold_mode)
         try:
-            with context.arbiter.changing_mode():
-                send = self._session.commands.send_int
-                await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
-            with cleanup.flying(order), self._session.streaming("position"):
-                await self._await_rounds(order, mode, stay_s, radius_m)
-            if holds_at_end:
-                await cleanup.stop_in(hold_mode, order)
-            elif radius_m:
+            with cleanup.flying(order):
+                with context.arbiter.changing_mode():
+                    send = self._session.commands.send_int
+                    await context.sender.run_command(order, send, command, *params, modes=(mode,), **self._place)
+                with self._session.streaming("position"):
+                    await self._await_rounds(order, mode, stay_s, radius_m)
+                if holds_at_end:
+                    await cleanup.stop_in(hold_mode, order)
+            if radius_m and not holds_at_end:
                 context.vehicle_position.record_circle(radius_m)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):  # also CommandTimeout and HeartbeatTimeout
             # The vehicle may have received the command, so it is ordered to hold.
@@ -142,7 +144,13 @@ class RoundFlight:
             """Return why the rounds cannot succeed: the mode, a status text that refuses them, or a wrong radius."""
             if reason := mode_failure():
                 return reason
-            refusals = filter(session.autopilot.is_refusal, session.texts_since(order.given_at))
+            texts = session.telemetry.texts_since(order.given_at)
+            refusals = (
+                text.text
+                for text in texts
+                # A later refusal is about something else, e.g. a mission that another ground station uploads.
+                if text.at <= started + CIRCLE_REPORT_S and session.autopilot.is_refusal(text.text)
+            )
             # For a moment, PX4 may still report the previous circle.
             is_radius_reported = session.connection.now() > started + CIRCLE_REPORT_S
             # `fly_by_command` orders the vehicle to hold if there is a problem.

@@ -177,10 +177,12 @@ class ValueStream(Generic[ValueT]):
     def _stop(self, reason: str, *, hold: bool = True) -> None:
         """Stop the stream for this reason; with ``hold``, order the vehicle to hold."""
         self._end()
+        is_state_recent = self._context.arbiter.is_state_recent
+        hold_text = "a hold was ordered" if is_state_recent else "a hold will be ordered after the next HEARTBEAT"
         is_hold_ordered = hold and self._hold()
         self._release()
         self._stop_error = SetpointStreamStopped(
-            f"the {self._NAME} has stopped: {reason}" + ("; a hold was ordered" if is_hold_ordered else "")
+            f"the {self._NAME} has stopped: {reason}" + (f"; {hold_text}" if is_hold_ordered else "")
         )
 
     def _hold(self) -> bool:
@@ -297,7 +299,8 @@ class SteeringStream(ValueStream[ValueT]):
             cleanup, hold_mode = self._context.flight_cleanup, self._context.sender.mode_for("hold", "hold")
             order = self._context.arbiter.order(hold_mode)
             try:
-                await cleanup.stop_in(hold_mode, order)
+                with cleanup.flying(order):
+                    await cleanup.stop_in(hold_mode, order)
             except (anyio.get_cancelled_exc_class(), OperationTimeout):
                 # The order to hold may have been lost. CommandTimeout and HeartbeatTimeout are OperationTimeouts, too.
                 cleanup.hold_in_background(order)

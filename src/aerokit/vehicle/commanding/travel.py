@@ -121,17 +121,17 @@ class TravelActions(VehicleBase):
         yaw = self._reposition_yaw(heading_deg)
         is_incomplete = False  # True once the vehicle has accepted the target, until the speed and the heading are set.
         try:
-            unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
-            is_incomplete = True
-            if speed_m_s is not None and not self._speeds_by_reposition:
-                # ArduPilot applies the speed only once the vehicle is on its way.
-                change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
-                await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, *change)
-            # On this autopilot, MAV_CMD_DO_REPOSITION does not set the heading.
-            if heading_deg is not None and math.isnan(yaw):
-                await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
-            is_incomplete = False
             with self._flight_cleanup.flying(order):
+                unacknowledged_target = await self._send_target(order, place, yaw, speed_m_s)
+                is_incomplete = True
+                if speed_m_s is not None and not self._speeds_by_reposition:
+                    # ArduPilot applies the speed only once the vehicle is on its way.
+                    change = (SpeedType.GROUNDSPEED, speed_m_s, KEEP_THROTTLE)
+                    await self._sender.send_long(order, MavCmd.DO_CHANGE_SPEED, *change)
+                # On this autopilot, MAV_CMD_DO_REPOSITION does not set the heading.
+                if heading_deg is not None and math.isnan(yaw):
+                    await self._sender.send_long(order, MavCmd.CONDITION_YAW, heading_deg % 360)
+                is_incomplete = False
                 await self._await_arrival(
                     target,
                     arrival_radius_m,

@@ -90,6 +90,7 @@ class TuningActions(VehicleBase):
 
     async def _poll(self, answers: list[CommandAck]) -> CommandAck:
         """Poll PX4 by sending the command once; return the answer. ``answers`` collects all received COMMAND_ACKs."""
+        self._session.end.raise_if_ended()
         answers.clear()
         self._session.commands.send_unconfirmed(MavCmd.DO_AUTOTUNE_ENABLE, 1)
         until = self.connection.now() + ANSWER_TIMEOUT_S

@@ -55,6 +55,7 @@ class ComponentSession:
             self.rates,
             register_cell=session.register_cell,
             at_close=session.at_close,
+            end=session.end,
         )
         version: StateCell[AutopilotVersion] = session.connection.new_cell(
             "version", f"AUTOPILOT_VERSION of component {component_id}"
@@ -96,7 +97,7 @@ class ComponentSession:
         return f"{prefix}last heartbeat of component {self.component_id} {age:.1f} s ago"
 
     def _close(self) -> None:
-        self.transfers.is_closed = True
+        self.transfers.close()
         self.rates.close()
 
 

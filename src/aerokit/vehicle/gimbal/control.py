@@ -203,12 +203,12 @@ class GimbalControl:
             OperationRejected: the block ended.
             ConnectionClosed, LinkLost: the connection ended.
         """
-        detach = self._session.connection.on_end(lambda _: self._lost.set())  # Stop waiting when the connection ends.
+        detach = self._session.end.on_end(lambda _: self._lost.set())  # Stop waiting when the session ends.
         try:
             await self._lost.wait()
         finally:
             detach()
-        self._session.connection.raise_if_ended()
+        self._session.end.raise_if_ended()
         if self._taken is None:
             raise OperationRejected(f"{self._orders.name}: the block that had control has ended")
         self._was_loss_raised = True

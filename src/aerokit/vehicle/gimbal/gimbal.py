@@ -336,7 +336,7 @@ class Gimbals:
                     attempts=2,
                 )
         await anyio.sleep(max(0.0, deadline - session.connection.now()))
-        session.connection.raise_if_ended()
+        session.end.raise_if_ended()
         return self.ids
 
     def __getitem__(self, device_id: int) -> Gimbal:

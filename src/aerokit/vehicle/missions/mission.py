@@ -295,8 +295,9 @@ class MissionControl(VehiclePlan["Mission"]):
         self._is_paused = False
         self._tracker.start()
         try:
-            await self._set_current(item, timeout, order, keeps_jump_counts=False)
-            await self._enter_mode(mode, order, timeout)
+            with vehicle_context.flight_cleanup.flying(order):
+                await self._set_current(item, timeout, order, keeps_jump_counts=False)
+                await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
@@ -338,12 +339,14 @@ class MissionControl(VehiclePlan["Mission"]):
         self._order = order
         self._tracker.start()
         try:
-            await self._enter_mode(mode, order, timeout)
+            with vehicle_context.flight_cleanup.flying(order):
+                await self._enter_mode(mode, order, timeout)
         except (anyio.get_cancelled_exc_class(), OperationTimeout):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
             raise
-        self._is_paused = False
+        if self._order is order:  # Otherwise, another task has paused the mission again.
+            self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
         """Wait until the mission has been flown to its end, including a landing at its end.

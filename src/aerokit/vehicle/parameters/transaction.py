@@ -58,6 +58,7 @@ class _Block:
         self._registry, self._access, self._writer = registry, access, writer
         self._idle_timeout_s = idle_timeout_s
         self._saved: dict[str, Parameter] = {}  # parameters before their first write in this block
+        self._has_ended = False
 
     async def _write(self, values: Mapping[str, float]) -> dict[str, ParameterWrite]:
         return await self._writer.write(values, resolve=self._resolve_and_save, idle_timeout_s=self._idle_timeout_s)
@@ -75,6 +76,8 @@ class _Block:
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
         unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
         answers = await self._access.read(unread_names, idle_timeout_s)
+        if self._has_ended:  # A write by another task must not outlive the block, because nothing would restore it.
+            raise InvalidArgument("the block of these parameters has ended; the rest was not set")
         current: dict[str, Parameter] = {}
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
@@ -98,6 +101,7 @@ class _Block:
         If an overlapping block has written a parameter later, that block restores it, to the value from before this
         block.
         """
+        self._has_ended = True
         to_restore = []
         for name, saved in self._saved.items():
             later_block = self._registry.remove(name, self)
@@ -108,6 +112,7 @@ class _Block:
         return to_restore
 
     def _discard(self) -> None:
+        self._has_ended = True
         for name in self._saved:
             self._registry.remove(name, self)
 

@@ -234,7 +234,8 @@ class MessageRates:
                 stream.message_type.ID,
                 interval_us,
                 component_id=self._component_id,
-                attempts=1,
+                # With one attempt, a late refusal of another message would count as the answer to this request.
+                attempts=2,
             )
         except CommandRejected as error:
             if error.result == MavResult.UNSUPPORTED:

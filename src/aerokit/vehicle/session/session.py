@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.autopilots import autopilot_for
+from aerokit.connection.bus import EndSignal
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import (
@@ -132,6 +133,8 @@ class VehicleSession:
         self.component_id: int = component_id
         self.vehicle_type: int = heartbeat.type
         self.autopilot: Autopilot = autopilot_for(heartbeat)
+        self.end: EndSignal = EndSignal()
+        """Signals the end of the connection, or of the vehicle's `async with` block."""
         self.telemetry: Telemetry = Telemetry(
             connection.now, system_id=system_id, component_id=component_id, autopilot=self.autopilot
         )
@@ -148,9 +151,17 @@ class VehicleSession:
             connection, self.commands, system_id, component_id, self.autopilot.stream_groups
         )
         self.subscriber: ComponentSubscriber = ComponentSubscriber(
-            connection, system_id, component_id, self.rates, register_cell=self.register_cell, at_close=self.at_close
+            connection,
+            system_id,
+            component_id,
+            self.rates,
+            register_cell=self.register_cell,
+            at_close=self.at_close,
+            end=self.end,
         )
-        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._on_reboot)
+        frame = heartbeat.received_frame
+        heartbeat_at = connection.now() if frame is None else frame.received_at
+        self.watch: VehicleWatch = VehicleWatch(connection, system_id, component_id, self._on_reboot, heartbeat_at)
         self.link_watch: LinkWatch = LinkWatch(
             connection, system_id, component_id, self._on_link_report, self.watch.on_time_answer
         )
@@ -170,8 +181,6 @@ class VehicleSession:
         # Cells that are not part of the telemetry.
         self._cells: list[StateCell[Any]] = [self.link_quality]
         self._detach_callbacks: list[Detach] = []
-        # The error that ended the session; None while it runs.
-        self._ended_by: Exception | None = None
         self.on_reboot: list[Callable[[], None]] = [
             self.rates.request_again,
             self.commands.forget_results,
@@ -195,7 +204,7 @@ class VehicleSession:
     def close(self) -> None:
         """Stop sending and receiving; waiting calls raise ConnectionClosed."""
         self.is_closed = True
-        self.transfers.is_closed = True
+        self.transfers.close()
         self._on_end(ConnectionClosed("the async with block of this vehicle was left"))
         for detach in self._detach_callbacks:
             detach()
@@ -216,8 +225,8 @@ class VehicleSession:
         self._cells.append(cell)
         self.add_timeout_hint(cell)
         self.on_reboot.append(cell.forget)
-        if self._ended_by is not None:
-            cell.close(self._ended_by)
+        if self.end.error is not None:
+            cell.close(self.end.error)
 
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
         """Make time-out errors of these state cells mention rejected signatures, which are a likely cause."""
@@ -425,6 +434,8 @@ class VehicleSession:
         self.background.cancel()
         self.watch.end(error)
         self.telemetry.close(error)
-        self._ended_by = error
         for cell in self._cells:
             cell.close(error)
+        if self.end.error is None:
+            self.end.error = error
+            self.end.notify(error)

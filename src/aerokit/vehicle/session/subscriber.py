@@ -18,7 +18,7 @@ from aerokit.vehicle.state.states import DEFAULT_RATES_HZ
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.connection.bus import Detach, Sink
+    from aerokit.connection.bus import Detach, EndSignal, Sink
     from aerokit.connection.connection import Connection
     from aerokit.events import Event
     from aerokit.vehicle.session.rates import MessageRates
@@ -41,8 +41,8 @@ MessageT = TypeVar("MessageT", bound=Message)
 class ComponentSubscriber:
     """Subscriptions to the messages of one component, and cells with its latest messages.
 
-    ``register_cell`` and ``at_close`` are methods of the session: ``register_cell`` adds a cell to the session, and
-    ``at_close`` registers a callback for the end of the session.
+    ``register_cell``, ``at_close`` and ``end`` are those of the session: ``register_cell`` adds a cell to the session,
+    ``at_close`` registers a callback for the end of the session, and ``end`` ends the subscriptions.
     """
 
     def __init__(
@@ -54,6 +54,7 @@ class ComponentSubscriber:
         *,
         register_cell: Callable[[StateCell[Any]], None],
         at_close: Callable[[Detach], None],
+        end: EndSignal,
     ) -> None:
         self._connection = connection
         self._rates = rates
@@ -61,6 +62,7 @@ class ComponentSubscriber:
         self._component_id = component_id
         self._register_cell = register_cell
         self._at_close = at_close
+        self._end = end
         # The cell with the latest message of each type, and the function that releases the request for its rate.
         self._cells: dict[type[Message], StateCell[Any]] = {}
         self._rate_releases: dict[type[Message], Detach] = {}
@@ -88,7 +90,7 @@ class ComponentSubscriber:
             """Attach the sink and request the rates, when the `with` block of the subscription is entered."""
             filtered_sink = sink if entire_system else self._of_component(sink)
             detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)
-            detach_callbacks.append(self._connection.on_end(subscription.close))  # `subscription` is assigned below.
+            detach_callbacks.append(self._end.on_end(subscription.close))  # `subscription` is assigned below.
             for message_type in message_types:
                 hz = subscription_rate_hz(message_type) if rate_hz is None else rate_hz
                 if hz is not None:

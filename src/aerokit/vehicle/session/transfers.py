@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -9,7 +10,7 @@ import anyio
 
 from aerokit.connection.exchanges import run_exchange
 from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, ConnectionClosed, OperationTimeout
-from aerokit.protocols.exchange import RoundTrip
+from aerokit.protocols.exchange import RoundTrip, Transfer, TransferProgress
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
     from aerokit.connection.cells import StateCell
     from aerokit.connection.connection import Connection
     from aerokit.connection.tasks import BackgroundTasks
-    from aerokit.protocols.exchange import Exchange
+    from aerokit.protocols.exchange import Exchange, OnProgress
+
+logger: logging.Logger = logging.getLogger("aerokit")
 
 ResultT = TypeVar("ResultT")
 
@@ -41,6 +44,18 @@ class Messaging(Protocol):
 
     def at_close(self, *functions: Detach) -> None:
         """Register callbacks for the end of the vehicle's `async with` block."""
+
+
+def _without_errors(on_progress: OnProgress) -> OnProgress:
+    """Return a callback that logs errors of ``on_progress``, so that the transfer continues."""
+
+    def report(progress: TransferProgress) -> None:
+        try:
+            on_progress(progress)
+        except Exception:
+            logger.exception("on_progress raised an exception; the transfer continues")
+
+    return report
 
 
 class Transfers:
@@ -73,6 +88,8 @@ class Transfers:
         self.round_trip: RoundTrip = RoundTrip()
         """Round-trip time: measured by TIMESYNC at first, and by transfers from the first one on."""
         self.is_closed: bool = False
+        # Cancels each running exchange.
+        self._scopes: set[anyio.CancelScope] = set()
         # True once a component has not answered the request for its version.
         self._is_version_unavailable = False
         self._send_command = send_command
@@ -82,6 +99,12 @@ class Transfers:
         self._describe = describe
         self._round_trip_s = round_trip_s
 
+    def close(self) -> None:
+        """End all exchanges: they raise ConnectionClosed, as do later ones."""
+        self.is_closed = True
+        for scope in tuple(self._scopes):
+            scope.cancel()
+
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
 
@@ -90,18 +113,24 @@ class Transfers:
         """
         if self.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
-        with self.limit(timeout):
+        with self.limit(timeout), anyio.CancelScope() as scope:
             self._init_round_trip()
+            if isinstance(exchange, Transfer) and exchange.on_progress is not None:
+                exchange.on_progress = _without_errors(exchange.on_progress)
+            self._scopes.add(scope)
             try:
                 result = await run_exchange(self.connection, self.system_id, exchange)
             except OperationTimeout as error:
                 self._explain(error)
                 raise
+            finally:
+                self._scopes.remove(scope)
             if isinstance(result, dict):  # A request for several names returns one value or exception for each name.
                 for answer in result.values():
                     if isinstance(answer, OperationTimeout):
                         self._explain(answer)
             return result
+        raise ConnectionClosed("the async with block of this vehicle was left before the operation was done")
 
     def _explain(self, error: OperationTimeout) -> None:
         error.args = (f"{error}; {self._describe()}",)

@@ -58,6 +58,7 @@ class VehicleWatch:
         system_id: int,
         component_id: int,
         on_reboot: Callable[[], None],
+        heartbeat_at: float,
     ) -> None:
         self._connection = connection
         self._system_id = system_id
@@ -65,13 +66,14 @@ class VehicleWatch:
         self._now = connection.now
         self._on_reboot = on_reboot
         # Times at which the last HEARTBEAT arrived, and at which it was processed.
-        self.last_heartbeat_at: float = connection.now()
-        self._heartbeat_read_at = connection.now()
+        # The vehicle may have been found by a HEARTBEAT that the connection has processed some time ago.
+        self.last_heartbeat_at: float = heartbeat_at
+        self._heartbeat_read_at = max(self.last_heartbeat_at, connection.now() - SILENT_AFTER_S)
         self.link_state: StateCell[LinkState] = StateCell("link_state", connection.now, "HEARTBEAT")
         self._state_tracker = LinkStateTracker(
             self.link_state, connection.bus, system_id=system_id, component_id=component_id
         )
-        self._state_tracker.record_activity(connection.now())
+        self._state_tracker.record_activity(self.last_heartbeat_at)
         # True from `VehicleSilent` to `VehicleRecovered`.
         self._is_reported_silent = False
         self._has_ended = False
