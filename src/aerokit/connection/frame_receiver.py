@@ -133,8 +133,8 @@ BLOCKING_CODE_HINT = (
 class FrameReceiver:
     """Checks the framing, signature and route of received frames, with one framer for each peer.
 
-    Accepted frames go to ``bus``, then to the observers. ``multilink`` is ``routes`` if there are several links,
-    otherwise None. ``clock`` is the clock of the event loop.
+    Accepted frames go to ``bus``, then to the observers. With several links, the same object is passed as ``routes``
+    and as ``multilink``; with one link, ``multilink`` is None. ``clock`` is the clock of the event loop.
     """
 
     def __init__(

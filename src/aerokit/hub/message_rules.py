@@ -216,7 +216,7 @@ class TargetFields:
                 self.offsets.update(dict.fromkeys(message_ids, (HEADER_LENGTH + system, component_offset)))
 
     def look_up(self, message_id: int) -> FieldOffsets | None:
-        """Return the offsets of a message; None if it has no target, or is not in the dialect."""
+        """Return the offsets of a message's target ids; None if it has none, or is not in the dialect."""
         if message_id not in self._dialect.rows:
             return None  # An unknown id is not stored, because noise may contain millions of ids.
         offsets = self.offsets[message_id] = _field_offsets(self._dialect[message_id])

@@ -168,7 +168,7 @@ class ArduPilotMessageRequests:
         return f"MAV{self._vehicle.channels.index(channel) + 1}_"
 
     def restart(self) -> None:
-        """Restore the stream rates that REQUEST_DATA_STREAM has changed, because of a reboot."""
+        """After a reboot of the vehicle, restore the stream rates that REQUEST_DATA_STREAM has changed."""
         parameters = self._vehicle.parameters
         for name, (value_after_reboot, requested) in self._changed_rates.items():
             if parameters[name] == requested:  # False if PARAM_SET has set another value, which is kept.

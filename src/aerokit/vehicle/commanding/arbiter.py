@@ -125,10 +125,10 @@ class CommandArbiter:
     def order(
         self, *modes: Mode, subjects: Collection[Subject] = ("mode", "motion"), ends_flight: bool = False
     ) -> Order:
-        """Create a steering order. ``modes`` are the modes that the vehicle may enter because of it.
+        """Create a steering order, which may make the vehicle enter ``modes``.
 
-        The new order supersedes the previous steering order, and the posted orders about these subjects (orders that
-        the program does not wait for). With ``ends_flight``, a failsafe does not end the order.
+        It supersedes the previous steering order, and the posted orders about ``subjects``: orders for which the program
+        does not wait. With ``ends_flight``, a failsafe does not end the order.
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)

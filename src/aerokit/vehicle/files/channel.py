@@ -45,9 +45,10 @@ class RemoteFile(NamedTuple):
 def _limit(
     description: str, timeout: float | None, missing: Callable[[], tuple[tuple[int, int], ...]]
 ) -> Iterator[None]:
-    """Raise FileTimeout, with the ranges that ``missing()`` returns, if a block takes more than ``timeout`` seconds.
+    """Raise FileTimeout if the body of the `with` statement takes more than ``timeout`` seconds.
 
-    A TimeoutError of the block, such as one of the disk, is not changed.
+    The error has the missing ranges of the file, which ``missing()`` returns. A TimeoutError that the body itself
+    raises, for example because of the disk, is not changed.
     """
     with anyio.move_on_after(timeout) as scope:
         yield

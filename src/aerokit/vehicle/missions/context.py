@@ -103,7 +103,7 @@ class PlanContext:
 
     @property
     def is_flying_mission(self) -> bool:
-        """True while the vehicle is in its mission mode and may be armed."""
+        """True while the vehicle is in its mission mode, unless it is known to be disarmed."""
         return self.tracker.is_in_mission_mode and not self.session.telemetry.is_confirmed_disarmed
 
     def plan_id(self, mission_type: int, since: float) -> int:

@@ -82,9 +82,9 @@ class _Block:
         for name, answer in (answers | fresh).items():
             if not isinstance(answer, Parameter):
                 raise answer
-            # The answer may be a float that lacks the last bits of the store's value. If the store's value differs by
-            # more, it is wrong: another station has just undone our last write, and the store took its message for a
-            # delayed one.
+            # The store's value is used if it equals the answer up to rounding, because the answer may lack the last
+            # bits of a float. Otherwise the store is out of date: another station has just undone our write, and the
+            # store ignored the vehicle's message about it as a delayed one.
             known = self._access.store.get(name) or answer
             current[name] = known if same_value(float(known.value), float(answer.value)) else answer
             if name not in self._saved:
