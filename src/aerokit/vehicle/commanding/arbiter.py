@@ -127,8 +127,8 @@ class CommandArbiter:
     ) -> Order:
         """Create a steering order, which may make the vehicle enter ``modes``.
 
-        It supersedes the previous steering order, and the posted orders about ``subjects``: orders for which the program
-        does not wait. With ``ends_flight``, a failsafe does not end the order.
+        It supersedes the previous steering order, and the posted orders about ``subjects``: orders for which the
+        program does not wait. With ``ends_flight``, a failsafe does not end the order.
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
