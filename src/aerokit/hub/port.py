@@ -119,7 +119,10 @@ class FrameQueue:
 
 
 def _to_mavlink2(frame: Frame, crc_extra: bytes, *, flags: int) -> bytes:
-    """Return the frame as an unsigned MAVLink 2 frame with these incompatibility flags, and a new checksum."""
+    """Return the frame as MAVLink 2 with these incompatibility flags and a new checksum.
+
+    With the flag SIGNED, the caller must append the signature.
+    """
     # MAVLink 2 truncates trailing zeros, but keeps at least one byte. MAVLink 1 does not truncate.
     payload = frame.payload.rstrip(b"\0") or frame.payload[:1]
     body = bytes((len(payload), flags)) + frame.body[2:HEADER_LENGTH] + payload
@@ -187,8 +190,8 @@ class EndpointCounters:
 class Port:
     """One peer of one endpoint.
 
-    While the link accepts data, frames are collected in ``batch`` until the end of the loop iteration. While more than
-    ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. `UNLIMITED` turns this check off.
+    While the link accepts data, frames are collected in ``batch``, and `Switch` writes them. While more than
+    ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. With `UNLIMITED`, they never wait.
 
     ``endpoint`` is the endpoint's name. ``period(message_id)`` is the minimum interval in seconds of a message, see
     `Filters.period`. ``report(kind, text)`` publishes an event of the endpoint. ``on_drop(reason, frame)`` is called

@@ -105,8 +105,9 @@ class Router(Generic[PortT]):
     - A message for one component or system goes to the ports at which its target was received. It is dropped if the
       target is unknown. A message for an unknown component of a known system goes to the ports of the system.
     - A vehicle that is received at several ports gets messages through the first port until that port is silent for 3.5
-      s, so that no command arrives twice. A message for a system goes to the autopilot in this way, and also to ports
-      that only reach other components of the system. Ground stations that share ids all get the messages for these ids.
+      s, so that no command arrives twice. A message for a system goes to that port of its autopilot, and also to each
+      port at which only other components of the system were received. Ground stations that share ids all get the
+      messages for these ids.
     - A frame never goes back to the port at which it arrived, and is forwarded once. Copies that arrive at other ports
       within two seconds are dropped. Later copies are dropped if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
@@ -300,7 +301,10 @@ class Router(Generic[PortT]):
         return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
-        """Return True if an equal frame arrived at another port before, by chance or because of a loop."""
+        """Return True if an equal frame arrived first at another port, recently and when this port already existed.
+
+        The cause is a loop, or chance.
+        """
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S
 
@@ -317,7 +321,7 @@ class Router(Generic[PortT]):
         return True
 
     def _record_new(self, node: RouterPort[PortT], source: int) -> None:
-        """Subtract a new frame of a sender from the count of the sender's returning frames (`RouterPort.echoes`)."""
+        """Reduce the count of a sender's returning frames (`RouterPort.echoes`), because a frame was new."""
         count = node.echoes.pop(source, 0) - 1
         if count > 0:
             node.echoes[source] = count
@@ -416,7 +420,7 @@ class Router(Generic[PortT]):
         return numbers
 
     def _is_redundant(self, number: int) -> bool:
-        """Return True if other ports reach all autopilots that are received at this port."""
+        """Return True if autopilots are received at this port, and other ports are used to reach all of them."""
         here = [sender for sender in self._senders.values() if sender.is_autopilot and sender.is_at(number)]
         return bool(here) and all(sender.port_number != number for sender in here)
 

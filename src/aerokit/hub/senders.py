@@ -84,7 +84,7 @@ class Sender:
         return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if the sender was received at this port within `ROUTE_TIMEOUT_S` before its last frame."""
+        """Return True if this is the sender's port, or if the sender was received here at nearly the same time."""
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float) -> bool:
@@ -104,7 +104,10 @@ class Sender:
         self.ports = {number: min(now, at + paused_s) for number, at in self.ports.items()}
 
     def record_heartbeat(self, body: bytes) -> bool:
-        """Record from a HEARTBEAT whether the sender is a vehicle or an autopilot. Return True if that has changed."""
+        """Record from a HEARTBEAT whether the sender belongs to a vehicle, and whether it is an autopilot.
+
+        Return True if either has changed.
+        """
         if len(body) <= _AUTOPILOT:  # The payload is too short for a HEARTBEAT.
             return False
         before = self.is_vehicle, self.is_autopilot

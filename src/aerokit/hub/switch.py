@@ -72,7 +72,8 @@ class Switch:
     def unix_time(self) -> float:
         """Return seconds since 1970: the system time at the start, advanced by the loop's clock. It never jumps.
 
-        `Signing` uses the newest received stamp if this time is older, so a late correction of the clock is not needed.
+        A later correction of the system time has no effect. This does no harm, because `Signing` uses the newest
+        received stamp if that is later.
         """
         return self._unix_epoch_s + self._clock()
 

@@ -134,7 +134,7 @@ class CameraDriver:
         raise NotImplementedError
 
     async def focus_at(self, rate: float) -> None:
-        """Focus continuously: -1 (near) to 1 (far), 0 stops."""
+        """Move the focus at a rate from -1 (towards near) to 1 (towards far) until the rate 0 stops it."""
         raise NotImplementedError
 
     async def focus_distance(self, metres: float) -> None:

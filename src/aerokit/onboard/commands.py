@@ -62,7 +62,7 @@ class CommandRequest:
 
     @property
     def params(self) -> tuple[float, ...]:
-        """Parameters 1 to 7; positions are in degrees for COMMAND_LONG and COMMAND_INT."""
+        """Parameters 1 to 7. Latitude and longitude are in degrees, also those of a COMMAND_INT."""
         *params, x, y, z = self._command.params
         # In COMMAND_INT, x and y are latitude and longitude in 1e-7 degrees, except in these two frames.
         if self._command.frame is not None and self._command.frame not in (MavFrame.MISSION, MavFrame.LOCAL_NED):

@@ -229,7 +229,9 @@ class OnboardComponent:
         self._host.send(message)
 
     def send_text(self, text: str, *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send a status text in ASCII to all programs (STATUSTEXT). A text of more than 254 characters is cut.
+        """Send a status text to all programs (STATUSTEXT).
+
+        Characters that are not ASCII are replaced by "?". A text of more than 254 characters is cut.
 
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.

@@ -35,8 +35,9 @@ class WinchReport(Snapshot):
 class WinchDriver:
     """Base class for your program's winch; pass an instance to :meth:`OnboardComponent.add_winch`.
 
-    Override the coroutines for the actions that the winch has; other actions are UNSUPPORTED. A coroutine returns when
-    the action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command. HOLD cancels it, too.
+    Override the coroutines for the actions that the winch has; other actions are UNSUPPORTED. A coroutine must return
+    only when its action has ended. Until then the sender gets IN_PROGRESS, and can cancel the command. The winch
+    action HOLD cancels it, too.
     """
 
     async def relax(self) -> None:
@@ -102,7 +103,8 @@ STATUS_HZ = 5.0
 def _check_instance(services: ComponentServices, instance: float | None) -> None:
     """Refuse a command for another component's device. It arrives here too if it was sent to all components.
 
-    A component has one device. Its number is 1 or the component id; 0 means all devices (DO_GRIPPER in common.xml).
+    A component has one device, which a command can call 1 or the component id. 0 means all devices (DO_GRIPPER in
+    common.xml).
     """
     if instance not in (None, 0, 1, services.host.component_id):
         raise InvalidArgument(f"instance = {instance} is not allowed: this component has only number 1")

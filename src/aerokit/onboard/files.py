@@ -94,7 +94,7 @@ class DirectoryFiles:
 
     @_raises_file_fault
     def size(self, path: str) -> int:
-        """Return the size of a file in bytes."""
+        """Return the size of a file in bytes; 0 for a path that is not a regular file."""
         if path in self._memory:
             return self._memory.size(path)
         status = self._path(path).lstat()

@@ -74,7 +74,7 @@ class ComponentHost:
         return int((self.now - self._started_at) * 1000.0) & 0xFFFFFFFF
 
     def on(self, message_class: type[Message], handler: Handler) -> None:
-        """Call a handler with each message to this component or to all components, and with its sender."""
+        """Call ``handler(message, sender)`` for each message to this component or to all, except late orders."""
 
         def on_message(message: Message) -> None:
             sender = sender_of(message)
@@ -100,7 +100,7 @@ class ComponentHost:
         return not is_command_to_all or self.knows_command(message.command)  # type: ignore[attr-defined]
 
     def _is_late(self, message: Message) -> bool:
-        """Return True for an order that may have waited too long while the event loop was blocked."""
+        """Return True for a message that makes the component act, if it may have waited too long in a blocked loop."""
         frame = message.received_frame
         age_s = 0.0 if frame is None else self.now - frame.received_at
         if message.ID not in _ORDER_MESSAGE_IDS or age_s <= MAX_COMMAND_AGE_S:

@@ -152,7 +152,7 @@ class ComponentMissions:
 
 
 def _result_of(verdict: object) -> int:
-    """Return the MAV_MISSION_RESULT that a function returned; DENIED for False, ACCEPTED for all other values."""
+    """Convert what a function returned: an integer is the MAV_MISSION_RESULT, False is DENIED, all else ACCEPTED."""
     if verdict is False:
         return MavMissionResult.DENIED
     if isinstance(verdict, int) and not isinstance(verdict, bool):

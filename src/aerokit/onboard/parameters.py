@@ -143,7 +143,10 @@ class ComponentParameters(Mapping[str, ParameterValue]):
             self._param_ext_server = TypedExtendedServer(self._host, _Store(self))
 
     def _forbid_parameters(self) -> None:
-        """Refuse calls of :meth:`add` from now on, because the settings of a camera definition use PARAM_EXT."""
+        """Refuse :meth:`add` from now on, because the settings of a camera definition need PARAM_EXT for themselves.
+
+        InvalidArgument if there are parameters already.
+        """
         if self._rows:
             raise InvalidArgument("a component cannot have both parameters and the settings of a camera definition")
         self._has_camera_settings = True
@@ -200,7 +203,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return checked
 
     def _store(self, name: str, value: ParameterValue) -> None:
-        """Store a checked value. If it has changed, start to write the file, unless it is being written already."""
+        """Store a checked value. If it has changed and there is a file, write the file, after a running write."""
         row = self._rows[name]
         if settings_equal(row.value, value):
             return

@@ -55,7 +55,7 @@ class Rename(Snapshot):
 
     @property
     def old_names(self) -> tuple[str, ...]:
-        """All names whose values are in old units."""
+        """All names whose values are in the units of ``old``."""
         return (self.old, *self.other_old)
 
     @property
@@ -84,7 +84,7 @@ class Renamed(Snapshot):
     rename: Rename
 
     def to_vehicle(self, value: float, type: ParameterType | None = None) -> int | float:  # noqa: A002
-        """Convert a value of the program to the vehicle's units; rounded if its ``type`` is an integer type."""
+        """Convert a value from the program's to the vehicle's units; rounded if the ``type`` is an integer one."""
         converted = self._convert(value, self.requested)
         return round(converted) if type is not None and type.is_integer else converted
 

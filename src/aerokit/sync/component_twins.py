@@ -371,7 +371,9 @@ class OnboardComponent(ComponentTwin):
         self._loop.call(self.aio.send, message)
 
     def send_text(self, text: str, *, severity: int = MavSeverity.INFO.value) -> None:
-        """Send a status text in ASCII to all programs (STATUSTEXT). A text of more than 254 characters is cut.
+        """Send a status text to all programs (STATUSTEXT).
+
+        Characters that are not ASCII are replaced by "?". A text of more than 254 characters is cut.
 
         Raises:
             InvalidArgument: ``severity`` is not a MAV_SEVERITY, 0 to 7.

@@ -116,7 +116,7 @@ class CommandDispatcher:
         self.dispatch(command)
 
     def dispatch(self, command: ReceivedCommand) -> None:
-        """Call the command's handler, and send the acknowledgement."""
+        """Call the command's handler, and send the acknowledgement unless the handler returned None."""
         answer = self.handle(command)
         if isinstance(answer, CommandProgress):
             self.report(command, answer, lambda: self.answer(command, answer.result))
