@@ -690,19 +690,20 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving the block in any way makes the vehicle hold.
+    OFFBOARD on PX4. Leaving the block, also by an exception, makes the vehicle hold.
 
-    The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
-    when the source of positions ends or raises, or when the target is farther away than ``max_distance_m``. The stream
-    also stops for the same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops
-    and sends nothing more. After a stop, ``fly`` and leaving the block raise :class:`SetpointStreamStopped`.
+    The stream stops by itself, and the vehicle holds, for the same reasons as a set-point stream, and also when no new
+    position of the target arrives for ``valid_for_s``, when the source of positions ends or raises, or when the target
+    is farther away than ``max_distance_m``. If a pilot or a failsafe changes the mode, the stream stops, and nothing
+    more is sent, not even an order to hold. After a stop, ``fly`` and leaving the block raise
+    :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.
         OperationTimeout: no position of the target was known within ``valid_for_s``.
         InvalidArgument: ``height_m`` was given, but the target has no altitude.
 
-    After these errors, the vehicle is ordered to hold if it was still executing an earlier order of the program.
+    After these errors, a flying vehicle is ordered to hold if it was still executing an earlier order of the program.
     """
 
     @property
@@ -732,16 +733,17 @@ class FollowStream(BlockTwin["AsyncFollowStream"]):
 class StickStream(BlockTwin["AsyncStickStream"]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
-    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block in any
-    way orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked
-    event loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
-    failsafe changes the mode, the sticks are released at once and no hold is ordered.
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block, also
+    by an exception, orders the vehicle to hold and ends the stream; ArduPilot is also told to release the sticks. If
+    the stream stops by itself (no new positions, a blocked event loop, a silent vehicle), ``set`` and leaving the block
+    raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changes the mode, the stream ends in the same way,
+    but no hold is ordered.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
     stream as a loss of the sticks. Without another source of manual control, PX4 then executes NAV_RCL_ACT (return by
     default). PX4 does so even in hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
-    executes FS_THR_ENABLE.
+    executes the action of FS_THR_ENABLE after the end of a stream.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.
@@ -1307,7 +1309,7 @@ class Gimbals(GimbalsTwin["Gimbal"]):
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """Gimbal device ids of the discovered gimbals, the first gimbal first."""
+        """Gimbal device ids of the discovered gimbals, beginning with that of :attr:`first`."""
         return self._loop.call(lambda: self.aio.ids)
 
     def get(self, device_id: int) -> Gimbal:
@@ -1339,7 +1341,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
     @property
     def end(self) -> str:
-        """Reason why no command of the order is sent again, as a clause; empty while commands may be sent."""
+        """Reason why the order's commands are not repeated, as a clause; empty while they may be repeated."""
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
@@ -2112,7 +2114,7 @@ class Shell(BlockTwin["AsyncShell"]):
 
 
 class TemporaryParameters(TemporarilyTwin):
-    """Sets other values for the duration of a block; see :meth:`Parameters.temporarily`."""
+    """Changes parameters for the duration of a block, and then restores them; see :meth:`Parameters.temporarily`."""
 
 
 class Transaction(TransactionTwin):
@@ -2976,7 +2978,7 @@ class Rtk(TwinOf["AsyncRtk"]):
 
     @cached_property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent; their ``age`` is the time since the last message."""
+        """Number, bytes and bandwidth of the corrections sent; their ``age`` counts from the last one sent."""
         return StateCell(self._loop, self.aio.corrections)
 
     def send(self, rtcm: bytes) -> None:
@@ -4310,7 +4312,7 @@ class Vehicle(VehicleTwin):
 
     @cached_property
     def link_state(self) -> StateCell[LinkState]:
-        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link is lost)."""
+        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link failed or was closed)."""
         return StateCell(self._loop, self.aio.link_state)
 
     def describe_link(self) -> str:
@@ -4432,8 +4434,8 @@ class Vehicle(VehicleTwin):
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        This program armed the vehicle, or has given a steering order since another party armed it. No pilot, failsafe
-        or other program took over since. False for a vehicle that this program only observes.
+        This is so if the program armed the vehicle, or has given a steering order since another party armed it; and if
+        no pilot, failsafe or other program has taken over since. False for a vehicle that the program only observes.
         """
         return self.aio.is_flown_by_program
 

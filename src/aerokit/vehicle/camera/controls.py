@@ -150,7 +150,7 @@ class LensMixin(CameraMixin):
             await self._link.command(command, kind, value, self._link.device_id, order=order, attempts=attempts)
 
     def _continuous(self, action: str, capability: str, command: int, kind: int, speed: float) -> CameraBlock:
-        """Return a block that starts a zoom or focus movement and stops the movement at its end."""
+        """Return a block that starts a zoom or focus movement and, when it is left, stops the movement."""
         link = self._link
         return CameraBlock(
             link,

@@ -34,7 +34,7 @@ STEERING, ACTION = "steering", "action"
 
 
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
-    """Return True if the order that the vehicle accepted at ``accepted_at`` has armed it.
+    """Return True if the vehicle, which is now armed, was armed by the order that it accepted at ``accepted_at``.
 
     ``disarmed_at`` is the time of the last report of disarmed. If HEARTBEAT still reports disarmed more than
     ``ARM_HEARTBEAT_DELAY_S`` after the acceptance, the order had no effect, and another party has armed the vehicle.
@@ -98,8 +98,8 @@ class CommandArbiter:
         return order
 
     def _is_newest(self, order: Order) -> bool:
-        """Return True if the order is not withdrawn, and no newer order about its topics was given."""
-        latest_orders = (self.latest(topic) for topic in order.ended_by)
+        """Return True if the order is not withdrawn, and no newer order was given about a topic that ends it."""
+        latest_orders = (self.latest(topic) for topic in order.ending_topics)
         is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
         return not order.is_withdrawn and not is_superseded
 
@@ -114,8 +114,11 @@ class CommandArbiter:
         self._register(Order(self._now(), next(self._order_numbers), self._is_newest), topics)
 
     def device_order(self, topic: Topic, *, may_be_withdrawn: bool = False) -> Order:
-        """Create an order about a device, which supersedes the previous one until the new order is withdrawn."""
-        order = Order(self._now(), next(self._order_numbers), self._is_newest, ended_by=(topic,))
+        """Create an order about a device. It supersedes the previous order about this device.
+
+        With ``may_be_withdrawn``, withdrawing the new order makes the previous one valid again.
+        """
+        order = Order(self._now(), next(self._order_numbers), self._is_newest, ending_topics=(topic,))
         order.previous = self.latest(topic) if may_be_withdrawn else None
         self._register(order, (topic,))
         return order
@@ -186,7 +189,7 @@ class CommandArbiter:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
         # The vehicle may still change to the modes of the newest steering order.
         modes = () if self.newest is None else self.newest.modes
-        device_topics = () if device_order is None else device_order.ended_by
+        device_topics = () if device_order is None else device_order.ending_topics
         order = self._create_order(modes, (ACTION, *device_topics), ends_flight)
         self._orders.append(order)
         try:
@@ -275,7 +278,7 @@ class CommandArbiter:
             self._arming_accepted_at = self._now()
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """End earlier orders to arm or disarm if a newer command does either; ``armed`` is None if it does neither."""
+        """If a newer command arms or disarms (``armed`` is not None), end earlier orders to arm or disarm."""
         if armed is None:
             return
         self.arm_commands_sent += 1
@@ -306,7 +309,7 @@ class CommandArbiter:
         return newest if newest is not None and newest.given_at >= self._last_arming_at else self._arming_order
 
     def clear_failsafe(self) -> None:
-        """Ignore a failsafe that has ended, or that was already active when the program gave its new order."""
+        """Clear the failsafe of the newest order and the arming order, because the program reclaimed the vehicle."""
         for order in (self.newest, self._arming_order):
             if order is not None:
                 order.clear_failsafe()
@@ -367,7 +370,9 @@ class CommandArbiter:
 
     # ------------------------------------------------------------------------------- internals
 
-    def _create_order(self, modes: Collection[Mode], ended_by: Sequence[Topic], ends_flight: bool = False) -> Order:
+    def _create_order(
+        self, modes: Collection[Mode], ending_topics: Sequence[Topic], ends_flight: bool = False
+    ) -> Order:
         """Create an order that also accepts the modes that earlier orders may still lead to."""
         newest, present_mode = self.newest, self._telemetry.mode.latest
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
@@ -375,7 +380,7 @@ class CommandArbiter:
         newest_modes = newest.modes if is_unsettled and newest is not None else ()
         return self._build_order(
             modes,
-            ended_by,
+            ending_topics,
             {mode.custom_mode for mode in (*newest_modes, *self._posted_modes())},
             settles_at=self.mode_settles_at,
             any_until=self._any_mode_until,
@@ -383,14 +388,14 @@ class CommandArbiter:
         )
 
     def _build_order(
-        self, modes: Collection[Mode], ended_by: Sequence[Topic], expected: Collection[int], **rules: Any
+        self, modes: Collection[Mode], ending_topics: Sequence[Topic], expected: Collection[int], **rules: Any
     ) -> Order:
         """Create an order with the vehicle's present state as the state before the order."""
         return Order(
             self._now(),
             next(self._order_numbers),
             self._is_newest,
-            ended_by=ended_by,
+            ending_topics=ending_topics,
             modes=modes,
             mode_before=self._telemetry.mode.latest,
             expected=expected,

@@ -327,7 +327,7 @@ class ArmingActions(VehicleBase):
             raise HeartbeatTimeout(f"arm(): the vehicle is silent; {link}; the arm command was not sent")
 
     async def _wait_until_armable(self) -> None:
-        """Wait briefly until SYS_STATUS no longer reports that the pre-arm checks fail, after a change of the mode."""
+        """After a change of the mode, wait briefly until SYS_STATUS no longer reports that the pre-arm checks fail."""
         sensors = self.telemetry.sensors
         with self._session.streaming("sensors"), anyio.move_on_after(MODE_READY_TIMEOUT_S):
             since = self.connection.now()
@@ -376,7 +376,7 @@ class ArmingActions(VehicleBase):
         )
 
     async def _order_reboot(self, force: bool) -> None:
-        """Send the command once: if only its acknowledgement was lost, a second one would cause another reboot."""
+        """Send the command once: if only the acknowledgement is lost, repeating the command causes another reboot."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ACK_TIMEOUT_S}
         await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)

@@ -66,7 +66,7 @@ class BackgroundTask:
         self._session.background.start(run, self._name)
 
     def cancel(self) -> None:
-        """Cancel the task. Code of the task that is shielded from cancellation still finishes."""
+        """Cancel the task. It still finishes the steps that it shields from cancellation."""
         if self._scope is not None:
             self._scope.cancel()
             self._scope = None
@@ -286,7 +286,7 @@ class FlightCleanup:
             raise
 
     def end_flights(self) -> None:
-        """At the end of the vehicle's `async with` block, stop an open stream, and hold if a task awaits an order."""
+        """At the end of the vehicle's `async with` block, stop an open stream, and hold if an order is in progress."""
         if self.stop_stream is not None:
             self.stop_stream("the async with block of its vehicle was left")
         if self._awaited_order is not None:

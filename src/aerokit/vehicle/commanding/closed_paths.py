@@ -72,9 +72,9 @@ class Eight(ClosedPath):
 class PathFlight:
     """Moves a set-point straight to the start of a path, stops it there, and then moves it along the path to its end.
 
-    ``start_from_center`` is the vehicle's position at the start, relative to the center of the path (north, east,
-    down). ``center`` is the position of the center in the local frame. ``heading`` returns the heading in degrees for a
-    place relative to the center and a velocity; if it returns None, the autopilot chooses the heading.
+    ``initial_offset`` is the vehicle's position when the flight begins, relative to the center of the path (north,
+    east, down). ``center`` is the position of the center in the local frame. ``heading`` returns the heading in degrees
+    for a place relative to the center and a velocity; if it returns None, the autopilot chooses the heading.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PathFlight:
         path: ClosedPath,
         rounds: float,
         speed_m_s: float,
-        start_from_center: tuple[float, float, float],
+        initial_offset: tuple[float, float, float],
         center: tuple[float, float, float],
         heading: Callable[[Vector, Vector], float | None],
     ) -> None:
@@ -90,7 +90,7 @@ class PathFlight:
         self._speed_m_s = speed_m_s
         self._center = center
         self._heading = heading
-        self._start_from_center = start_from_center
+        self._initial_offset = initial_offset
         # Phase of the set-point, and phase at the end of the path.
         self._phase = path.first_phase
         self._last_phase = path.first_phase + 2 * math.pi * rounds
@@ -112,7 +112,7 @@ class PathFlight:
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
         """Move the set-point along the straight line to the first point of the path."""
         (path_north, path_east), _, _ = self._path.at(self._path.first_phase)
-        start_north, start_east, start_down = self._start_from_center
+        start_north, start_east, start_down = self._initial_offset
         to_path = (path_north - start_north, path_east - start_east, -start_down)  # The path is at down = 0.
         length_m = math.hypot(*to_path)
         self._change_speed(seconds, length_m - self._flown_m)
@@ -124,7 +124,7 @@ class PathFlight:
         fraction = self._flown_m / length_m if length_m else 1.0
         north, east, down = (
             coordinate + fraction * component
-            for coordinate, component in zip(self._start_from_center, to_path, strict=True)
+            for coordinate, component in zip(self._initial_offset, to_path, strict=True)
         )
         speed = self._present_speed_m_s
         north_m_s, east_m_s, down_m_s = (speed * component / length_m if length_m else 0.0 for component in to_path)
@@ -161,7 +161,7 @@ class PathFlight:
     def _setpoint(
         self, place: Vector, down: float, velocity: tuple[float, float, float], acceleration: Vector
     ) -> TrajectorySetpoint:
-        """Return the set-point for a place relative to the center, in the local frame."""
+        """Return the set-point in the local frame for a place that is given relative to the center."""
         center_north, center_east, center_down = self._center
         north, east = place
         position = (center_north + north, center_east + east, center_down + down)
@@ -196,7 +196,7 @@ class TurnCounter:
 
 
 class LobeCounter:
-    """Counts figure eights: two different lobes in a row are one figure."""
+    """Counts figure eights; each lobe in turn counts as half a figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
         # A vehicle is in a lobe if it is farther than this from the center along the axis.

@@ -157,13 +157,13 @@ class FlightActions(VehicleBase):
         """
         started, landed = self.connection.now(), self.telemetry.landed_state
         # Without a recent altitude, the climb is measured from the first one that is received.
-        is_start_known = self._position.is_known_since(started - POSITION_MAX_AGE_S)
+        is_start_known = self._position.was_received_since(started - POSITION_MAX_AGE_S)
         start_m = self._position.altitude_relative() if is_start_known else -math.inf
         state_before = landed.latest
 
         def is_rising() -> bool:
             nonlocal start_m
-            if start_m == -math.inf and self._position.is_known_since(started):
+            if start_m == -math.inf and self._position.was_received_since(started):
                 start_m = self._position.altitude_relative()
             has_taken_off = landed.latest in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF)
             is_reported = has_taken_off and landed.latest != state_before
@@ -181,7 +181,7 @@ class FlightActions(VehicleBase):
         started = self.connection.now()
 
         def is_up() -> bool:
-            is_known = self._position.is_known_since(started)
+            is_known = self._position.was_received_since(started)
             return is_known and self._position.altitude_relative() >= min_altitude_m and not order.end
 
         with self._session.streaming("position"):
@@ -272,7 +272,7 @@ class FlightActions(VehicleBase):
 
         def is_deep() -> bool:
             return (
-                self._position.is_known_since(order.given_at)
+                self._position.was_received_since(order.given_at)
                 and self._position.altitude_relative() < -MAX_SURFACE_DEPTH_M
             )
 
@@ -305,7 +305,7 @@ class FlightActions(VehicleBase):
             return self._position.distance_to(Position(home.latest.latitude_deg, home.latest.longitude_deg))
 
         def is_back() -> bool:
-            return self._position.is_known_since(started) and distance_m() <= arrival_radius_m and not order.end
+            return self._position.was_received_since(started) and distance_m() <= arrival_radius_m and not order.end
 
         def describe() -> str:
             is_known = math.isfinite(distance_m())
@@ -369,8 +369,8 @@ class ModeActions(VehicleBase):
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        This program armed the vehicle, or has given a steering order since another party armed it. No pilot, failsafe
-        or other program took over since. False for a vehicle that this program only observes.
+        This is so if the program armed the vehicle, or has given a steering order since another party armed it; and if
+        no pilot, failsafe or other program has taken over since. False for a vehicle that the program only observes.
         """
         return self.telemetry.is_armed and self._arbiter.is_flown_by_program
 

@@ -147,19 +147,20 @@ class FollowStream(SteeringStream[TargetState]):
     """Follows a target while its ``async with`` block runs; opened by :meth:`aerokit.Vehicle.follow`.
 
     Entering the block waits for the first position of the target, and changes the mode: to GUIDED on ArduPilot, to
-    OFFBOARD on PX4. Leaving the block in any way makes the vehicle hold.
+    OFFBOARD on PX4. Leaving the block, also by an exception, makes the vehicle hold.
 
-    The stream stops by itself, and the vehicle holds, when no new position of the target arrives for ``valid_for_s``,
-    when the source of positions ends or raises, or when the target is farther away than ``max_distance_m``. The stream
-    also stops for the same reasons as a set-point stream. If a pilot or a failsafe changes the mode, the stream stops
-    and sends nothing more. After a stop, ``fly`` and leaving the block raise :class:`SetpointStreamStopped`.
+    The stream stops by itself, and the vehicle holds, for the same reasons as a set-point stream, and also when no new
+    position of the target arrives for ``valid_for_s``, when the source of positions ends or raises, or when the target
+    is farther away than ``max_distance_m``. If a pilot or a failsafe changes the mode, the stream stops, and nothing
+    more is sent, not even an order to hold. After a stop, ``fly`` and leaving the block raise
+    :class:`SetpointStreamStopped`.
 
     Entering raises:
         OperationRejected: the vehicle is not flying (nothing was sent), or its altitude is unknown.
         OperationTimeout: no position of the target was known within ``valid_for_s``.
         InvalidArgument: ``height_m`` was given, but the target has no altitude.
 
-    After these errors, the vehicle is ordered to hold if it was still executing an earlier order of the program.
+    After these errors, a flying vehicle is ordered to hold if it was still executing an earlier order of the program.
     """
 
     _NAME, _VALUE = "following", "position of the target"

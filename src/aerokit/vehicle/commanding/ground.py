@@ -156,8 +156,8 @@ class GroundCheck:
             detach()
 
     @property
-    def is_pending(self) -> bool:
-        """True while the vehicle is reported on the ground, whether or not `confirms` has already returned True."""
+    def is_reported_on_ground(self) -> bool:
+        """True while the vehicle is reported on the ground, also after `confirms` has returned True."""
         return self._reported_at is not None
 
     def confirms(self, is_reported: bool) -> bool:
@@ -177,11 +177,11 @@ class GroundCheck:
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
-        """Return a clause if the vehicle falls or fell. Before it is reported on the ground, return ``in_flight()``."""
-        return self.fall() if self.is_pending else in_flight()
+        """Return :meth:`fall` while the vehicle is reported on the ground, otherwise ``in_flight()``."""
+        return self.fall() if self.is_reported_on_ground else in_flight()
 
     def fall(self) -> str | None:
-        """Return a clause if the vehicle has hit the ground, or sinks fast although it is reported on the ground."""
+        """Return a clause if the vehicle has hit the ground, or sinks fast although reported landed and disarmed."""
         telemetry = self._session.telemetry
         is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
         if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:

@@ -274,7 +274,7 @@ class SetpointStream(SteeringStream[SetpointT]):
             self._repeats_left = INITIAL_REPEATS
 
     def _send(self) -> None:
-        """Send the set-point, unless it restarts the autopilot's path and its next repetition is not yet due."""
+        """Send the set-point. If each repetition restarts the autopilot's path, send it only when one is due."""
         is_due = self._repeats_left > 0 or self._now() - self._sent_at >= REPEAT_INTERVAL_S
         if is_due or not self._restarts_path:
             super()._send()

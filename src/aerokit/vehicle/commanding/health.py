@@ -32,10 +32,11 @@ RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 
 
 def in_order(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
-    """Return all reasons in the order in which aerokit's programs list them.
+    """Return all reasons in the order in which aerokit lists them.
 
-    ``report_reasons`` name missing or old reports. Those in ``REPORTS_ABOUT_ARMING`` come first, the others last.
-    Between them are ``other_reasons``: the vehicle's own texts, its mode, failing sensors, and missing estimates.
+    ``report_reasons`` name missing or old reports. Those that begin with an entry of ``REPORTS_ABOUT_ARMING`` come
+    first, the others last. Between them are ``other_reasons``: the vehicle's own texts, its mode, failing sensors, and
+    missing estimates.
     """
     first = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
     last = [reason for reason in report_reasons if reason not in first]
@@ -201,7 +202,7 @@ class Health:
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
-        """Return one text for each missing estimate, after the probable cause if no GPS receiver has a fix."""
+        """Return one text for each missing estimate; a missing GPS fix, their probable cause, comes first."""
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []
@@ -213,7 +214,8 @@ class Health:
     def _checks_fail(self) -> bool:
         """Return True if the vehicle reports that its pre-arm checks do not pass.
 
-        In a mode that does not allow arming, PX4 evaluates the requirements of that mode instead of those for arming.
+        PX4's report is ignored in a mode that does not allow arming, because it is then about the requirements of that
+        mode instead of those for arming.
         """
         sensors = self._telemetry.sensors.latest
         is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()

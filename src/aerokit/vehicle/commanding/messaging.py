@@ -133,7 +133,7 @@ class _StreamMonitor:
             cleanup.callback(bus.attach_event(event_type, self._on_event))
 
     def reset(self) -> None:
-        """Forget the messages and events that arrived before a new request."""
+        """Before a new request, forget that messages were received and that a request was due."""
         self.has_received = False
         self.must_request = asyncio.Event()
 
@@ -401,7 +401,7 @@ class MessagingActions(VehicleBase):
 
     @property
     def link_state(self) -> StateCell[LinkState]:
-        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link is lost)."""
+        """CONNECTED, SILENT (no heartbeat for more than 3.5 seconds) or LOST (the link failed or was closed)."""
         return self._session.watch.link_state
 
     def describe_link(self) -> str:

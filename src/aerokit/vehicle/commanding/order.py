@@ -115,7 +115,7 @@ def failsafe_text(state: int) -> str:
 class Order:
     """One order of this program, from its creation until it is done, superseded or taken over.
 
-    A newer order about any topic in ``ended_by`` supersedes this order. The arbiter updates the order with each
+    A newer order about any topic in ``ending_topics`` supersedes this order. The arbiter updates the order with each
     HEARTBEAT: an unexpected mode, a failsafe, disarming or a reboot ends the order. An order that has ended does not
     become valid again, even if its mode is reported again.
 
@@ -124,8 +124,8 @@ class Order:
     - ``mode_before`` was active when the order was given.
     - ``modes`` are the order's own modes.
     - ``expected`` modes may appear in any sequence until ``settles_at``, because the program ordered them shortly
-      before. They are no longer accepted once one of the order's own modes is reported; with ``requires_mode_change``,
-      once the mode changes to one of the order's own modes.
+      before. They are no longer accepted once one of the order's own modes is reported. With ``requires_mode_change``,
+      reports of an own mode that was already active do not count: the mode must change to it.
     - Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown effect.
     - Any other mode is attributed to the pilot or a failsafe.
     """
@@ -136,7 +136,7 @@ class Order:
         number: int,
         is_newest: Callable[[Order], bool],
         *,
-        ended_by: Collection[Topic] = (),
+        ending_topics: Collection[Topic] = (),
         modes: Collection[Mode] = (),
         armed: bool | None = None,
         mode_before: Mode | None = None,
@@ -153,7 +153,7 @@ class Order:
         self.given_at: float = given_at
         self.number: int = number
         """Sequence number: a newer order has a greater number."""
-        self.ended_by: tuple[Topic, ...] = tuple(ended_by)
+        self.ending_topics: tuple[Topic, ...] = tuple(ending_topics)
         """Topics of the order: a newer order about any of them ends this order."""
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.armed = armed
@@ -225,11 +225,11 @@ class Order:
         return mode.custom_mode in self._own_modes
 
     def expect(self, modes: Collection[Mode]) -> None:
-        """Count these modes as the order's own, because another order of the program may lead to them."""
+        """Count these modes as the order's own: if another order of the program leads to them, that is no takeover."""
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """Record that the order was refused or not acknowledged: the device is still to follow its previous order."""
+        """Record that the order was refused or not acknowledged, so that the device's previous order is valid again."""
         self.is_withdrawn = True
 
     def commit(self) -> None:
@@ -241,7 +241,7 @@ class Order:
         self.takeover_reason = self.takeover_reason or "its `with` block was left"
 
     def clear_failsafe(self) -> None:
-        """Ignore the reported failsafe, because the program has given a new order since."""
+        """Ignore the reported failsafe, because the program has reclaimed the vehicle."""
         self.failsafe = ""
 
     # -------------------------------------------------------------------- vehicle reports

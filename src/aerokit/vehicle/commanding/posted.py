@@ -53,7 +53,7 @@ class PostedOrder:
 
     @property
     def end(self) -> str:
-        """Reason why no command of the order is sent again, as a clause; empty while commands may be sent."""
+        """Reason why the order's commands are not repeated, as a clause; empty while they may be repeated."""
         return "its effect was reported" if self._order.is_confirmed else self._order.end or self._order.unexplained
 
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:
@@ -176,7 +176,7 @@ class PostedOrder:
         await self._sender.run_command(order, send, command, *params, modes=order.modes, armed=order.armed, **options)
 
     def _begin_command(self, command: int) -> None:
-        """Check that the block is open, and collect refusals that follow an acceptance of this command."""
+        """Check that the block is open, and collect refusals: the vehicle may refuse a command after accepting it."""
         if self._was_left:
             raise InvalidArgument(f"the `with` block of this order was left: {command_name(command)} was not sent")
         self._refusal_watch.close()

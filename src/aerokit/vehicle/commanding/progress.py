@@ -185,7 +185,7 @@ class StallDetector:
         return None
 
     def _record_descent(self, here: Position) -> None:
-        """Record height and sink rate of a vehicle that has just arrived at this place."""
+        """Update the greatest height and sink rate, and the time of a fast descent, after a move to ``here``."""
         velocity = self._session.telemetry.velocity.latest
         if here.altitude_relative_m is not None:
             self._max_height_m = max(self._max_height_m, here.altitude_relative_m)
@@ -314,8 +314,8 @@ class VehiclePosition:
                 return here_m - target_m
         return 0.0
 
-    def is_known_since(self, started: float) -> bool:
-        """Return True if the last position is recent and was received after ``started``."""
+    def was_received_since(self, started: float) -> bool:
+        """Return True if the last position is recent and was received at or after ``started``."""
         position = self._telemetry.position
         return position.updated_at >= started and position.age <= POSITION_MAX_AGE_S
 

@@ -166,7 +166,7 @@ class RoundFlight:
             await await_progress(
                 session,
                 self._operation,
-                is_done=lambda: self._is_flown_since(started) and not order.end,
+                is_done=lambda: self._are_rounds_flown(started) and not order.end,
                 failure_reason=failure_reason,
                 describe=self._describe,
                 timeout=self._timeout,
@@ -177,9 +177,12 @@ class RoundFlight:
         finally:
             detach()
 
-    def _is_flown_since(self, started: float) -> bool:
-        """Return True if the rounds are flown; with 0 rounds, if the vehicle is in place."""
-        is_known = self._context.vehicle_position.is_known_since(started)
+    def _are_rounds_flown(self, started: float) -> bool:
+        """Return True if the rounds are flown; with 0 rounds, if the vehicle is in place.
+
+        Only a recent position that was received since ``started`` counts.
+        """
+        is_known = self._context.vehicle_position.was_received_since(started)
         if not is_known or self._count_rounds() < self._rounds:
             return False
         return self._rounds > 0 or self._is_in_place

@@ -61,7 +61,7 @@ class OrderSender:
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """
         self.raise_if_ended(order)
-        is_steering = STEERING in order.ended_by  # A newer steering order would end this order.
+        is_steering = STEERING in order.ending_topics  # A newer steering order would end this order.
         if order.was_sent and is_steering:
             await self.await_recent_state(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
@@ -114,12 +114,18 @@ class OrderSender:
             self.raise_if_slept(order)
 
     def raise_if_slept(self, order: Order) -> None:
-        """Raise OperationRejected if the computer slept after the order was given: a further step would be too late."""
+        """Raise OperationRejected if the computer slept after the order was given: a further step would be too late.
+
+        Steps that only stop the vehicle are never too late.
+        """
         if not order.only_stops and self._arbiter.slept_since(order.given_at) > 0:
             raise OperationRejected("the computer slept; the rest of the order was not sent")
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
-        """Return the error for a command without an answer: the takeover if there was one, otherwise the time-out."""
+        """Return the error for a command without an answer: the time-out or, after a takeover, OperationRejected.
+
+        A failsafe that ended the order counts as a takeover, too.
+        """
         if order.takeover_reason or (order.failsafe and order.end):
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
         return error
@@ -292,7 +298,7 @@ class OrderSender:
         return failure_reason
 
     def impact_failure(self, order: Order) -> Callable[[], str]:
-        """Return a function that returns a clause once the vehicle has hit the ground while ``order`` is the newest."""
+        """Return a function that returns a clause if the vehicle has hit the ground and ``order`` is still newest."""
         detector = ImpactDetector(self._session.telemetry)
 
         def failure_reason() -> str:

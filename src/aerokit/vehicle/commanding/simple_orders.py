@@ -226,7 +226,7 @@ def _supersession(order: Order | None) -> str | None:
 
 
 async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
-    """Request a message; return False if the vehicle refuses, so that it probably does not have the message."""
+    """Request a message; return False if the vehicle refuses, because then it probably does not have it."""
     with suppress(CommandTimeout):  # A vehicle that does not answer may still have the message.
         try:
             await context.session.commands.send_long(

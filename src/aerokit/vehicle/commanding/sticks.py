@@ -56,16 +56,17 @@ class StickInput(Snapshot):
 class StickStream(SteeringStream[StickInput]):
     """Sends the latest stick positions at a fixed rate while the ``async with`` block supplies them.
 
-    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block in any
-    way orders the vehicle to hold and releases the sticks. If the stream stops by itself (no new positions, a blocked
-    event loop, a silent vehicle), ``set`` and leaving the block raise :class:`SetpointStreamStopped`. If a pilot or a
-    failsafe changes the mode, the sticks are released at once and no hold is ordered.
+    Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block, also
+    by an exception, orders the vehicle to hold and ends the stream; ArduPilot is also told to release the sticks. If
+    the stream stops by itself (no new positions, a blocked event loop, a silent vehicle), ``set`` and leaving the block
+    raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changes the mode, the stream ends in the same way,
+    but no hold is ordered.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
     stream as a loss of the sticks. Without another source of manual control, PX4 then executes NAV_RCL_ACT (return by
     default). PX4 does so even in hold mode, unless bit 1 of COM_RCL_EXCEPT is set. ArduCopter without a transmitter
-    executes FS_THR_ENABLE.
+    executes the action of FS_THR_ENABLE after the end of a stream.
 
     Entering raises:
         InvalidArgument: a position is out of range. Nothing was sent.

@@ -236,7 +236,7 @@ class SteeringStream(ValueStream[ValueT]):
         raise NotImplementedError
 
     async def _check_support(self) -> None:
-        """Raise if the vehicle would ignore the values, before anything is sent."""
+        """Before any value is sent, raise if the vehicle would ignore the values."""
 
     async def __aenter__(self) -> Self:
         """Give the steering order, change to the stream's mode, and begin to send the initial value."""

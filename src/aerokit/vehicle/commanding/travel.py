@@ -221,7 +221,7 @@ class TravelActions(VehicleBase):
 
         def resend_and_check_arrival() -> bool:
             resend_if_due()
-            is_known = self._position.is_known_since(started)
+            is_known = self._position.was_received_since(started)
             return is_known and self._position.remaining_distance(target) <= arrival_radius_m and not order.end
 
         with self._session.streaming("position"):
@@ -475,7 +475,7 @@ class LookActions(VehicleBase):
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:
-        """Raise if the order was superseded. A mode change does not matter, because a ROI applies in any mode."""
+        """Raise if the order has ended. A takeover does not count, because a ROI applies in any mode."""
         if order.end and not order.takeover_reason:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 

@@ -149,7 +149,7 @@ class _WebDownload:
         self._is_aborted = False
 
     async def content(self) -> bytes:
-        """Return the content of the file. The thread is aborted if the caller is cancelled or the time is over."""
+        """Return the content of the file. Cancellation and the time-out ``WEB_TIMEOUT_S`` abort the download."""
         try:
             with anyio.move_on_after(WEB_TIMEOUT_S):
                 return await asyncio.to_thread(self._download)

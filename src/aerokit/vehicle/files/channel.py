@@ -226,7 +226,7 @@ class FileChannel:
             await self.transfers.run(request)
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
-        """Wait for the confirmation of a session that :meth:`_close_soon` is closing."""
+        """Wait for the reply to the request of :meth:`_close_soon`; if there is none, close the session again."""
         request, task = self._closing[session]
         await asyncio.wait((task,))
         if not request.is_answered:

@@ -292,7 +292,7 @@ class Gimbals:
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """Gimbal device ids of the discovered gimbals, the first gimbal first."""
+        """Gimbal device ids of the discovered gimbals, beginning with that of :attr:`first`."""
         return tuple(device.device_id for device in self._sorted())
 
     def get(self, device_id: int) -> Gimbal:

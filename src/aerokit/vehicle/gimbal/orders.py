@@ -315,7 +315,7 @@ class GimbalOrders:
         return bool(blocks) and not any(block.is_held for block in blocks)
 
     def not_supported(self, predicate: str) -> NotSupported:
-        """Return the error with the text ``<gimbal>: <manager> <predicate>``."""
+        """Return the error with the text ``<gimbal>: <manager> <predicate>; nothing was sent``."""
         autopilot = self.session.autopilot
         manager = autopilot.firmware if self.manager_id == self.session.component_id else short_repr(self.manager_id)
         return NotSupported(f"{self.name}: {manager} {predicate}; nothing was sent")

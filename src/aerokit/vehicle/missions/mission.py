@@ -88,7 +88,7 @@ class MissionEndDetector:
         self.ground: GroundCheck = GroundCheck(session)
 
     def has_ended(self) -> bool:
-        """Return True if the mission has ended. If the vehicle is on the ground, it must have landed, not fallen."""
+        """Return True if the mission has ended. On the ground, this also requires a landing without a fall."""
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
         # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
@@ -152,7 +152,7 @@ class MissionEndDetector:
         fall = self.ground.fall()
         if fall:
             return f"{fall}, {self.describe()}"
-        if self.ground.is_pending:  # It is not yet decided whether the vehicle has landed.
+        if self.ground.is_reported_on_ground:  # It is not yet decided whether the vehicle has landed.
             return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode

@@ -160,7 +160,7 @@ class _Block:
 
 
 class TemporaryParameters(_Block):
-    """Sets other values for the duration of a block; see :meth:`Parameters.temporarily`."""
+    """Changes parameters for the duration of a block, and then restores them; see :meth:`Parameters.temporarily`."""
 
     def __init__(
         self,

@@ -97,7 +97,7 @@ class NameResolver:
         return translated
 
     def without_duplicates(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
-        """Drop values of parameters for which ``values`` also has a value under the vehicle's own name."""
+        """If ``values`` has a parameter under two names, keep only the value under the name that the vehicle uses."""
         from aerokit.parameters.renames import resolve_rename
 
         remaining = {}

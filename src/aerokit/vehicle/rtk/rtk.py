@@ -99,7 +99,7 @@ class Rtk:
 
     @property
     def corrections(self) -> StateCell[Corrections]:
-        """Number, bytes and bandwidth of the corrections sent; their ``age`` is the time since the last message."""
+        """Number, bytes and bandwidth of the corrections sent; their ``age`` counts from the last one sent."""
         return self._corrections
 
     def send(self, rtcm: bytes) -> None:

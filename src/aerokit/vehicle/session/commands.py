@@ -250,9 +250,9 @@ class CommandSender:
             self._runs[key].abort(CommandTimeout(text))
 
     def _min_attempt_timeout_s(self) -> float:
-        """Return the minimum time to wait for an ack.
+        """Return the minimum time to wait for an ack: a few round trips, but no more than ``MAX_ATTEMPT_TIMEOUT_S``.
 
-        This time has a maximum, because round trips that were measured while the link was stalled are too long.
+        A round trip that was measured while the link was stalled would make the wait too long.
         """
         return min(MIN_ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 
@@ -263,14 +263,14 @@ class CommandSender:
     def _expect_acks(self, key: _Key, count: int, earlier_acks: Sequence[float] = ()) -> None:
         """Record acks that may still arrive, so that the next command with this key ignores them.
 
-        The acks are ``earlier_acks``, which have been recorded before, and ``count`` new ones.
+        There are ``count`` new acks. ``earlier_acks`` were returned by :meth:`_pop_pending_acks`, and are put back.
         """
         new_acks = [self._connection.now()] * count
         if earlier_acks or new_acks:
             self._pending_acks.setdefault(key, []).extend([*earlier_acks, *new_acks])
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
-        """Remove and return the recorded acks with this key, without those that are considered lost."""
+        """Remove all recorded acks with this key, and return those that are not considered lost."""
         lost_before = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= lost_before]
 

@@ -72,7 +72,7 @@ class _Stream:
         self.is_slow = False
         # Number of messages received so far, and this number at each of the last checks.
         self.received = 0
-        self.received_at_checks: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
+        self.counts_at_checks: deque[int] = deque([0], maxlen=WATCH_WINDOW + 1)
         # The stream is requested again at `retry_at` if none of its messages has arrived by then.
         self.retry_interval_s = RETRY_INTERVAL_S
         self.retry_at = math.inf
@@ -88,7 +88,7 @@ class _Stream:
 
     @property
     def is_optional(self) -> bool:
-        """True if no present request needs the message."""
+        """True if all present requests are optional."""
         return not self.required
 
     @property
@@ -98,13 +98,13 @@ class _Stream:
 
     def achieved_hz(self) -> float:
         """Return the average rate in the window of the last checks."""
-        received_in_window = self.received_at_checks[-1] - self.received_at_checks[0]
-        return received_in_window / ((len(self.received_at_checks) - 1) * WATCH_PERIOD_S)
+        received_in_window = self.counts_at_checks[-1] - self.counts_at_checks[0]
+        return received_in_window / ((len(self.counts_at_checks) - 1) * WATCH_PERIOD_S)
 
     def mark_requested(self, now: float, hz: float) -> None:
-        """Record that this rate was requested, and begin to measure the received rate anew."""
+        """Record that this rate was requested, and restart the measurement of the received rate."""
         self.requested_hz = hz
-        self.received_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
+        self.counts_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
         self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
 
     def on_frame(self, frame: Frame) -> None:
@@ -211,7 +211,10 @@ class MessageRates:
         return stream
 
     async def _request_all_due(self) -> None:
-        """Request the due streams one at a time. Streams whose last request was not answered come last."""
+        """Request the due streams one at a time; without support for the command, request their groups together.
+
+        Streams whose last request was not answered come last.
+        """
         while not self._uses_groups and (stream := self._most_urgent()) is not None:
             await self._request_by_command(stream)
         if self._uses_groups:
@@ -314,10 +317,10 @@ class MessageRates:
 
     def _watch(self, stream: _Stream) -> None:
         """Record how many messages have arrived. If necessary, request the stream again, or report it as slow."""
-        stream.received_at_checks.append(stream.received)
+        stream.counts_at_checks.append(stream.received)
         if stream.requested_hz is None or stream.requested_hz <= 0 or stream.is_refused:
             return
-        if stream.received_at_checks[-1] == stream.received_at_checks[0]:  # No message has arrived in the window.
+        if stream.counts_at_checks[-1] == stream.counts_at_checks[0]:  # No message has arrived in the window.
             self._retry_if_due(stream)
         else:
             stream.retry_interval_s = RETRY_INTERVAL_S
@@ -332,11 +335,11 @@ class MessageRates:
 
     def _check_rate(self, stream: _Stream) -> None:
         """Publish StreamSlow when a stream becomes slow."""
-        if stream.requested_hz is None or len(stream.received_at_checks) <= WATCH_WINDOW:
+        if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()
         # If no message arrived in the first period of the window, the stream began later, so its average is too low.
-        has_just_started = achieved_hz > 0 and stream.received_at_checks[0] == stream.received_at_checks[1]
+        has_just_started = achieved_hz > 0 and stream.counts_at_checks[0] == stream.counts_at_checks[1]
         if has_just_started and not stream.is_slow:
             return
         # A stream that lacks only one message is not slow, because that message may have arrived just outside the

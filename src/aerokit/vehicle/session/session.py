@@ -102,7 +102,7 @@ async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
 
 
 async def _request(commands: CommandSender, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
-    """Request one message, twice if necessary. Return True if the vehicle acknowledged or refused the request."""
+    """Request one message, twice if necessary. Return True if the vehicle answered, even if it refused."""
     try:
         await commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout)
     except CommandTimeout:

@@ -136,7 +136,7 @@ class Transfers:
         error.args = (f"{error}; {self._describe()}",)
 
     def _init_round_trip(self) -> None:
-        """Use the round trip of TIMESYNC until a transfer has measured one."""
+        """Unless a round trip is known already, use that of TIMESYNC as the first sample."""
         if self.round_trip.smoothed_s is not None:
             return
         seconds = self._round_trip_s()

@@ -224,7 +224,7 @@ class VehicleWatch:
             self._on_reboot_detected(clock, milliseconds)
 
     def _is_decrease_confirmed(self, clock: str, milliseconds: int) -> bool:
-        """Return True if the vehicle has counted on from the decreased time for ``REBOOT_CONFIRM_S`` seconds."""
+        """Return True if the time first decreased at least ``REBOOT_CONFIRM_S`` seconds ago, and has advanced since."""
         now = self._connection.now()
         decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
         if milliseconds < decreased_ms:  # The time has decreased further, so the confirmation starts again.
@@ -310,7 +310,7 @@ class LinkWatch:
                 on_tick()
 
     def request_time(self) -> None:
-        """Request the vehicle's time now, in addition to the requests that are sent every two seconds."""
+        """Request the vehicle's time now; the next periodic request follows ``TIMESYNC_PERIOD_S`` later."""
         now = self._connection.now()
         self._next_request_at = now + TIMESYNC_PERIOD_S
         sent_at_ns = int(now * 1e9)

@@ -174,7 +174,7 @@ class Telemetry(States):
     def texts_about_failsafes(self) -> tuple[StatusText, ...]:
         """Return the last status texts (64 at most) about failsafes and problems in flight, oldest first.
 
-        Texts from before the end of the last failsafe are left out.
+        When a failsafe ends, the texts received until then are dropped.
         """
         return self._texts.about_failsafes()
 
