@@ -77,7 +77,7 @@ class GimbalDriver:
         self.attitude_hz: float = attitude_hz
 
     def point(self, target: GimbalTarget) -> None:
-        """Start to turn to a target, which is within the limits. Called on the event loop, so it must return at once."""
+        """Start to turn to a target within the limits. Called on the event loop, so it must return at once."""
         raise NotImplementedError
 
     def attitude(self) -> tuple[float, float, float]:
