@@ -14,6 +14,7 @@ import pytest
 from flight_controller import FlightController, Received
 
 import aerokit.dronekit as dronekit
+from aerokit.dronekit import flight
 
 LOITER = 5
 ARM, SET_MODE, REPOSITION = 400, 176, 192
@@ -116,6 +117,28 @@ def test_disarm_during_arming_waits_for_answer(copter: FlightController, vehicle
     disarming.join(LIMIT_S)
     assert not disarming.is_alive()
     assert [command.param1 for command in copter.commands()] == [1, 0]
+
+
+def test_disarming_silent_vehicle_is_sent_and_not_taken_for_done(
+    copter: FlightController, vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose_answers(copter, ARM, does=False)
+    copter.heartbeat_s = None
+    monkeypatch.setattr(flight, "MODE_MAX_AGE_S", -1.0)  # each HEARTBEAT is too old
+    vehicle.armed = False  # HEARTBEAT has reported disarmed, but a pilot may have armed the vehicle since
+    copter.wait_for_command(ARM)
+    with pytest.raises(dronekit.TimeoutError, match="failed to disarm vehicle"):
+        vehicle.disarm()
+    assert {command.param1 for command in copter.commands()} == {0}
+
+
+def test_px4_goto_refused_by_mode_changes_no_speed() -> None:
+    mission = 4 << 16 | 4 << 24
+    with FlightController(autopilot=12, mode=mission) as px4, dronekit.connect(px4.address, rate=None) as vehicle:
+        vehicle.simple_goto(dronekit.LocationGlobal(-35.0, 149.0, 620.0), airspeed=15, groundspeed=15)
+        vehicle._handler.calls.wait(LIMIT_S)
+        assert vehicle.mode == "MISSION"
+        assert not px4.commands()
 
 
 @pytest.mark.parametrize("wait", ["arm", "wait_for_mode"])
