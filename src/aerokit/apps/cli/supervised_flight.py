@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from typing import Literal
 
     from aerokit.apps.cli.terminal import InterruptStack
+    from aerokit.autopilots.modes import Mode
     from aerokit.position import Position
     from aerokit.vehicle.state.movement import Velocity
     from aerokit.vehicle.vehicle import Vehicle
@@ -79,6 +80,7 @@ class SupervisedFlight(ABC):
         self._may_arm_late = False  # True while the result of a sent arm command is unknown
         self._modes_armed_in: set[str] = set()
         self._has_changed_mode = False  # True once a command of this program has changed the mode after arming
+        self._has_left_mode = False  # True once the armed vehicle was in a mode other than those it was armed in
 
     async def fly(self) -> int:
         """Perform the flight and return the exit code. After an error, make an armed vehicle safe and re-raise."""
@@ -130,6 +132,10 @@ class SupervisedFlight(ABC):
             raise
         self._may_arm_late = False
         self._modes_armed_in.add(self._vehicle.mode_name)
+        self._vehicle.mode.observe(self._on_mode)
+
+    def _on_mode(self, _: Mode | None, mode: Mode) -> None:
+        self._has_left_mode = self._has_left_mode or mode.name not in self._modes_armed_in
 
     async def _wait_disarmed_on_ground(self) -> None:
         if is_reported_on_ground(self._vehicle.telemetry):
@@ -233,8 +239,8 @@ class SupervisedFlight(ABC):
     @property
     def _is_in_our_mode(self) -> bool:
         vehicle = self._vehicle
-        if not self._has_changed_mode and vehicle.mode_name in self._modes_armed_in:
-            return True
+        if not (self._has_changed_mode or self._has_left_mode) and vehicle.mode_name in self._modes_armed_in:
+            return self._is_armed_on_ground  # In this mode, only a pilot can have taken off.
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 
