@@ -217,6 +217,13 @@ def test_emit_on_ascii_terminal_replaces_characters(as_json: bool, monkeypatch: 
     assert written.getvalue().decode() == ('{"type": "text", "text": "Gr\\u00fc\\u00dfe"}\n' if as_json else "Gr??e\n")
 
 
+def test_emit_error_on_ascii_terminal_prints_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    emit_error(OperationRejected("Grüße"), 5, as_json=True)
+    assert '"message": "Gr\\u00fc\\u00dfe"' in written.getvalue().decode()
+
+
 @pytest.mark.parametrize(
     ("text", "plain"),
     [
