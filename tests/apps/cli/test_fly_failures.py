@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import io
+import math
+import os
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -398,6 +401,30 @@ def test_status_line_has_no_old_speed(copter: SimulatedCopter, capsys: pytest.Ca
 
     run_virtual(scenario())
     assert "STABILIZE, speed unknown" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="only sockets can be checked there")
+def test_flight_lines_wait_while_output_is_blocked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After Ctrl-S, printing would block the event loop, and with it the heartbeats."""
+    reading, writing = os.pipe()
+    os.set_blocking(reading, False)
+    os.set_blocking(writing, False)
+    filled = 0
+    for size in (1000, 1):
+        with suppress(BlockingIOError):
+            while True:
+                filled += os.write(writing, bytes(size))
+    vehicle: Any = SimpleNamespace(
+        connection=SimpleNamespace(now=lambda: 0.0), position=SimpleNamespace(age=math.inf), heartbeat_age=0.0
+    )
+    with os.fdopen(reading, "rb") as reader, os.fdopen(writing, "w") as blocked:
+        monkeypatch.setattr(sys, "stdout", blocked)
+        report = FlightReport(vehicle, argparse.Namespace(json=False), speedup=1.0)
+        report.print_line("one")
+        reader.read(filled)
+        report.print_line("two")
+        assert re.findall(rb"one|two", reader.read() or b"") == [b"one", b"two"]
+        monkeypatch.undo()
 
 
 def test_fly_progress_ends_silently_with_connection(copter: SimulatedCopter) -> None:

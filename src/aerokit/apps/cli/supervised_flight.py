@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import select
 import shlex
 import sys
 from abc import ABC, abstractmethod
+from collections import deque
 from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -59,6 +61,7 @@ _WARNING_SEVERITY = 4
 # If nothing was printed for this time, a status line is printed.
 _STATUS_INTERVAL_S = 5.0
 _MIN_STEP_M = 1.0
+_MAX_UNPRINTED = 1000  # lines that wait for a stopped terminal; further lines replace the oldest
 
 
 class SupervisedFlight(ABC):
@@ -267,6 +270,8 @@ class FlightReport:
         self._fastest_m_s = 0.0
         self._flown_m = 0.0
         self._previous_position: Position | None = None
+        # Arguments of `emit` that wait until the output accepts them, oldest first.
+        self._unprinted: deque[tuple[str, Mapping[str, object], str]] = deque(maxlen=_MAX_UNPRINTED)
         self.prints_status: bool = True
         """True if status lines are printed when there is no other output. Set it to False during questions."""
 
@@ -357,7 +362,7 @@ class FlightReport:
             lines.append(f"next: aerokit report {force}{shlex.quote(recorded_in)}")
         else:
             lines += [frames, "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`"]
-        self._emit("flight_summary", record, "\n".join(lines))
+        self._emit("flight_summary", record, "\n".join(lines), waits=True)  # the flight is over, so this may block
 
     def _describe_armed(self, speed: float) -> str:
         """Return "armed for 47 s", with notes on the time until an impact and on the speed of a simulation.
@@ -444,11 +449,22 @@ class FlightReport:
         self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
         self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
 
-    def _emit(self, kind: str, record: Mapping[str, object], text: str) -> None:
+    def _emit(self, kind: str, record: Mapping[str, object], text: str, *, waits: bool = False) -> None:
+        self._unprinted.append((kind, record, text))
         try:
-            emit(self._options, kind, record, text)
+            while self._unprinted and (waits or _can_print()):
+                emit(self._options, *self._unprinted.popleft())
         except OSError:
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - used until the process ends
+
+
+def _can_print() -> bool:
+    """Return False while printing would block: after Ctrl-S, or if a pipe is not read. Heartbeats must go on."""
+    try:
+        _, writable, _ = select.select([], [sys.stdout], [], 0)
+    except (OSError, ValueError):  # stdout is no file, or this is Windows, where only sockets can be checked
+        return True
+    return bool(writable)
 
 
 def _duration(seconds: float) -> str:
