@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import select
 import sys
 from contextlib import contextmanager
 from importlib import import_module
@@ -56,6 +57,18 @@ def _print_json(fields: Mapping[str, object]) -> None:
         print(json.dumps(fields, ensure_ascii=False), flush=True)
     except UnicodeEncodeError:
         print(json.dumps(fields), flush=True)
+
+
+def can_print() -> bool:
+    """Return False while printing to stdout would block: after Ctrl-S, or if a pipe is not read.
+
+    Commands on which vehicles depend must not print then, because heartbeats and forwarding would stop.
+    """
+    try:
+        _, writable, _ = select.select([], [sys.stdout], [], 0)
+    except (OSError, ValueError):  # stdout is no file, or this is Windows, where only sockets can be checked
+        return True
+    return bool(writable)
 
 
 def _print(text: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import select
 import shlex
 import sys
 from abc import ABC, abstractmethod
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit import events
-from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
+from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, can_print, emit, plain_text
 from aerokit.apps.readiness import arms_but_cannot_fly_text, readiness
 from aerokit.errors import (
     AerokitError,
@@ -452,19 +451,10 @@ class FlightReport:
     def _emit(self, kind: str, record: Mapping[str, object], text: str, *, waits: bool = False) -> None:
         self._unprinted.append((kind, record, text))
         try:
-            while self._unprinted and (waits or _can_print()):
+            while self._unprinted and (waits or can_print()):
                 emit(self._options, *self._unprinted.popleft())
         except OSError:
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - used until the process ends
-
-
-def _can_print() -> bool:
-    """Return False while printing would block: after Ctrl-S, or if a pipe is not read. Heartbeats must go on."""
-    try:
-        _, writable, _ = select.select([], [sys.stdout], [], 0)
-    except (OSError, ValueError):  # stdout is no file, or this is Windows, where only sockets can be checked
-        return True
-    return bool(writable)
 
 
 def _duration(seconds: float) -> str:
