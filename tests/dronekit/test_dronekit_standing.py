@@ -141,6 +141,16 @@ def test_px4_goto_refused_by_mode_changes_no_speed() -> None:
         assert not px4.commands()
 
 
+def test_goto_after_reboot_uses_new_home(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
+    copter.report("HOME_POSITION", altitude=584_000)
+    wait_for(lambda: vehicle.home_location is not None)
+    vehicle._handler.loop.call(vehicle.aio._session._on_reboot)
+    assert vehicle.home_location is None
+    copter.home = (-353632610, 1491652300, 700_000)
+    vehicle.simple_goto(dronekit.LocationGlobal(-35.36, 149.16, 720.0))
+    copter.wait_for("COMMAND_INT", lambda frame: frame.command == REPOSITION and frame.z == 20.0)
+
+
 @pytest.mark.parametrize("wait", ["arm", "wait_for_mode"])
 def test_abandoned_order_is_not_repeated(copter: FlightController, vehicle: dronekit.Vehicle, wait: str) -> None:
     lose_answers(copter, ARM, SET_MODE, does=False)

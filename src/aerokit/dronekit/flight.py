@@ -255,6 +255,8 @@ class FlightMethods(VehicleAttributes):
     def home_location(self) -> LocationGlobal | Any:
         """Home location, a new object each time; None until HOME_POSITION or a downloaded mission reports home.
 
+        A reboot of the vehicle resets it to None.
+
         Set it to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME). As in DroneKit, the attribute changes at once; a
         refusal restores it. Raises ValueError, without sending, for another type or for a missing or wrong number.
         """
