@@ -132,6 +132,17 @@ def test_disarming_silent_vehicle_is_sent_and_not_taken_for_done(
     assert {command.param1 for command in copter.commands()} == {0}
 
 
+def test_wait_for_mode_is_not_ended_by_old_report(
+    copter: FlightController, vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose_answers(copter, SET_MODE, does=False)
+    copter.heartbeat_s = None
+    monkeypatch.setattr(flight, "MODE_MAX_AGE_S", -1.0)  # each HEARTBEAT is too old
+    assert vehicle.mode == "STABILIZE"
+    with pytest.raises(dronekit.TimeoutError, match="failed to set flight mode"):
+        vehicle.wait_for_mode("STABILIZE")
+
+
 def test_px4_goto_refused_by_mode_changes_no_speed() -> None:
     mission = 4 << 16 | 4 << 24
     with FlightController(autopilot=12, mode=mission) as px4, dronekit.connect(px4.address, rate=None) as vehicle:

@@ -69,7 +69,17 @@ class FlightMethods(VehicleAttributes):
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects the mode.
         """
         name, order = self._dk_set_mode(mode)
-        self._dk_wait_for_order(order, lambda: self._flightmode == name, timeout, "failed to set flight mode")
+
+        def is_done() -> bool:
+            return self._flightmode == name and not self._dk_is_report_old
+
+        self._dk_wait_for_order(order, is_done, timeout, "failed to set flight mode")
+
+    @property
+    def _dk_is_report_old(self) -> bool:
+        """True if the vehicle may have changed since the last HEARTBEAT."""
+        aio = self._dk.aio_or_none
+        return aio is not None and aio.heartbeat_age > MODE_MAX_AGE_S
 
     # -------------------------------------------------------------------------------- arming
 
@@ -95,9 +105,7 @@ class FlightMethods(VehicleAttributes):
 
         An old report of a disarmed vehicle does not count, because a pilot may have armed it since.
         """
-        aio = self._dk.aio_or_none
-        is_old = aio is not None and aio.heartbeat_age > MODE_MAX_AGE_S
-        return self._armed == value and (value or not is_old)
+        return self._armed == value and (value or not self._dk_is_report_old)
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
