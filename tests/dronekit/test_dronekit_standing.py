@@ -14,6 +14,7 @@ import pytest
 from flight_controller import FlightController, Received
 
 import aerokit.dronekit as dronekit
+from aerokit.dronekit import flight
 
 LOITER = 5
 ARM, SET_MODE, REPOSITION = 400, 176, 192
@@ -116,6 +117,49 @@ def test_disarm_during_arming_waits_for_answer(copter: FlightController, vehicle
     disarming.join(LIMIT_S)
     assert not disarming.is_alive()
     assert [command.param1 for command in copter.commands()] == [1, 0]
+
+
+def test_disarming_silent_vehicle_is_sent_and_not_taken_for_done(
+    copter: FlightController, vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose_answers(copter, ARM, does=False)
+    copter.heartbeat_s = None
+    monkeypatch.setattr(flight, "MODE_MAX_AGE_S", -1.0)  # each HEARTBEAT is too old
+    vehicle.armed = False  # HEARTBEAT has reported disarmed, but a pilot may have armed the vehicle since
+    copter.wait_for_command(ARM)
+    with pytest.raises(dronekit.TimeoutError, match="failed to disarm vehicle"):
+        vehicle.disarm()
+    assert {command.param1 for command in copter.commands()} == {0}
+
+
+def test_wait_for_mode_is_not_ended_by_old_report(
+    copter: FlightController, vehicle: dronekit.Vehicle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose_answers(copter, SET_MODE, does=False)
+    copter.heartbeat_s = None
+    monkeypatch.setattr(flight, "MODE_MAX_AGE_S", -1.0)  # each HEARTBEAT is too old
+    assert vehicle.mode == "STABILIZE"
+    with pytest.raises(dronekit.TimeoutError, match="failed to set flight mode"):
+        vehicle.wait_for_mode("STABILIZE")
+
+
+def test_px4_goto_refused_by_mode_changes_no_speed() -> None:
+    mission = 4 << 16 | 4 << 24
+    with FlightController(autopilot=12, mode=mission) as px4, dronekit.connect(px4.address, rate=None) as vehicle:
+        vehicle.simple_goto(dronekit.LocationGlobal(-35.0, 149.0, 620.0), airspeed=15, groundspeed=15)
+        vehicle._handler.calls.wait(LIMIT_S)
+        assert vehicle.mode == "MISSION"
+        assert not px4.commands()
+
+
+def test_goto_after_reboot_uses_new_home(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
+    copter.report("HOME_POSITION", altitude=584_000)
+    wait_for(lambda: vehicle.home_location is not None)
+    vehicle._handler.loop.call(vehicle.aio._session._on_reboot)
+    assert vehicle.home_location is None
+    copter.home = (-353632610, 1491652300, 700_000)
+    vehicle.simple_goto(dronekit.LocationGlobal(-35.36, 149.16, 720.0))
+    copter.wait_for("COMMAND_INT", lambda frame: frame.command == REPOSITION and frame.z == 20.0)
 
 
 @pytest.mark.parametrize("wait", ["arm", "wait_for_mode"])

@@ -298,3 +298,8 @@ class VehicleAttributes(VehicleCore):
         home = LocationGlobal(lat, lon, alt)
         self._home_location = home
         self._dk_reported_home = home
+
+    def _dk_forget_home(self) -> None:
+        """Forget home, because the vehicle has rebooted, perhaps at another place, and altitudes depend on it."""
+        self._home_location = None
+        self._dk_reported_home = None

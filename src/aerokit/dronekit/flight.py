@@ -15,6 +15,7 @@ from aerokit.dronekit.values import LocationGlobal, LocationGlobalRelative, Vehi
 from aerokit.errors import CommandRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavFrame, SpeedType
 from aerokit.mavlink.messages import HomePosition
+from aerokit.vehicle.commanding.arbiter import MODE_MAX_AGE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,7 +69,17 @@ class FlightMethods(VehicleAttributes):
         Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle rejects the mode.
         """
         name, order = self._dk_set_mode(mode)
-        self._dk_wait_for_order(order, lambda: self._flightmode == name, timeout, "failed to set flight mode")
+
+        def is_done() -> bool:
+            return self._flightmode == name and not self._dk_is_report_old
+
+        self._dk_wait_for_order(order, is_done, timeout, "failed to set flight mode")
+
+    @property
+    def _dk_is_report_old(self) -> bool:
+        """True if the vehicle may have changed since the last HEARTBEAT."""
+        aio = self._dk.aio_or_none
+        return aio is not None and aio.heartbeat_age > MODE_MAX_AGE_S
 
     # -------------------------------------------------------------------------------- arming
 
@@ -77,16 +88,24 @@ class FlightMethods(VehicleAttributes):
         """True if HEARTBEAT reports armed motors.
 
         Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait, and sends nothing if the
-        vehicle already reports the value. :meth:`arm` waits, and raises the reason if arming is refused.
+        vehicle already reports the value. A silent vehicle is disarmed in any case, because its last report may be
+        outdated. :meth:`arm` waits, and raises the reason if arming is refused.
         """
         return self._armed
 
     @armed.setter
     def armed(self, value: bool) -> None:
-        if bool(value) != self._armed or self._dk_is_changing_to(not value):
+        if not self._dk_reports_armed(bool(value)) or self._dk_is_changing_to(not value):
             self._dk_set_armed(bool(value))
         else:
             self._dk.check_link()
+
+    def _dk_reports_armed(self, value: bool) -> bool:
+        """Return True if HEARTBEAT reports this value.
+
+        An old report of a disarmed vehicle does not count, because a pilot may have armed it since.
+        """
+        return self._armed == value and (value or not self._dk_is_report_old)
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
@@ -113,7 +132,7 @@ class FlightMethods(VehicleAttributes):
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
         """Arm or disarm, unless the vehicle already reports the value and no opposite order is pending."""
         is_overruling = self._dk_is_changing_to(not value)
-        if self._armed == value and not is_overruling:
+        if self._dk_reports_armed(value) and not is_overruling:
             self._dk.check_link()
             return
         order = self._dk_set_armed(value)
@@ -122,7 +141,7 @@ class FlightMethods(VehicleAttributes):
             def is_done() -> bool:
                 # If an opposite order was overruled, HEARTBEAT may still report the state from before that order. In
                 # this case, `_armed` is reliable only after `order` is done.
-                return self._armed == value and (order.done() or not is_overruling)
+                return self._dk_reports_armed(value) and (order.done() or not is_overruling)
 
             self._dk_wait_for_order(order, is_done, timeout, failure_text)
 
@@ -191,8 +210,8 @@ class FlightMethods(VehicleAttributes):
         if modes and self._flightmode not in map(str, modes):
             reason = f"not sent in mode {self._flightmode}: set mode {modes[0]} first"
             self._dk.order("goto", flight_orders.reject, reason)
-        else:
-            self._dk.order("goto", flight_orders.go_to, aio, *target)
+            return  # The speeds are not sent either, because they would change the flight of the present mode.
+        self._dk.order("goto", flight_orders.go_to, aio, *target)
         if airspeed is not None:
             self.airspeed = airspeed
         if groundspeed is not None:
@@ -243,6 +262,8 @@ class FlightMethods(VehicleAttributes):
     @property
     def home_location(self) -> LocationGlobal | Any:
         """Home location, a new object each time; None until HOME_POSITION or a downloaded mission reports home.
+
+        A reboot of the vehicle resets it to None.
 
         Set it to a LocationGlobal to move home (MAV_CMD_DO_SET_HOME). As in DroneKit, the attribute changes at once; a
         refusal restores it. Raises ValueError, without sending, for another type or for a missing or wrong number.

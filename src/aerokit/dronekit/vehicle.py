@@ -269,6 +269,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         self._handler.note_sent = aio.note_sent
         self._handler.calls.describe = self._dk_describe
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
+        aio._session.on_reboot.append(weak_callback(self._dk_forget_home))
         # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.
         first_heartbeat = aio.connection.heartbeats.get((aio.system_id, aio.component_id))
         if first_heartbeat is not None:

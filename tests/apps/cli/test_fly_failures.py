@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import io
+import math
+import os
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,10 +29,11 @@ from aerokit.apps.cli.mission import read_plan
 from aerokit.apps.cli.output import TIMED_OUT, emit, emit_error
 from aerokit.apps.cli.supervised_flight import FlightReport
 from aerokit.apps.cli.terminal import InterruptStack
+from aerokit.autopilots.modes import Mode
 from aerokit.errors import OperationRejected
 from aerokit.logs.flights import read_flight
 from aerokit.logs.report.statistics import statistics_of, summary
-from aerokit.mavlink.enums import CopterMode, MavCmd
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState
 from aerokit.mavlink.messages import ParamValue, VfrHud
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import read_waypoint_file
@@ -120,28 +124,34 @@ def test_fly_vehicle_silent_after_confirmation_is_not_started(
     assert not copter.is_armed
 
 
-def test_fly_mission_changed_during_question_is_not_flown(
-    copter: SimulatedCopter, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("asks", [True, False])
+def test_fly_mission_changed_after_upload_is_not_flown(
+    asks: bool, copter: SimulatedCopter, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ours, theirs = memory_link_pair(), memory_link_pair()
     Path("other.waypoints").write_text(MISSION.replace("\t15\t1", "\t99\t1"))
 
-    async def confirm(_: str) -> bool:
+    async def upload_other(_: PlanFlight) -> bool:
         async with aerokit.connect(theirs[0], source_system=254) as other:
             await other.mission.upload(read_waypoint_file("other.waypoints"))
         return True
 
     async def scenario() -> int:
         async with SimulatorServer([copter], [ours[1], theirs[1]]):
-            return await run_on(ours[0], "fly", "m.waypoints")
+            return await run_on(ours[0], "fly", "m.waypoints", *(() if asks else ("--yes",)))
 
-    monkeypatch.setattr(flown_plan, "confirm", confirm)
+    monkeypatch.setattr(PlanFlight, "_is_confirmed", upload_other)
     assert run_virtual(scenario()) == 5
-    assert (
-        "mission on the vehicle changed while aerokit waited for your confirmation; nothing was started"
-        in capsys.readouterr().err
-    )
+    assert "the mission on the vehicle changed after the upload; nothing was started" in capsys.readouterr().err
     assert (copter.is_armed, copter.is_landed) == (False, True)
+
+
+def test_demo_with_refused_mode_disarms_on_ground(copter: SimulatedCopter, capsys: pytest.CaptureFixture[str]) -> None:
+    copter.faults.refuse(MavCmd.DO_SET_MODE)
+    assert run_with(copter, ("demo",)) == [1]
+    out = capsys.readouterr().out
+    assert "on the ground and armed; disarming" in out
+    assert "another party" not in out
 
 
 def test_fly_fall_ends_with_error_and_sends_nothing(
@@ -208,6 +218,13 @@ def test_emit_on_ascii_terminal_replaces_characters(as_json: bool, monkeypatch: 
     options = argparse.Namespace(json=as_json)
     emit(options, "text", {"text": "Grüße"}, "Grüße")
     assert written.getvalue().decode() == ('{"type": "text", "text": "Gr\\u00fc\\u00dfe"}\n' if as_json else "Gr??e\n")
+
+
+def test_emit_error_on_ascii_terminal_prints_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    emit_error(OperationRejected("Grüße"), 5, as_json=True)
+    assert '"message": "Gr\\u00fc\\u00dfe"' in written.getvalue().decode()
 
 
 @pytest.mark.parametrize(
@@ -386,6 +403,30 @@ def test_status_line_has_no_old_speed(copter: SimulatedCopter, capsys: pytest.Ca
     assert "STABILIZE, speed unknown" in capsys.readouterr().out
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="only sockets can be checked there")
+def test_flight_lines_wait_while_output_is_blocked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After Ctrl-S, printing would block the event loop, and with it the heartbeats."""
+    reading, writing = os.pipe()
+    os.set_blocking(reading, False)
+    os.set_blocking(writing, False)
+    filled = 0
+    for size in (1000, 1):
+        with suppress(BlockingIOError):
+            while True:
+                filled += os.write(writing, bytes(size))
+    vehicle: Any = SimpleNamespace(
+        connection=SimpleNamespace(now=lambda: 0.0), position=SimpleNamespace(age=math.inf), heartbeat_age=0.0
+    )
+    with os.fdopen(reading, "rb") as reader, os.fdopen(writing, "w") as blocked:
+        monkeypatch.setattr(sys, "stdout", blocked)
+        report = FlightReport(vehicle, argparse.Namespace(json=False), speedup=1.0)
+        report.print_line("one")
+        reader.read(filled)
+        report.print_line("two")
+        assert re.findall(rb"one|two", reader.read() or b"") == [b"one", b"two"]
+        monkeypatch.undo()
+
+
 def test_fly_progress_ends_silently_with_connection(copter: SimulatedCopter) -> None:
     """Its error must not replace that of the flight."""
     ours, theirs = memory_link_pair()
@@ -401,6 +442,28 @@ def test_fly_progress_ends_silently_with_connection(copter: SimulatedCopter) -> 
             await progress
 
     run_virtual(scenario())
+
+
+@pytest.mark.parametrize(
+    ("landed", "modes", "is_ours"),
+    [
+        (MavLandedState.ON_GROUND, [], True),
+        (MavLandedState.IN_AIR, [], False),  # a pilot has taken off in the mode in which this program has armed
+        (MavLandedState.ON_GROUND, ["AUTO"], False),  # a pilot has restored this mode
+    ],
+)
+def test_mode_of_arming_is_ours_until_left_or_airborne(landed: int, modes: list[str], is_ours: bool) -> None:
+    states: Any = SimpleNamespace(landed_state=SimpleNamespace(latest=landed, age=0.0))
+    vehicle: Any = SimpleNamespace(mode_name="STABILIZE", is_armed=True, telemetry=states)
+    options = make_parser("fly").parse_args(["fly", "m.waypoints"])
+    report: Any = SimpleNamespace(print_line=print)
+    flight = PlanFlight(vehicle, read_plan("m.waypoints"), report, InterruptStack(), options)
+    flight._modes_armed_in.add("STABILIZE")
+    for mode in modes:
+        flight._on_mode(None, Mode(mode, 3))
+    vehicle.autopilot = SimpleNamespace(mode_for=lambda *_, **__: None)
+    vehicle.is_vtol = False
+    assert flight._is_in_our_mode is is_ours
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from cli_harness import ctrl_c, records
 
-from aerokit.apps.cli import main
+from aerokit.apps.cli import hub, main
 from aerokit.apps.cli.hub import _endpoints
 from aerokit.apps.cli.main import make_parser
 from aerokit.errors import InvalidArgument
@@ -97,9 +97,9 @@ def test_hub_forwards_frames_prints_events_and_records(tmp_path: Path, capsys: p
         while not any(each["type"] == "hub" for each in printed):
             await asyncio.sleep(0.01)
             printed += records(capsys.readouterr().out)
-        (hub,) = (each for each in printed if each["type"] == "hub")
+        (started,) = (each for each in printed if each["type"] == "hub")
         assert [each["kind"] for each in printed if each["type"] == "hub_event"] == ["opened", "opened"]
-        host, _, port = hub["endpoints"][0].partition(":")[2].rpartition(":")
+        host, _, port = started["endpoints"][0].partition(":")[2].rpartition(":")
         _, writer = await asyncio.open_connection(host, int(port))
         writer.write(FrameEncoder(1, 1).encode(COPTER))
         printed.clear()
@@ -125,6 +125,17 @@ def test_hub_prints_statistics_as_text(capsys: pytest.CaptureFixture[str]) -> No
     assert lines[0].startswith("a: tcpin:127.0.0.1:")
     assert lines[1] == "1 endpoint, for 0.1 s"
     assert lines[-1] == "a: 0 frames in, 0 out, 0 lost; systems none"
+
+
+def test_hub_prints_nothing_while_terminal_is_stopped(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Printing would block, and the hub would forward nothing."""
+    monkeypatch.setattr(hub, "can_print", lambda: False)
+    assert main(["hub", "a=tcpin:127.0.0.1:0", "--seconds", "0.3", "--every", "0.1"]) == 0
+    first, last = capsys.readouterr().out.splitlines()
+    assert first == "1 endpoint, for 0.3 s"
+    assert last == "a: 0 frames in, 0 out, 0 lost; systems none"
 
 
 def test_hub_empty_recording_is_removed(tmp_path: Path) -> None:

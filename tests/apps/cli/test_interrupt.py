@@ -6,6 +6,7 @@ import signal
 import sys
 
 import anyio
+import anyio.lowlevel
 import pytest
 
 from aerokit.apps.cli.terminal import on_interrupt
@@ -47,5 +48,27 @@ def test_on_interrupt_under_nohup_ignores_sighup() -> None:
         anyio.run(go_on)
         assert not printed
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_hang_up_sent_by_shell_and_kernel_interrupts_once() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    calls: list[None] = []
+
+    async def hang_up_twice() -> None:
+        with on_interrupt(lambda: calls.append(None)):
+            for _ in range(2):
+                signal.raise_signal(signal.SIGHUP)
+                await anyio.lowlevel.checkpoint()
+                await anyio.lowlevel.checkpoint()
+            assert len(calls) == 1
+            signal.raise_signal(signal.SIGINT)
+            await anyio.lowlevel.checkpoint()
+            await anyio.lowlevel.checkpoint()
+            assert len(calls) == 2
+
+    try:
+        anyio.run(hang_up_twice)
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -344,6 +344,24 @@ async def test_server_shutdown_holds_vehicle() -> None:
         assert flight.vehicle.mode_name == "BRAKE"
 
 
+async def test_order_after_shutdown_is_refused() -> None:
+    async with open_stage() as stage:
+        await stage.app.aclose()
+        with anyio.fail_after(5):
+            refused = await stage.submit("hold")
+        assert (refused.status_code, refused.json()["error"]) == (503, "Ended")
+        assert stage.app._orders.all() == []
+
+
+async def test_order_at_shutdown_ends_although_it_never_ran() -> None:
+    async with open_stage() as stage:
+        hold = next(each for each in ORDERS if each.name == "hold")
+        record = stage.app._orders.submit(stage.flight.vehicle, hold, {}, "key-of-hold", None)
+        await stage.app.aclose()
+        assert record.ended.is_set()
+        assert (record.state, record.problem and record.problem["error"]) == ("failed", "Ended")
+
+
 async def test_read_only_server_refuses_commands() -> None:
     async with open_stage(read_only=True, open_reading=True) as stage:
         for kind in ORDERS:

@@ -162,8 +162,8 @@ class _SquareFlight(SupervisedFlight):
         self._print(f"ready, home is {home.latitude_deg:.6f}, {home.longitude_deg:.6f}; arming")
         await self._arm()
         self._print(f"armed; taking off to {altitude_m:g} m")
-        self._has_changed_mode = True  # from now on, a mode change by another party ends this program's control
         await vehicle.take_off(altitude_m)
+        self._has_changed_mode = True  # from now on, a mode change by another party ends this program's control
         self._print("at altitude; flying the square")
 
     def _our_purposes(self) -> tuple[Purpose, ...]:

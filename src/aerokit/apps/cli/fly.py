@@ -67,9 +67,10 @@ class PlanFlight(SupervisedFlight):
         self.sent_text = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
         self.sent_text = "the plan is on the vehicle, nothing was armed"
+        # Other stations cannot reach a simulated vehicle.
+        uploaded_mission = () if self._options.sim else await self._download_mission()
         if self._options.record is not None:
             await record_parameters(vehicle, self._print)
-        confirmed_mission = await self._download_mission() if self._needs_confirmation else ()
         self._print("waiting until the vehicle is ready")
         await vehicle.wait_ready(timeout=self._options.ready)
         for warning in self._warnings():
@@ -78,10 +79,8 @@ class PlanFlight(SupervisedFlight):
             self._print("not confirmed; nothing was started")
             return FAILED
         self._check_disarmed()  # once more, because much may have happened before the user answered
-        if self._needs_confirmation and await self._download_mission() != confirmed_mission:
-            raise OperationRejected(
-                "the mission on the vehicle changed while aerokit waited for your confirmation; nothing was started"
-            )
+        if not self._options.sim and await self._download_mission() != uploaded_mission:
+            raise OperationRejected("the mission on the vehicle changed after the upload; nothing was started")
         self._print("arming")
         await self._arm()
         progress = asyncio.create_task(self._print_progress())

@@ -12,7 +12,7 @@ import anyio
 from aerokit.apps.cli.arguments import add_baud, add_record, address, number
 from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_signing_key, signing_of
-from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, emit, new_recording, suggestion
+from aerokit.apps.cli.output import DONE, INTERRUPTED, add_json, can_print, emit, new_recording, suggestion
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 
@@ -99,7 +99,7 @@ async def _hub(options: argparse.Namespace) -> int:
     endpoints = _endpoints(options)
     stop = asyncio.Event()
     hub = Hub(endpoints)
-    hub.on_event(lambda event: _emit_hub_event(options, event))
+    hub.on_event(lambda event: _emit_hub_event(options, event) if can_print() else None)
     with on_interrupt(stop.set), new_recording(options.record):
         async with hub:
             if options.record is not None:
@@ -111,7 +111,7 @@ async def _hub(options: argparse.Namespace) -> int:
                 while not stop.is_set():
                     with anyio.move_on_after(options.every):
                         await stop.wait()
-                    if not stop.is_set():
+                    if not stop.is_set() and can_print():
                         _emit_statistics(options, hub)
             _emit_statistics(options, hub)  # totals since the start
     # Without --seconds, Ctrl-C is the normal end of the command.

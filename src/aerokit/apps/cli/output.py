@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import select
 import sys
 from contextlib import contextmanager
 from importlib import import_module
@@ -46,13 +47,28 @@ def emit(options: argparse.Namespace, kind: str, record: Mapping[str, object], t
     """
     if options.json:
         assert "type" not in record, record
-        fields = {"type": kind, **to_jsonable(record)}
-        try:
-            print(json.dumps(fields, ensure_ascii=False), flush=True)
-        except UnicodeEncodeError:
-            print(json.dumps(fields), flush=True)
+        _print_json({"type": kind, **to_jsonable(record)})
     elif text is not None:
         _print(printable(text))
+
+
+def _print_json(fields: Mapping[str, object]) -> None:
+    try:
+        print(json.dumps(fields, ensure_ascii=False), flush=True)
+    except UnicodeEncodeError:
+        print(json.dumps(fields), flush=True)
+
+
+def can_print() -> bool:
+    """Return False while printing to stdout would block: after Ctrl-S, or if a pipe is not read.
+
+    Commands on which vehicles depend must not print then, because heartbeats and forwarding would stop.
+    """
+    try:
+        _, writable, _ = select.select([], [sys.stdout], [], 0)
+    except (OSError, ValueError):  # stdout is no file, or this is Windows, where only sockets can be checked
+        return True
+    return bool(writable)
 
 
 def _print(text: str) -> None:
@@ -71,8 +87,7 @@ def emit_error(error: BaseException, code: int, *, as_json: bool) -> None:
     """Print an error to stderr and, with ``--json``, also as the last object on stdout."""
     text = _text(error)
     if as_json:
-        record = {"type": "error", "error": type(error).__name__, "message": text, "exit_code": code}
-        print(json.dumps(record, ensure_ascii=False), flush=True)
+        _print_json({"type": "error", "error": type(error).__name__, "message": text, "exit_code": code})
     print(f"aerokit: {printable(text)}", file=sys.stderr)
 
 

@@ -8,6 +8,7 @@ import os
 import shlex
 import sys
 from abc import ABC, abstractmethod
+from collections import deque
 from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit import events
-from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, emit, plain_text
+from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, can_print, emit, plain_text
 from aerokit.apps.readiness import arms_but_cannot_fly_text, readiness
 from aerokit.errors import (
     AerokitError,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from typing import Literal
 
     from aerokit.apps.cli.terminal import InterruptStack
+    from aerokit.autopilots.modes import Mode
     from aerokit.position import Position
     from aerokit.vehicle.state.movement import Velocity
     from aerokit.vehicle.vehicle import Vehicle
@@ -58,6 +60,7 @@ _WARNING_SEVERITY = 4
 # If nothing was printed for this time, a status line is printed.
 _STATUS_INTERVAL_S = 5.0
 _MIN_STEP_M = 1.0
+_MAX_UNPRINTED = 1000  # lines that wait for a stopped terminal; further lines replace the oldest
 
 
 class SupervisedFlight(ABC):
@@ -79,6 +82,7 @@ class SupervisedFlight(ABC):
         self._may_arm_late = False  # True while the result of a sent arm command is unknown
         self._modes_armed_in: set[str] = set()
         self._has_changed_mode = False  # True once a command of this program has changed the mode after arming
+        self._has_left_mode = False  # True once the armed vehicle was in a mode other than those it was armed in
 
     async def fly(self) -> int:
         """Perform the flight and return the exit code. After an error, make an armed vehicle safe and re-raise."""
@@ -130,6 +134,10 @@ class SupervisedFlight(ABC):
             raise
         self._may_arm_late = False
         self._modes_armed_in.add(self._vehicle.mode_name)
+        self._vehicle.mode.observe(self._on_mode)
+
+    def _on_mode(self, _: Mode | None, mode: Mode) -> None:
+        self._has_left_mode = self._has_left_mode or mode.name not in self._modes_armed_in
 
     async def _wait_disarmed_on_ground(self) -> None:
         if is_reported_on_ground(self._vehicle.telemetry):
@@ -233,8 +241,8 @@ class SupervisedFlight(ABC):
     @property
     def _is_in_our_mode(self) -> bool:
         vehicle = self._vehicle
-        if not self._has_changed_mode and vehicle.mode_name in self._modes_armed_in:
-            return True
+        if not (self._has_changed_mode or self._has_left_mode) and vehicle.mode_name in self._modes_armed_in:
+            return self._is_armed_on_ground  # In this mode, only a pilot can have taken off.
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 
@@ -261,6 +269,8 @@ class FlightReport:
         self._fastest_m_s = 0.0
         self._flown_m = 0.0
         self._previous_position: Position | None = None
+        # Arguments of `emit` that wait until the output accepts them, oldest first.
+        self._unprinted: deque[tuple[str, Mapping[str, object], str]] = deque(maxlen=_MAX_UNPRINTED)
         self.prints_status: bool = True
         """True if status lines are printed when there is no other output. Set it to False during questions."""
 
@@ -351,7 +361,7 @@ class FlightReport:
             lines.append(f"next: aerokit report {force}{shlex.quote(recorded_in)}")
         else:
             lines += [frames, "next time: --record FILE.tlog records the flight for `aerokit report FILE.tlog`"]
-        self._emit("flight_summary", record, "\n".join(lines))
+        self._emit("flight_summary", record, "\n".join(lines), waits=True)  # the flight is over, so this may block
 
     def _describe_armed(self, speed: float) -> str:
         """Return "armed for 47 s", with notes on the time until an impact and on the speed of a simulation.
@@ -438,9 +448,11 @@ class FlightReport:
         self._highest_m = max(self._highest_m, position.altitude_relative_m or 0.0)
         self._fastest_m_s = max(self._fastest_m_s, self._vehicle.ground_speed_m_s.latest or 0.0)
 
-    def _emit(self, kind: str, record: Mapping[str, object], text: str) -> None:
+    def _emit(self, kind: str, record: Mapping[str, object], text: str, *, waits: bool = False) -> None:
+        self._unprinted.append((kind, record, text))
         try:
-            emit(self._options, kind, record, text)
+            while self._unprinted and (waits or can_print()):
+                emit(self._options, *self._unprinted.popleft())
         except OSError:
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - used until the process ends
 

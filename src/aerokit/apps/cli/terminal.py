@@ -101,12 +101,21 @@ def on_interrupt(
     """Within the block, SIGINT, SIGTERM and SIGHUP only call ``callback`` on the running loop.
 
     Before that, ``at_once(number)`` is called in the signal handler, so it is called even if the loop is blocked.
+
+    SIGHUP counts once. When a terminal or an SSH session ends, both the shell and the kernel send it, a moment apart.
+    The second one must not be taken for another Ctrl-C, which would end what makes the vehicle safe.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()
     previous_handlers = [signal.getsignal(number) for number in signals]
+    has_hung_up = False
 
     def handle(number: int, _: object) -> None:
+        nonlocal has_hung_up
+        if number not in (signal.SIGINT, signal.SIGTERM):
+            if has_hung_up:
+                return
+            has_hung_up = True
         at_once(number)
         loop.call_soon_threadsafe(callback)
 

@@ -312,7 +312,7 @@ class OrderRunner:
 
         Raises:
             HttpProblem: the key is missing, or was used for another order or for one whose result is no longer stored;
-                the client has only seen an old state; or ``force`` is not allowed.
+                the client has only seen an old state; ``force`` is not allowed; or the server has ended.
             FileFormatError, InvalidArgument: the arguments cannot be parsed.
             BusyError: too many orders are running.
             HeartbeatTimeout: the vehicle is silent.
@@ -341,9 +341,12 @@ class OrderRunner:
         self._check(vehicle, order_type, recorded_arguments, seen_at_s)
         unix_s = vehicle.connection.unix_time()
         record = OrderRecord(key, vehicle.system_id, order_type.name, recorded_arguments, unix_s)
-        self._store(record)
         run = partial(self._run, vehicle, order_type, record, arguments)
-        self._background.start(run, f"aerokit serve {order_type.name}")
+        task = self._background.start(run, f"aerokit serve {order_type.name}")
+        if task is None:
+            raise HttpProblem(503, "Ended", "the server has ended; nothing was sent")
+        task.add_done_callback(lambda _: self._end_unstarted(vehicle, record))
+        self._store(record)
         self._publish(record)
         return record
 
@@ -429,6 +432,15 @@ class OrderRunner:
             if record.problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
+            record.ended_unix_s = vehicle.connection.unix_time()
+            record.ended.set()
+            self._publish(record)
+
+    def _end_unstarted(self, vehicle: Vehicle, record: OrderRecord) -> None:
+        """End an order whose task was cancelled before its first step, so that no request waits for it."""
+        if not record.ended.is_set():
+            record.state = "failed"
+            record.problem = problem_of(HttpProblem(503, "Ended", "the server has ended; nothing was sent"))
             record.ended_unix_s = vehicle.connection.unix_time()
             record.ended.set()
             self._publish(record)
