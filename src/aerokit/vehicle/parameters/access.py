@@ -354,7 +354,7 @@ class ParameterAccess:
         """Forget what earlier writes have set, because the vehicle may have another value from now on."""
         for name in names:
             self.written.pop(name, None)
-            self.store.clear_replaced(name)
+            self.store.unmark_replaced(name)
 
     def _recently_written(self) -> set[str]:
         """Return the names for which a late answer to a write may arrive. Their next write is therefore read back."""

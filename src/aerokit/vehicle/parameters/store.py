@@ -76,7 +76,7 @@ class ParameterStore:
         """
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
-    def clear_replaced(self, name: str) -> None:
+    def unmark_replaced(self, name: str) -> None:
         """Stop ignoring messages with the replaced value, because a new write may set this value again."""
         self._replaced.pop(name, None)
 
