@@ -193,9 +193,9 @@ class StateCell(Generic[T]):
         return await waiter.wait(timeout, description)
 
     def changes(self) -> Changes[T]:
-        """Iterate over the current value, if there is one, and all later values that differ from the value before.
+        """Iterate over the current value, if there is one, and then over each change of the value.
 
-        A slow reader gets only the latest value. The loop can be left at any time.
+        A reader that is slower than the changes skips to the latest value. The loop can be left at any time.
         """
         return Changes(self, every_arrival=False)
 

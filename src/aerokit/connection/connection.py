@@ -207,7 +207,7 @@ class Connection:
             self._heartbeat.activity.feed()
 
     def _use_activity_monitor(self, activity: ActivityMonitor) -> None:
-        """Pause our heartbeat when the program's own threads hang, although the loop's thread keeps running."""
+        """Pause our heartbeat when the program's own threads hang, even if the event loop's thread still runs."""
         if self._heartbeat is not None:
             self._heartbeat.watch(activity, BLOCKING_MAX_IDLE_S)
 

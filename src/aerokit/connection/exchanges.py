@@ -34,7 +34,7 @@ async def run_exchange(connection: Connection, system_id: int, exchange: Exchang
 
 
 class ExchangeRun(Generic[ResultT]):
-    """Drives one exchange: sends the messages of the exchange, and calls it at its deadlines.
+    """Drives one exchange: sends its messages, and informs the exchange when a deadline has passed.
 
     The owner calls :meth:`receive` with each message of the target, and :meth:`abort` when the connection ends.
     """

@@ -39,8 +39,8 @@ class RouteClaim:
     """Evidence on whether a component now sends from another peer of the link.
 
     The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
-    the component claims the route. Its first frame after the owner's last frame decides the claim. The decision is
-    final until the owner sends again, because otherwise a peer could try many sequence numbers.
+    the component claims the route. Of its sequence numbers, only that of its first frame after the owner's last frame
+    counts until the owner sends again, because otherwise a peer could try many sequence numbers.
     """
 
     __slots__ = (

@@ -313,9 +313,9 @@ class StateCell(CellTwin[T]):
         )
 
     def changes(self) -> Changes[T]:
-        """Iterate over the current value, if there is one, and all later values that differ from the value before.
+        """Iterate over the current value, if there is one, and then over each change of the value.
 
-        A slow reader gets only the latest value. The loop can be left at any time.
+        A reader that is slower than the changes skips to the latest value. The loop can be left at any time.
         """
         return Changes(self._loop, self._loop.call(self.aio.changes))
 
@@ -775,13 +775,13 @@ class StickStream(BlockTwin["AsyncStickStream"]):
 
 
 class MeasurementStream(MeasurementTwin[MeasurementT]):
-    """Sends each measurement passed to ``send`` once, at most ``rate_hz`` measurements a second.
+    """Sends the measurements passed to ``send``: each at most once, and at most ``rate_hz`` measurements a second.
 
-    A measurement is never repeated. If your program supplies no new measurement, nothing is sent, and the vehicle
-    behaves as if its sensor had failed. Of several measurements within one period, only the newest is sent. A
-    measurement is dropped if it is older than ``valid_for_s`` when it is due to be sent, for example after the event
-    loop was blocked. While the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count
-    measurements. The stream ends only with its `async with` block.
+    If your program supplies no new measurement, nothing is sent, and the vehicle behaves as if its sensor had failed.
+    Of several measurements within one period, only the newest is sent. A measurement is dropped if it is older than
+    ``valid_for_s`` when it is due to be sent, for example after the event loop was blocked. While the vehicle is
+    silent, all measurements are dropped. ``sent`` and ``dropped`` count measurements. The stream ends only with its
+    `async with` block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.
@@ -910,7 +910,7 @@ class External(TwinOf["AsyncExternal"]):
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
         """Supply optical flow (OPTICAL_FLOW; for PX4 OPTICAL_FLOW_RAD).
 
-        Set FLOW_TYPE to 5 on ArduPilot, EKF2_OF_CTRL on PX4.
+        On ArduPilot, set FLOW_TYPE to 5. On PX4, set EKF2_OF_CTRL to 1.
         """
         return MeasurementStream(
             self._loop,
@@ -974,8 +974,9 @@ class GimbalControl(BlockTwin["AsyncGimbalControl"]):
     Entering takes control from any other station and returns when the manager confirms that you are in control. Leaving
     releases control, without waiting if the block exits by an error or cancellation. When another station takes
     control, aerokit publishes ``GimbalControlLost``, and orders to the gimbal, including running ones, raise
-    :class:`GimbalTaken`. Leaving the block after a loss releases nothing, and raises GimbalTaken unless your program
-    has already seen the loss. Another station that uses your own system and component id cannot be detected.
+    :class:`GimbalTaken`. Leaving the block after a loss releases nothing, and raises GimbalTaken, unless GimbalTaken
+    was raised in the block or :meth:`until_lost` has returned. Another station that uses your own system and component
+    id cannot be detected.
 
     Entering raises:
         NotSupported: the vehicle has no gimbal manager, or its manager has no secondary control.
@@ -1022,11 +1023,12 @@ class GimbalRates(BlockTwin["AsyncGimbalRates"]):
     """Turns a gimbal at the latest rates that the program supplies in the ``async with`` block.
 
     Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. From then on the latest rates are sent at
-    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
-    orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
-    no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
-    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. After a stop,
-    ``set`` and leaving the block raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
+    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block while the stream
+    runs, also by an error, orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself,
+    with a rate of zero, if no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or
+    the vehicle is silent. It stops without sending a rate of zero if another order to the gimbal is given, or if
+    control is lost. After a stop, ``set`` and leaving the block raise :class:`SetpointStreamStopped` or
+    :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -1064,9 +1066,9 @@ class Gimbal(TwinOf["AsyncGimbal"]):
     """One gimbal with the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
-    reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while
-    the vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims control until
-    :meth:`release`.
+    reports the ordered direction, and raises an error when another order is given. While the vehicle moves, the gimbal
+    keeps the direction in the frame of the order, e.g. its yaw from north or from the nose. If the manager requires
+    control, an order outside a block of :meth:`control` claims control until :meth:`release`.
     """
 
     @cached_property
@@ -1936,9 +1938,10 @@ class Actuators(TwinOf["AsyncActuators"]):
 class Gripper(TwinOf["AsyncGripper"]):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
-    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
-    reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
-    three seconds later. Orders are sent once. If you cancel a call, the gripper may still have moved.
+    Enable it by PD_GRIPPER_EN on PX4, by GRIP_ENABLE on ArduPilot. PX4 acknowledges when the gripper has moved.
+    ArduPilot acknowledges at once and reports the end by a status text; for an electro-permanent gripper it reports
+    only the start, and the call returns three seconds later. Orders are sent once. If you cancel a call, the gripper
+    may still have moved.
     """
 
     def grab(self) -> None:
@@ -1969,7 +1972,7 @@ class Winch(TwinOf["AsyncWinch"]):
 
     @cached_property
     def status(self) -> StateCell[WinchStatus]:
-        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS): ``vehicle.winch_status``."""
+        """Length, speed, tension and state of the autopilot's winch; the same cell as ``vehicle.winch_status``."""
         return StateCell(self._loop, self.aio.status)
 
     def relax(self) -> None:
@@ -2049,15 +2052,15 @@ class Winch(TwinOf["AsyncWinch"]):
         self._loop.run(self.aio.retract, timeout=timeout)
 
     def load_line(self) -> None:
-        """Turn slowly to load new line. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
+        """Load new line onto the winch. Returns when WINCH_STATUS reports LOAD_LINE. Raises as :meth:`retract`."""
         self._loop.run(self.aio.load_line)
 
     def abandon_line(self) -> None:
-        """Spool out all line and drop it. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
+        """Spool out the entire line. Returns when WINCH_STATUS reports ABANDON_LINE. Raises as :meth:`retract`."""
         self._loop.run(self.aio.abandon_line)
 
     def load_payload(self) -> None:
-        """Run slowly to attach a payload. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
+        """Present the hook for a payload. Returns when WINCH_STATUS reports LOAD_PAYLOAD. Raises as :meth:`retract`."""
         self._loop.run(self.aio.load_payload)
 
 
@@ -2462,16 +2465,16 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
     def compass(self) -> Calibration:
         """Calibrate all compasses, while a person turns the vehicle about all its axes.
 
-        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 asks for up to six
-        poses, and for a turn about the vertical axis in each.
+        ArduPilot reports progress and fitness of each compass; reboot it afterwards. PX4 asks for up to six poses,
+        and for a turn about the vertical axis in each.
         """
         return Calibration(self._loop, self._loop.call(self.aio.compass))
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
 
-        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects the poses itself, in
-        any order.
+        ArduPilot waits for a confirmation in each pose; reboot it afterwards. PX4 detects the poses itself, in any
+        order.
         """
         return Calibration(self._loop, self._loop.call(self.aio.accelerometer))
 
@@ -2491,7 +2494,7 @@ class CalibrationControl(TwinOf["AsyncCalibrationControl"]):
         return Calibration(self._loop, self._loop.call(self.aio.barometer))
 
     def airspeed(self) -> Calibration:
-        """Calibrate the airspeed sensors, first sheltered from wind; PX4 then asks a person to blow into the tube."""
+        """Calibrate the airspeed sensors. Shelter them from wind; PX4 later asks a person to blow into the tube."""
         return Calibration(self._loop, self._loop.call(self.aio.airspeed))
 
     def radio(self) -> Calibration:
@@ -3033,7 +3036,7 @@ class PhotoInterval(PhotoIntervalTwin):
 
     @property
     def missed(self) -> int:
-        """Number of photos whose captures could not be received."""
+        """Number of photos that were taken, but whose captures (the reports) were not received."""
         return self.aio.missed
 
 
@@ -3548,7 +3551,7 @@ class Settings(TwinOf["AsyncSettings"]):
         )
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting, by name, that the known values of other settings allow.
+        """Return those options of a setting, as {name: value}, that the known values of other settings allow.
 
         Empty without a definition, and for settings without options.
         """
@@ -3775,8 +3778,8 @@ class Vehicle(VehicleTwin):
 
     Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
     ``.fresh(within=1)``, ``await vehicle.mode.wait_until(...)``) in SI units and degrees, with the unit in the name.
-    Other threads may read the cells. Sub-objects (``mission``, ``parameters`` …) are created on first use, in the
-    event loop's thread.
+    Other threads may read the cells. Sub-objects (``mission``, ``parameters`` …) are created on first use; with
+    asyncio, use them first in the event loop's thread.
     """
 
     @cached_property
@@ -5062,7 +5065,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def camera(self) -> Camera:
-        """The first camera found. Cameras attached to the autopilot come after cameras with their own component id.
+        """The first camera found with its own component id; if none was found, one attached to the autopilot.
 
         The calls of this object wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
@@ -5130,7 +5133,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def external(self) -> External:
-        """Measurements from your program for the estimator: odometry, vision, GPS, obstacles, ranges, origin, wind."""
+        """Measurements from your program for the autopilot: odometry, vision, GPS, obstacles, ranges, origin, wind."""
         return self._part("external", External)
 
     def land_on(

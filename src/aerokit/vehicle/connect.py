@@ -329,7 +329,7 @@ class _Search:
         return result
 
     def close(self) -> None:
-        """Close the vehicle if the caller was cancelled before it received the result."""
+        """End the search. Close a vehicle that was found, unless :meth:`result` has returned it to the caller."""
         self._ended.set()
         if self._found is not None:
             context, vehicle, _ = self._found

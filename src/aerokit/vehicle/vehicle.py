@@ -71,8 +71,8 @@ class Vehicle(
 
     Create it with :func:`aerokit.connect`. State is held in cells (``vehicle.position.value``, ``.age``,
     ``.fresh(within=1)``, ``await vehicle.mode.wait_until(...)``) in SI units and degrees, with the unit in the name.
-    Other threads may read the cells. Sub-objects (``mission``, ``parameters`` …) are created on first use, in the
-    event loop's thread.
+    Other threads may read the cells. Sub-objects (``mission``, ``parameters`` …) are created on first use; with
+    asyncio, use them first in the event loop's thread.
     """
 
     def __init__(self, context: VehicleContext) -> None:
@@ -115,7 +115,7 @@ class Vehicle(
 
     @property
     def camera(self) -> Camera:
-        """The first camera found. Cameras attached to the autopilot come after cameras with their own component id.
+        """The first camera found with its own component id; if none was found, one attached to the autopilot.
 
         The calls of this object wait briefly until a camera is found. ``camera_at`` returns any other camera.
         """
@@ -184,7 +184,7 @@ class Vehicle(
 
     @cached_property
     def external(self) -> External:
-        """Measurements from your program for the estimator: odometry, vision, GPS, obstacles, ranges, origin, wind."""
+        """Measurements from your program for the autopilot: odometry, vision, GPS, obstacles, ranges, origin, wind."""
         from aerokit.vehicle.external.external import External
 
         return External(self._context, self.parameters.probe)

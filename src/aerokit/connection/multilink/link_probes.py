@@ -40,8 +40,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, an idle costly link every five seconds.
 
-    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again if the
-    link led to the known vehicle in between. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again only
+    after the link has led back to the known vehicle. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(

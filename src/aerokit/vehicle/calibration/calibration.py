@@ -125,16 +125,16 @@ class CalibrationControl:
     def compass(self) -> Calibration:
         """Calibrate all compasses, while a person turns the vehicle about all its axes.
 
-        ArduPilot reports progress and fitness of each compass, and must reboot afterwards. PX4 asks for up to six
-        poses, and for a turn about the vertical axis in each.
+        ArduPilot reports progress and fitness of each compass; reboot it afterwards. PX4 asks for up to six poses,
+        and for a turn about the vertical axis in each.
         """
         return self._prepare("compass", procedures.ardupilot_compass, command_param=2)
 
     def accelerometer(self) -> Calibration:
         """Calibrate the accelerometers in six poses.
 
-        ArduPilot waits for a confirmation in each pose, and must reboot afterwards. PX4 detects the poses itself, in
-        any order.
+        ArduPilot waits for a confirmation in each pose; reboot it afterwards. PX4 detects the poses itself, in any
+        order.
         """
         return self._prepare("accelerometer", procedures.ardupilot_accelerometer, command_param=5)
 
@@ -155,7 +155,7 @@ class CalibrationControl:
         return self._prepare("barometer", _acknowledged("shelter the vehicle from wind"), command_param=3)
 
     def airspeed(self) -> Calibration:
-        """Calibrate the airspeed sensors, first sheltered from wind; PX4 then asks a person to blow into the tube."""
+        """Calibrate the airspeed sensors. Shelter them from wind; PX4 later asks a person to blow into the tube."""
         return self._prepare("airspeed", procedures.ardupilot_airspeed, command_param=6, param_value=2)
 
     def radio(self) -> Calibration:

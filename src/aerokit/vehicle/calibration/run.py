@@ -117,7 +117,7 @@ class CalibrationRun:
                 raise
 
     async def start(self, *params: float, command: int = MavCmd.PREFLIGHT_CALIBRATION) -> None:
-        """Send the command that starts the calibration. If the vehicle refuses, the calibration is not running."""
+        """Send the command that starts the calibration. If the vehicle refuses, end this run and raise the error."""
         try:
             await self.command(command, *params)
         except CommandRejected:

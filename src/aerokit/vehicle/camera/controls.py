@@ -144,7 +144,7 @@ class LensMixin(CameraMixin):
     async def _set(
         self, action: str, capability: str, command: int, kind: int, value: float, *, attempts: int = 4
     ) -> None:
-        """Send a zoom or focus command once the camera's capabilities allow it."""
+        """Send a zoom or focus command. Raises NotSupported if the camera lacks the capability."""
         await self._link.require_capability(action, capability)
         with self._link.new_order(ORDER_SUBJECTS[command]) as order:
             await self._link.command(command, kind, value, self._link.device_id, order=order, attempts=attempts)

@@ -89,7 +89,7 @@ class CameraLink(CameraOrders):
 
     @property
     def video_stream(self) -> int:
-        """Stream id for recording commands; 0 means all streams."""
+        """Stream id in recording commands: 0 (all streams), or the camera's device id if the autopilot expects that."""
         return self.device_id if self._session.autopilot.video_addresses_camera else 0
 
     @property
@@ -105,7 +105,7 @@ class CameraLink(CameraOrders):
             self._session.publish(event_type, *fields, self.component.component_id)
 
     def call_later(self, seconds: float, action: Callable[[], None]) -> None:
-        """Call ``action`` after a delay, unless the vehicle is released earlier."""
+        """Call ``action`` after a delay, unless the vehicle's block exits earlier."""
 
         async def wait() -> None:
             await anyio.sleep(seconds)

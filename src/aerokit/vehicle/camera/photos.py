@@ -202,7 +202,7 @@ def _is_new(capture: Capture, before: CameraStatus | None, known_indices: set[in
 
 
 def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
-    """Return True if the camera certainly has taken no picture between the two reports, and is taking none."""
+    """Return True if the image count has not risen between the two reports, and the camera is not capturing now."""
     return before is not None and status.image_count <= before.image_count and not status.is_capturing
 
 
@@ -244,7 +244,7 @@ class PhotoInterval:
 
     @property
     def missed(self) -> int:
-        """Number of photos whose captures could not be received."""
+        """Number of photos that were taken, but whose captures (the reports) were not received."""
         return self._missed
 
     async def __aenter__(self) -> Self:
@@ -366,7 +366,7 @@ class PhotoInterval:
                     self._set_newest(capture.index)
 
     def _set_newest(self, index: int) -> None:
-        """Record the highest index so far."""
+        """Record ``index`` as the newest index, and the present time as its time."""
         self._newest_index = index
         self._newest_at = self._link.now()
 
@@ -379,7 +379,7 @@ class PhotoInterval:
         return index <= self._newest_index + self._max_new_captures()
 
     def _contradicts_guess(self, index: int) -> bool:
-        """Return True if this index is so far below the first index that the first index must have been corrupt."""
+        """Return True if this index is so far below the expected next one that the guessed start must be corrupt."""
         return (
             self._is_start_guessed
             and self._next_index is not None

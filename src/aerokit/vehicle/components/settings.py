@@ -153,7 +153,7 @@ class Settings:
             return self.load(parse_definition(data, uri), locale=locale)
 
     def options(self, name: str) -> Mapping[str, SettingValue]:
-        """Return the options of a setting, by name, that the known values of other settings allow.
+        """Return those options of a setting, as {name: value}, that the known values of other settings allow.
 
         Empty without a definition, and for settings without options.
         """
@@ -316,7 +316,7 @@ class Settings:
         return await transfers.run(exchange)
 
     async def _read_again(self, names: Iterable[str], idle_timeout_s: float) -> None:
-        """Read settings that may have changed. The values of those that cannot be read are discarded."""
+        """Read settings that may have changed, except write-only ones. If a read fails, discard the known value."""
         assert self._definition is not None
         settings = self._definition.settings
         readable = [name for name in names if name in settings and not settings[name].write_only]

@@ -26,9 +26,10 @@ END_TEXTS = {GripperActions.GRAB: "Gripper load grabbed", GripperActions.RELEASE
 class Gripper(ReadOnly):
     """One gripper: ``vehicle.gripper()`` (MAV_CMD_DO_GRIPPER).
 
-    PX4 acknowledges when the gripper has moved (PD_GRIPPER_EN). ArduPilot (GRIP_ENABLE) acknowledges at once and
-    reports the end by a status text. For an electro-permanent gripper it reports only the start, and the call returns
-    three seconds later. Orders are sent once. If you cancel a call, the gripper may still have moved.
+    Enable it by PD_GRIPPER_EN on PX4, by GRIP_ENABLE on ArduPilot. PX4 acknowledges when the gripper has moved.
+    ArduPilot acknowledges at once and reports the end by a status text; for an electro-permanent gripper it reports
+    only the start, and the call returns three seconds later. Orders are sent once. If you cancel a call, the gripper
+    may still have moved.
     """
 
     def __init__(self, context: VehicleContext, number: int) -> None:

@@ -48,7 +48,7 @@ class Winch(ReadOnly):
 
     @property
     def status(self) -> StateCell[WinchStatus]:
-        """Length, speed, tension and state of the autopilot's winch (WINCH_STATUS): ``vehicle.winch_status``."""
+        """Length, speed, tension and state of the autopilot's winch; the same cell as ``vehicle.winch_status``."""
         cell: StateCell[WinchStatus] = self._context.session.telemetry.cells["winch_status"]
         return cell
 
@@ -154,15 +154,15 @@ class Winch(ReadOnly):
         await self._send_until(MavWinchStatusFlag.FULLY_RETRACTED, WinchActions.RETRACT, timeout)
 
     async def load_line(self) -> None:
-        """Turn slowly to load new line. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
+        """Load new line onto the winch. Returns when WINCH_STATUS reports LOAD_LINE. Raises as :meth:`retract`."""
         await self._send_until(MavWinchStatusFlag.LOAD_LINE, WinchActions.LOAD_LINE)
 
     async def abandon_line(self) -> None:
-        """Spool out all line and drop it. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
+        """Spool out the entire line. Returns when WINCH_STATUS reports ABANDON_LINE. Raises as :meth:`retract`."""
         await self._send_until(MavWinchStatusFlag.ABANDON_LINE, WinchActions.ABANDON_LINE)
 
     async def load_payload(self) -> None:
-        """Run slowly to attach a payload. Returns when WINCH_STATUS reports this state. Raises as :meth:`retract`."""
+        """Present the hook for a payload. Returns when WINCH_STATUS reports LOAD_PAYLOAD. Raises as :meth:`retract`."""
         await self._send_until(MavWinchStatusFlag.LOAD_PAYLOAD, WinchActions.LOAD_PAYLOAD)
 
     async def _send_until(

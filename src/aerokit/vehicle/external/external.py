@@ -101,7 +101,7 @@ class External:
     def optical_flow(self, *, rate_hz: float = 30.0, valid_for_s: float = 0.2) -> MeasurementStream[FlowMeasurement]:
         """Supply optical flow (OPTICAL_FLOW; for PX4 OPTICAL_FLOW_RAD).
 
-        Set FLOW_TYPE to 5 on ArduPilot, EKF2_OF_CTRL on PX4.
+        On ArduPilot, set FLOW_TYPE to 5. On PX4, set EKF2_OF_CTRL to 1.
         """
         return self._stream("optical_flow", FlowMeasurement, self._encode.optical_flow, rate_hz, valid_for_s)
 

@@ -73,13 +73,13 @@ class TimesyncAnswers:
 
 @checks_arguments
 class MeasurementStream(Generic[MeasurementT]):
-    """Sends each measurement passed to ``send`` once, at most ``rate_hz`` measurements a second.
+    """Sends the measurements passed to ``send``: each at most once, and at most ``rate_hz`` measurements a second.
 
-    A measurement is never repeated. If your program supplies no new measurement, nothing is sent, and the vehicle
-    behaves as if its sensor had failed. Of several measurements within one period, only the newest is sent. A
-    measurement is dropped if it is older than ``valid_for_s`` when it is due to be sent, for example after the event
-    loop was blocked. While the vehicle is silent, all measurements are dropped. ``sent`` and ``dropped`` count
-    measurements. The stream ends only with its `async with` block.
+    If your program supplies no new measurement, nothing is sent, and the vehicle behaves as if its sensor had failed.
+    Of several measurements within one period, only the newest is sent. A measurement is dropped if it is older than
+    ``valid_for_s`` when it is due to be sent, for example after the event loop was blocked. While the vehicle is
+    silent, all measurements are dropped. ``sent`` and ``dropped`` count measurements. The stream ends only with its
+    `async with` block.
 
     Entering raises:
         NotSupported: this firmware does not read such measurements. Nothing was sent.

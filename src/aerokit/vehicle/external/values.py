@@ -180,10 +180,10 @@ class TargetMeasurement(Snapshot):
 class FlowMeasurement(Snapshot):
     """Optical flow of a camera that looks down (OPTICAL_FLOW, OPTICAL_FLOW_RAD).
 
-    ``x_rad`` and ``y_rad`` are the angles about the body's forward and right axes by which the ground moved in the
-    picture within ``interval_s``. ``gyro_rad`` are the angles by which the camera itself turned about all three axes.
-    ``quality`` is from 0 to 255. Send every measurement without gaps, because ArduPilot takes the time between two
-    messages as ``interval_s``.
+    ``x_rad`` and ``y_rad`` are the angles about the body's forward and right axes by which the camera seems to have
+    turned within ``interval_s``, judged by the ground in its picture. They include its real turn, whose angles about
+    all three axes are ``gyro_rad``. ``quality`` is from 0 to 255. Send every measurement without gaps, because
+    ArduPilot takes the time between two messages as ``interval_s``.
     """
 
     x_rad: float

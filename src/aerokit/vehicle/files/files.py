@@ -386,7 +386,7 @@ class Files:
 
 
 class _ShorterError(Exception):
-    """The vehicle's file is shorter than the part of an interrupted download."""
+    """The vehicle's file is shorter than what an interrupted download has already received."""
 
 
 def _content_of(source: str | os.PathLike[str]) -> bytes:

@@ -140,7 +140,7 @@ class LogStream(ReadOnly):
         self._detach()
 
     def _acknowledge(self, message: LoggingDataAcked) -> None:
-        """Acknowledge a message at once. PX4 repeats a message every 50 ms, and stops after 50 attempts."""
+        """Acknowledge a message at once. PX4 repeats it every 50 ms until then, and ends the stream after 50 times."""
         session = self._context.session
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 

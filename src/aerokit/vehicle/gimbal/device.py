@@ -144,7 +144,7 @@ ATTITUDE_MESSAGES = "GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION"
 
 
 class ControlBlock(Protocol):
-    """Interface of the blocks that control a gimbal."""
+    """Interface of the ``async with`` blocks that control a gimbal."""
 
     @property
     def is_held(self) -> bool: ...
@@ -213,7 +213,7 @@ class GimbalDevice:
 
     @property
     def is_in_use(self) -> bool:
-        """True while this program controls the gimbal or waits for an order to it."""
+        """True while this program controls the gimbal, or while an order to the gimbal is unfinished."""
         return bool(self.control_blocks or self.pending_orders)
 
     @contextmanager
@@ -233,7 +233,7 @@ class GimbalDevice:
         self.failures = message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
-        """Set the controllers from a status; return False for a late status, which is older than the newest one."""
+        """Set the controllers from a status; return False if it arrived late (see ``REORDER_WINDOW_MS``)."""
         older_by_ms = self._status_ms - message.time_boot_ms
         if 0 < older_by_ms < REORDER_WINDOW_MS:
             return False

@@ -68,7 +68,7 @@ class GimbalRegistry:
 
     @property
     def first_reporting(self) -> GimbalDevice | None:
-        """The first of the gimbals that have reported their attitude."""
+        """The gimbal that comes first by ``sort_key`` among those that have reported their attitude."""
         reporting = [device for device in self.devices.values() if device.attitude.is_known]
         return min(reporting, key=self.sort_key, default=None)
 

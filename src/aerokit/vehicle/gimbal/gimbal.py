@@ -183,9 +183,9 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
     """One gimbal with the gimbal protocol v2 (https://mavlink.io/en/services/gimbal_v2.html), or an older mount.
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
-    reports the ordered direction, and raises an error when another order is given. The gimbal keeps the direction while
-    the vehicle moves. If the manager requires control, an order outside a block of :meth:`control` claims control until
-    :meth:`release`.
+    reports the ordered direction, and raises an error when another order is given. While the vehicle moves, the gimbal
+    keeps the direction in the frame of the order, e.g. its yaw from north or from the nose. If the manager requires
+    control, an order outside a block of :meth:`control` claims control until :meth:`release`.
     """
 
     async def information(self) -> GimbalInformation:

@@ -43,7 +43,7 @@ STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Orders to one gimbal, or to the first gimbal. A new order ends the wait for the previous one."""
+    """Orders to ``device``, or if None, to the present first gimbal. A new order ends the wait for the previous one."""
 
     def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
         self.context: VehicleContext = context
@@ -65,7 +65,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        """The device that reports the attitude; the placeholder if only an old mount (MOUNT_STATUS) reports it."""
+        """The device with the attitude. For the first gimbal: the placeholder (MOUNT_STATUS) until a gimbal reports."""
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 

@@ -32,11 +32,12 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     """Turns a gimbal at the latest rates that the program supplies in the ``async with`` block.
 
     Entering orders the first rates by MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. From then on the latest rates are sent at
-    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block in any way
-    orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself, with a rate of zero, if
-    no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or the vehicle is silent. It
-    stops without sending a rate of zero if another order to the gimbal is given, or if control is lost. After a stop,
-    ``set`` and leaving the block raise :class:`SetpointStreamStopped` or :class:`GimbalTaken`.
+    ``rate_hz`` (GIMBAL_MANAGER_SET_PITCHYAW, or GIMBAL_MANAGER_SET_ATTITUDE to PX4). Leaving the block while the stream
+    runs, also by an error, orders a rate of zero, so that the gimbal keeps its direction. The stream stops by itself,
+    with a rate of zero, if no new rates are set for ``valid_for_s``, the event loop is blocked for ``max_lag_s``, or
+    the vehicle is silent. It stops without sending a rate of zero if another order to the gimbal is given, or if
+    control is lost. After a stop, ``set`` and leaving the block raise :class:`SetpointStreamStopped` or
+    :class:`GimbalTaken`.
 
     Entering raises:
         InvalidArgument: a rate is out of range. Nothing was sent.
@@ -134,7 +135,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._session.connection.send(self._encode_rates(self._value))  # The message depends on the present manager.
 
     def _encode_rates(self, rates: tuple[float, float]) -> Message:
-        """Return the message for these rates (pitch, yaw) that the manager supports."""
+        """Encode these rates (pitch, yaw) in the type of message that the manager supports."""
         orders = self._orders
         pitch_rate, yaw_rate = map(math.radians, rates)
         first_fields = (self._session.system_id, orders.manager_id, self._flags, orders.gimbal_id_param)

@@ -93,7 +93,7 @@ class PlanContext:
         return self.session.connection.now()
 
     def offset_of(self, mission_type: int) -> int:
-        """Offset of the vehicle's item numbers: 1 if the vehicle's item 0 is home, otherwise 0."""
+        """Number of the plan's first item on the vehicle: 1 for a mission if item 0 is home, otherwise 0."""
         return int(mission_type == 0 and self.autopilot.home_is_item_0)
 
     @property
@@ -103,7 +103,7 @@ class PlanContext:
 
     @property
     def is_flying_mission(self) -> bool:
-        """True while the vehicle is in its mission mode, unless it is known to be disarmed."""
+        """True while the vehicle is in its mission mode and is not known to be disarmed."""
         return self.tracker.is_in_mission_mode and not self.session.telemetry.is_confirmed_disarmed
 
     def plan_id(self, mission_type: int, since: float) -> int:
@@ -116,7 +116,7 @@ class PlanContext:
         return ids_by_mission_type[mission_type]
 
     def version(self, mission_type: int) -> tuple[int, int]:
-        """Return a value that changes with the vehicle's plan, as far as this program receives the change.
+        """Return a value that changes whenever this program notices that the vehicle's plan has changed.
 
         It consists of the number of transfers, also of other stations on a shared link, and of the plan's id (PX4
         only).

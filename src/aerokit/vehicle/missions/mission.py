@@ -49,11 +49,11 @@ RETURN_TIMEOUT_S = 300.0
 class MissionEndDetector:
     """Detects the end of a mission.
 
-    A mission has ended when the vehicle reports the mission as complete, or has landed and disarmed at its last item.
-    If the mission ends with a landing, or with a return that includes a landing, the vehicle must also be on the
-    ground. PX4 reports completion when the return starts, and then changes the mode. A return without a landing ends at
-    home. If a vehicle reports no mission state, the mission has ended when the last item is reached. If the items are
-    unknown, the mode after the completion shows whether the vehicle lands.
+    Usually, a mission has ended when the vehicle reports completion. A mission whose last item is a landing, or a
+    return with a landing, ends only on the ground, because PX4 reports completion when the return starts; here,
+    disarming in the mode of the last item also counts as the end. A return without a landing ends at home. If the
+    vehicle reports no mission state, the mission has ended when the last item is reached. If the items are unknown, the
+    mode after the completion shows whether the vehicle lands.
 
     After a failsafe in the last item, a vehicle may land elsewhere, in another mode than that of the item: then the
     mission has failed.
@@ -135,7 +135,11 @@ class MissionEndDetector:
 
     @property
     def _ends_by_landing_or_return(self) -> bool:
-        """True if the last item is a landing, or a return. If the items are unknown, the mode shows it at the end."""
+        """True if the last item is a landing or a return.
+
+        If the items are unknown: True once the mission is complete and the vehicle is in a landing mode, on an
+        autopilot that lands after a return.
+        """
         if self._are_items_known:
             return self._is_last_item_landing_or_return
         is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
@@ -180,7 +184,7 @@ class MissionEndDetector:
 
     @property
     def _is_landing(self) -> bool:
-        """True if the vehicle has changed from the mission mode to the mode of its last item (land or return)."""
+        """True if the vehicle is at the end of a mission that ends by landing or return, and is in the mode for it."""
         current, last = self._tracker.current.latest, self._tracker.last_item
         is_at_end = (current is not None and current == last) or not self._are_items_known
         return is_at_end and self._ends_by_landing_or_return and self._is_in_landing_mode
@@ -425,7 +429,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._tracker.on_transfer_count(count)
 
     def _check_item(self, item: int) -> None:
-        """Raise InvalidArgument unless the mission has this item. If the number of items is unknown, accept any."""
+        """Raise InvalidArgument unless the mission has this item (0 to MAX_ITEM if their number is unknown)."""
         count = self._tracker.count.latest
         last = MAX_ITEM if count is None else count - 1
         if count == 0:

@@ -132,7 +132,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
         raise NotImplementedError
 
     def _on_count(self, count: int) -> None:
-        """Called after each transfer with the number of items."""
+        """Called with the number of items after each transfer."""
 
     def _checked(self, plan: PlanT) -> PlanT:
         plan_type = self._get_plan_type()

@@ -33,10 +33,10 @@ _WAYPOINTS = (MavCmd.NAV_WAYPOINT, MavCmd.NAV_SPLINE_WAYPOINT)
 class MissionStallDetector:
     """Detects a fall, and a vehicle that does not move although its mission item requires movement.
 
-    A fall is a standstill of 12 s right after a fast descent, on the ground or at an item without a hold. Without a
-    fast descent, a standstill is reported after ``MISSION_STALL_TIMEOUT_S`` at an item without a hold, while the
-    vehicle is in its mission mode and not paused. The items are known only after an upload or a download. A disarmed
-    vehicle is never reported.
+    A fall is a fast descent that is followed at once by 12 s of standstill, either on the ground, or at an item without
+    a hold. Without a fast descent, a standstill is reported after ``MISSION_STALL_TIMEOUT_S`` at an item without a
+    hold, while the vehicle is in its mission mode and not paused. The items are known only after an upload or a
+    download. A disarmed vehicle is never reported.
     """
 
     def __init__(

@@ -190,7 +190,7 @@ class ParameterAccess:
                 return
 
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
-        """Return the table, and add the defaults that only an earlier download has reported."""
+        """Return a copy of the table; defaults that this download lacks are taken from an earlier one."""
         known = self.store.table
         parameters = []
         for parameter in table.values():
@@ -354,7 +354,7 @@ class ParameterAccess:
         """Forget what earlier writes have set, because the vehicle may have another value from now on."""
         for name in names:
             self.written.pop(name, None)
-            self.store.clear_replaced(name)
+            self.store.unmark_replaced(name)
 
     def _recently_written(self) -> set[str]:
         """Return the names for which a late answer to a write may arrive. Their next write is therefore read back."""
@@ -406,7 +406,7 @@ class ParameterAccess:
         )
 
     async def _read_back(self, written: tuple[Parameter, ...], idle_timeout_s: float) -> dict[str, ParameterAnswer]:
-        """Return the vehicle's values of these parameters, after they were written in a file."""
+        """Return the vehicle's values of these parameters, after they were set by uploading a parameter file."""
         if len(written) <= MAX_READ_BACK:
             return await self.read(_names(written), idle_timeout_s)
         await self.download("auto", refresh=True, cache=False, idle_timeout_s=idle_timeout_s, on_progress=None)
@@ -414,7 +414,7 @@ class ParameterAccess:
         return {name: table[name] for name in _names(written) if name in table}
 
     def _was_applied(self, written: Parameter, answer: ParameterAnswer | None) -> bool:
-        """Return True if the vehicle has the value. The last bits are ignored in values that were read as floats."""
+        """Return True if the vehicle has the value. The last bits are ignored if it sends all values as floats."""
         if not isinstance(answer, Parameter):
             return False
         if self.store.bytewise:
@@ -444,7 +444,7 @@ class _CachedList:
         return True
 
     async def save(self) -> None:
-        """Save the downloaded list, unless parameters changed during the download."""
+        """Save the downloaded list if the hash was known before the download and is still the same."""
         if self._hash is not None and self._hash == await self._read_hash():
             self._cache.save(await self._key(), self._hash, self._access.store.table)
 

@@ -23,7 +23,7 @@ async def read_return_altitude(parameters: Parameters, session: VehicleSession) 
 
 
 def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vtol: bool) -> float | None:
-    """Return the altitude if its parameter was read, without requesting it; otherwise None."""
+    """Return the altitude if its parameter is already known, otherwise None. Requests nothing."""
     for name, units_per_metre in autopilot.return_altitude_parameters(is_vtol=is_vtol):
         if (known := parameters.known(name)) is not None:
             return round(known.value / units_per_metre, 3)

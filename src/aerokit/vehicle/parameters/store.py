@@ -76,12 +76,12 @@ class ParameterStore:
         """
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
-    def clear_replaced(self, name: str) -> None:
-        """Accept messages with any value of this parameter again, because the parameter is being written."""
+    def unmark_replaced(self, name: str) -> None:
+        """Stop ignoring messages with the replaced value, because a new write may set this value again."""
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
-        """Return the value that was marked by `mark_replaced`, as long as messages with this value are ignored."""
+        """Return the old value given to `mark_replaced` while messages with this value are ignored, otherwise None."""
         if name not in self._replaced:
             return None
         value, ignored_until = self._replaced[name]

@@ -40,7 +40,7 @@ class RestoreRegistry:
         self._blocks.setdefault(name, []).append(block)
 
     def remove(self, name: str, block: _Block) -> _Block | None:
-        """Remove a block; return the block that first wrote the parameter after the removed block, if any."""
+        """Remove a block; return the next block that wrote the parameter, None if it was the last one."""
         blocks = self._blocks[name]
         position = blocks.index(block)
         del blocks[position]

@@ -55,7 +55,7 @@ class ResolvedParameter(Snapshot):
 
 
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
-    """Return the known parameter that has this name or another name of the same parameter; None if unknown."""
+    """Return the known parameter with this name or, if it was renamed, with its other name; None if unknown."""
     if name in known:
         return ResolvedParameter(name, known[name], is_fresh=False)
     from aerokit.parameters.renames import resolve_rename
@@ -65,7 +65,7 @@ def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParamete
 
 
 class NameResolver:
-    """Resolves names of the program to parameters of the vehicle."""
+    """Resolves the parameter names that the program uses to parameters of the vehicle."""
 
     def __init__(self, access: ParameterAccess) -> None:
         self._access = access
@@ -232,7 +232,7 @@ Resolve = Callable[[Iterable[str], float], Awaitable[dict[str, ResolvedParameter
 
 
 class _PlannedWrite(Snapshot):
-    """One requested value; ``to_send`` is the parameter with this value, in the name and unit of the vehicle."""
+    """One requested value; ``to_send`` has the vehicle's name for the parameter and the value in the vehicle's unit."""
 
     resolved: ResolvedParameter
     requested: int | float
@@ -351,7 +351,7 @@ def _plan_write(resolved: ResolvedParameter, value: int | float) -> _PlannedWrit
 
 
 def _check_same_value(plan: _PlannedWrite, first: _PlannedWrite) -> None:
-    """Raise InvalidArgument if the first plan for the same parameter has another value."""
+    """Raise InvalidArgument if two requested writes of the same parameter have different values."""
     if not same_value(plan.to_send.value, first.to_send.value):
         raise InvalidArgument(
             f"{plan.resolved.requested} = {plan.requested:g} and {first.resolved.requested} = {first.requested:g}"

@@ -235,7 +235,7 @@ class NtripClient:
         await run_shielded(self._wait_closed(writer))
 
     async def _wait_closed(self, writer: asyncio.StreamWriter | None) -> None:
-        """Wait briefly until the background task has ended and the connection is closed."""
+        """Wait, at most CLOSE_TIMEOUT_S, until the background task has ended and the connection is closed."""
         with anyio.move_on_after(CLOSE_TIMEOUT_S):
             if not self._session.is_closed:
                 await self._ended.wait()

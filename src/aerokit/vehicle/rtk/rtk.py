@@ -69,8 +69,7 @@ class Corrections(Snapshot):
     """Statistics of the corrections that were sent to the vehicle.
 
     ``message_number`` is the RTCM number of the last message (1005, 1077 …), None if that message was empty.
-    ``messages`` and ``bytes_sent`` count all messages. ``bandwidth_bytes_s`` is the mean rate over the last ten
-    seconds.
+    ``messages`` and ``bytes_sent`` are totals. ``bandwidth_bytes_s`` is the mean rate over the last ten seconds.
     """
 
     message_number: int | None

@@ -237,7 +237,7 @@ def batteries(message: messages.BatteryStatus, context: Context) -> tuple[Batter
 
 
 def main_battery(message: messages.SysStatus, context: Context) -> tuple[Battery, ...] | None:
-    """Update battery 0 from SYS_STATUS and return all batteries; None if SYS_STATUS has no values of a battery."""
+    """Update battery 0 from SYS_STATUS and return all batteries; None without a voltage or remaining charge."""
     voltage = None if message.voltage_battery in (0, U16) else message.voltage_battery / 1e3
     remaining = known(message.battery_remaining, unknown=-1)
     if voltage is None and remaining is None:
@@ -325,7 +325,7 @@ class GimbalAttitude(Snapshot):
 
 
 def from_status(message: MountStatus) -> GimbalAttitude:
-    """Return the attitude of MOUNT_STATUS, without converting its yaw."""
+    """Return the attitude of MOUNT_STATUS; its yaw stays in the mount's frame (from north or from the nose)."""
     return GimbalAttitude(message.pointing_a / 100.0, message.pointing_b / 100.0, message.pointing_c / 100.0)
 
 
@@ -402,6 +402,6 @@ def _rounded_to_180(degrees: float) -> float | None:
 
 
 def _rounded_to_360(degrees: float) -> float | None:
-    """Like :func:`_rounded`, but first normalise the angle to 0 to below 360."""
+    """Like :func:`_rounded`, but first normalise the angle to at least 0 and below 360."""
     # Rounding may turn 359.999 into 360, so the result is normalised again.
     return round(degrees % 360.0, 2) % 360.0 if math.isfinite(degrees) else None

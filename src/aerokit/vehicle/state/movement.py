@@ -236,7 +236,7 @@ def wind(message: messages.Wind) -> Wind:
 
 
 def wind_of_covariance(message: messages.WindCov) -> Wind | None:
-    """Return the wind in WIND_COV (PX4), which has the velocity of the air; None if this is unknown."""
+    """Return the wind in WIND_COV (PX4); None if unknown. The message has the direction that the air moves to."""
     if not (math.isfinite(message.wind_x) and math.isfinite(message.wind_y)):
         return None
     comes_from = math.degrees(math.atan2(-message.wind_y, -message.wind_x))

@@ -70,7 +70,7 @@ class StatusTextAssembler:
         return tuple(text for text in self._recent if text.at >= since)
 
     def about_failsafes(self) -> tuple[StatusText, ...]:
-        """Return the last texts (64 at most) about failsafes and problems in flight since the last failsafe ended."""
+        """Return the texts about failsafes and problems in flight (64 at most) since the latest failsafe ended."""
         return tuple(self._failsafes)
 
     def clear_failsafes(self) -> None:
@@ -78,7 +78,7 @@ class StatusTextAssembler:
         self._failsafes.clear()
 
     def clear(self) -> None:
-        """Discard incomplete and recent texts."""
+        """Discard all texts: incomplete, recent, and about failsafes."""
         self._incomplete.clear()
         self._recent.clear()
         self.clear_failsafes()

@@ -283,7 +283,7 @@ class Telemetry(States):
         return StreamedMessage(self.component_id, cells, instance_at, apply, self._lock)
 
     def _has_recent_better_value(self, cell: StateCell[Any], source: Source) -> bool:
-        """Return True if a better message than ``source`` has reported the cell's value recently."""
+        """Return True if another message than the fallback ``source`` has recently reported the cell's value."""
         return (
             cell.source is not None
             and cell.source.message != source.message
@@ -304,7 +304,7 @@ class Telemetry(States):
         return True
 
     def _learn_autopilot(self, heartbeat: messages.Heartbeat) -> None:
-        """Use the autopilot of the first HEARTBEAT, which also decides which messages report a state."""
+        """Use the autopilot of the first HEARTBEAT, and store in each cell which messages it waits for."""
         self.autopilot = autopilot_for(heartbeat)
         self._context.autopilot = self.autopilot
         self._knows_autopilot = True
@@ -330,7 +330,7 @@ class Telemetry(States):
 
 
 def is_reported_on_ground(vehicle: States, *, max_age_s: float = LANDED_STATE_MAX_AGE_S) -> bool:
-    """Return True if the vehicle reports that it is on the ground. An old report may be from before its take-off."""
+    """Return True if the latest report says that the vehicle is on the ground, and is at most ``max_age_s`` old."""
     landed = vehicle.landed_state
     return landed.latest == MavLandedState.ON_GROUND and landed.age <= max_age_s
 
