@@ -268,7 +268,10 @@ def _are_items(is_item: Check, value: object) -> bool:
 
 
 def check_kind(name: str, value: object, expected_type: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of this type. For annotations that are type variables."""
+    """Raise InvalidArgument unless ``value`` is an instance of this type.
+
+    Used for arguments that are annotated with a type variable, whose type is known only at run time.
+    """
     if not isinstance(value, expected_type):
         raise InvalidArgument(
             f"{name} = {short_repr(value)} is not allowed: it must be {with_article(expected_type.__name__)}"

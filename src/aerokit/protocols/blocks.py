@@ -166,7 +166,7 @@ class BlockRequests:
             self._requeue_overtaken(block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
-        """Return the time of the transmission that was answered; None if it may be one of several."""
+        """Return when the transmission that was answered was sent; None if several may have been answered."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0

@@ -60,10 +60,10 @@ class Exchange(ABC, Generic[ResultT]):
         """Send again, or fail, because the deadline has passed. Not called any more once ``done`` is True."""
 
     def link_changed(self, now: float) -> None:
-        """Handle a switch to another link, which leads to another port of the vehicle.
+        """Called after a switch to another link, which leads to another port of the vehicle.
 
-        Most exchanges only repeat unanswered requests. If the vehicle keeps the state of an exchange for each port, the
-        exchange restarts.
+        Does nothing by default, because most exchanges repeat unanswered requests anyway. An exchange whose state the
+        vehicle keeps for each port overrides this method to restart.
         """
         return
 

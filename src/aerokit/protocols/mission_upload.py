@@ -256,7 +256,7 @@ class MissionUpload(MissionExchange[UploadResult]):
                 self._fail_as_refused(MavMissionResult.ERROR)
 
     def _wait_while_busy(self, now: float) -> None:
-        """Announce the items again later, as long as the vehicle may be busy. Then fail with its refusal."""
+        """Announce the items again after BUSY_RETRY_INTERVAL_S, for at most BUSY_TIMEOUT_S in all; then fail."""
         if self._busy_until is None:
             self._busy_until = now + BUSY_TIMEOUT_S
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:

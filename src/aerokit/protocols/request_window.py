@@ -162,7 +162,11 @@ class RequestWindow(Generic[KeyT]):
             self._next_silence_at = now + self._timeout_s(1)
 
     def _timeout_s(self, attempts: int) -> float:
-        """Return the seconds to wait for an answer. Only silences of the whole link make the wait much longer."""
+        """Return the seconds to wait for an answer, up to MAX_TIMEOUT_S.
+
+        Repeating a request lengthens the wait only once, a silence of the whole link each time. If few requests are
+        left, the wait stays short.
+        """
         round_trip = self._round_trip
         seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
         if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:

@@ -121,7 +121,7 @@ def _flags(camera: CameraDevice, stream: int) -> int:
 
 
 def _thermal_stream(camera: CameraDevice) -> int:
-    """Return the number of the stream of the thermal camera, if there is one: the last stream."""
+    """Return the number of the last stream. If the camera has a thermal sensor, this stream is its."""
     return len(camera.streams)
 
 

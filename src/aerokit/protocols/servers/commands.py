@@ -266,7 +266,10 @@ class RunningCommands:
             self._server.answer(command, *outcome)
 
     def _record_result(self, command: ReceivedCommand, outcome: Outcome) -> None:
-        """Store the result for repetitions of the command, which may arrive after a command of another sender."""
+        """Store the result, to answer repetitions of the command.
+
+        Each sender has its own entry, because a repetition may arrive after the same command of another sender.
+        """
         key = (command.command, command.sender)
         self._ended.pop(key, None)  # The new entry must be the last one.
         if len(self._ended) >= MAX_RESULTS:

@@ -46,7 +46,7 @@ class ParameterLists:
         return len(self._lists)
 
     def restart(self) -> None:
-        """Stop sending all lists, as a reboot does."""
+        """Stop sending all lists, because the component has rebooted."""
         self._lists.clear()
 
     def start_list(self, channel: Channel) -> None:
@@ -169,7 +169,7 @@ class TypedParameterServer(ParameterProtocolServer):
         return value_message(parameter, len(self.names), bytewise=self.bytewise)
 
     def publish(self, name: str) -> None:
-        """Send a changed value to all other programs."""
+        """Send a changed value to all other programs if its type fits into PARAM_VALUE."""
         if fits_param_value(self._store.type(name)):
             self.send(name, self.names.index(name), None)
 
