@@ -628,6 +628,20 @@ async def test_compare_missions_includes_way_to_first_item() -> None:
         assert above.decision == "clear"
 
 
+async def test_upload_of_mission_through_hovering_member_is_refused() -> None:
+    async with open_stage(3, spacing_m=20, min_distance_m=5.0) as stage:
+        await stage.take_off(8)
+        here = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+
+        def mission_to(name: str) -> dict[str, Mission]:
+            return {"north/1": Mission([waypoint(here[name], altitude_relative_m=8)])}
+
+        with pytest.raises(OperationRejected, match=r"north/1 and north/2 \(.* come too close; nothing was sent"):
+            await stage.fleet.upload(mission_to("north/3"))
+        await stage.fleet.vehicles["north/2"].land()
+        assert stage.fleet.compare_missions(mission_to("north/2")).decision == "clear"
+
+
 async def test_compare_missions_ignores_regions_of_interest() -> None:
     async with open_stage(2, spacing_m=20, min_distance_m=5.0) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()

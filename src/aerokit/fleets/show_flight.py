@@ -23,7 +23,7 @@ from aerokit.fleets.paths import Path, PathPoint
 from aerokit.fleets.policy import FleetResult
 from aerokit.fleets.separation import METRES_PER_DEGREE, find_conflicts
 from aerokit.fleets.show import Show, state_at
-from aerokit.fleets.travel import Travel
+from aerokit.fleets.travel import Travel, stationary_members
 from aerokit.mavlink.messages import GlobalPositionInt, Timesync
 from aerokit.position import Position
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
@@ -421,7 +421,7 @@ class Shows(Travel):
         min_m = self._context.min_distance_m
         if min_m is None:
             return
-        stationary = self._stationary(origin, moving=show.tracks)
+        stationary = stationary_members(self._context.members, origin, moving=show.tracks)
         resting = [
             Path(name, [PathPoint(0.0, north, east, amsl_m - origin_amsl_m)])
             for name, (north, east, amsl_m) in stationary.items()

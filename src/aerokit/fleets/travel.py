@@ -249,16 +249,7 @@ class Travel(SelectionBase):
             )
             for member in moving
         ]
-        return routes, self._stationary(origin, moving=[member.name for member in moving])
-
-    def _stationary(self, origin: LocalOrigin, moving: Collection[str]) -> dict[str, LocalPoint]:
-        """Return the last known positions of all members of the fleet that are not ``moving``."""
-        stationary: dict[str, LocalPoint] = {}
-        for name, member in self._context.members.items():
-            position = member.vehicle.position.latest
-            if name not in moving and position is not None and position.altitude_amsl_m is not None:
-                stationary[name] = origin.to_local(position, position.altitude_amsl_m)
-        return stationary
+        return routes, stationary_members(members, origin, moving=[member.name for member in moving])
 
     async def _fly_to(
         self,
@@ -318,6 +309,18 @@ class Travel(SelectionBase):
                 break
         assert result is not None
         return result
+
+
+def stationary_members(
+    members: Mapping[str, Member], origin: LocalOrigin, moving: Collection[str]
+) -> dict[str, LocalPoint]:
+    """Return the last known positions of all members that are not ``moving``."""
+    stationary: dict[str, LocalPoint] = {}
+    for name, member in members.items():
+        position = member.vehicle.position.latest
+        if name not in moving and position is not None and position.altitude_amsl_m is not None:
+            stationary[name] = origin.to_local(position, position.altitude_amsl_m)
+    return stationary
 
 
 def _target_from_function(targets: Callable[[Member], Position | Home], member: Member) -> Position:
@@ -438,7 +441,8 @@ class Missions(SelectionBase):
 
         Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
         item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
-        by the member's present altitude.
+        by the member's present altitude. Members without a mission that are in the air count as obstacles at their last
+        known positions.
 
         Args:
             missions: maps names of members to missions.
@@ -459,7 +463,15 @@ class Missions(SelectionBase):
             # A position of any age will do, because it is only the origin of the coordinates.
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
-        conflicts = find_conflicts(paths, min_m)
+            # Members on the ground are left out, because missions begin and end beside them.
+            flying = {
+                name: member
+                for name, member in self._context.members.items()
+                if member.vehicle.is_armed and not is_reported_on_ground(member.vehicle.telemetry)
+            }
+            stationary = stationary_members(flying, origin, moving=missions)
+            paths += [Path(name, [PathPoint(0.0, *place)]) for name, place in stationary.items()]
+        conflicts = tuple(conflict for conflict in find_conflicts(paths, min_m) if conflict.name in missions)
         reason = f"{describe_pairs(conflicts)} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
         self._context.publish(

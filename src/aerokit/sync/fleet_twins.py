@@ -356,7 +356,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
         item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
-        by the member's present altitude.
+        by the member's present altitude. Members without a mission that are in the air count as obstacles at their last
+        known positions.
 
         Args:
             missions: maps names of members to missions.
