@@ -19,11 +19,12 @@ from hypothesis import strategies as st
 from aerokit import messages as m
 from aerokit.errors import FileFormatError, FleetError, InvalidArgument, OperationRejected
 from aerokit.fleets import show_flight
+from aerokit.fleets.distances import LocalOrigin
 from aerokit.fleets.members import Member
 from aerokit.fleets.opening import fleet
 from aerokit.fleets.paths import LocalPoint, Path, PathPoint
 from aerokit.fleets.show import Show, state_at
-from aerokit.fleets.show_flight import max_relative_error, measure_clock, track_deviation
+from aerokit.fleets.show_flight import ClockOffset, TrackRecorder, max_relative_error, measure_clock, track_deviation
 from aerokit.mavlink import FrameEncoder
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -159,6 +160,19 @@ async def test_show_member_that_would_join_late_holds(
         for error in result.failed.values():
             assert "would join its track 1.0 s late, so it holds" in str(error)
         assert set(stage.modes.values()) == {"BRAKE"}
+
+
+async def test_invalid_position_is_not_recorded() -> None:
+    """Autopilots that have lost their position report 0°N 0°E."""
+    async with open_stage(1) as stage:
+        vehicle, wire = stage.fleet.vehicles["north/1"], stage.wires["north"]
+        with TrackRecorder(vehicle, ClockOffset(0.0, 0.0, 1), LocalOrigin(ORIGIN), 0.0, HOME[2]) as recorder:
+            for latitude_deg in (0.0, HOME[0]):
+                position = m.GlobalPositionInt(
+                    0, round(latitude_deg * 1e7), round(latitude_deg * 1e7), 0, 0, 0, 0, 0, 0
+                )
+                wire.deliver(FrameEncoder(1, 1).encode(position))
+                assert recorder.has_position == (latitude_deg != 0)
 
 
 async def fly_many(networks: int, of_each: int, seconds: int) -> None:

@@ -113,6 +113,8 @@ def separate_by_altitude(
         min_distance_m: minimum distance in metres, which is also the distance between layers.
         max_altitude_m: highest layer in metres above sea level.
     """
+    if math.isnan(max_altitude_m):
+        raise InvalidArgument("max_altitude_m = nan is not a number")
     conflicts = _conflicts(routes, stationary, min_distance_m)
     if not conflicts:
         return Deconfliction("clear", "no paths come too close", min_distance_m)

@@ -27,6 +27,7 @@ from aerokit.fleets.travel import Travel, stationary_members
 from aerokit.mavlink.messages import GlobalPositionInt, Timesync
 from aerokit.position import Position
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
+from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -277,12 +278,16 @@ class TrackRecorder:
         frame = message.received_frame
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
+        coordinates = valid_coordinates(message.lat, message.lon)
+        if coordinates is None:  # A member that lost its position must not fly towards its track from 0°N 0°E.
+            return
+        latitude, longitude = coordinates
         measured_at = self._clock.to_local_time(message.time_boot_ms / 1000)
         if abs(measured_at - frame.received_at) > MAX_CLOCK_ERROR_S:  # TIMESYNC uses another clock of the vehicle.
             measured_at = frame.received_at
         place = (
-            (message.lat / 1e7 - self._latitude) * self._metres_per_latitude_degree,
-            math.remainder(message.lon / 1e7 - self._longitude, 360.0) * self._metres_per_longitude_degree,
+            (latitude - self._latitude) * self._metres_per_latitude_degree,
+            math.remainder(longitude - self._longitude, 360.0) * self._metres_per_longitude_degree,
             message.alt / 1000 - self._origin_amsl_m,
         )
         self._latest = measured_at, place, (message.vx / 100, message.vy / 100, -message.vz / 100)
