@@ -17,8 +17,9 @@ from for_each import for_each
 from aerokit._internal.files import MAX_FILE_SIZE
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink import Dialect
-from aerokit.missions import Plan, read_plan_file
+from aerokit.missions import Mission, MissionItem, Plan, read_plan_file
 from aerokit.missions.plan_file import format_plan, parse_plan
+from aerokit.missions.waypoint_file import parse_waypoints
 from aerokit.parameters import load_metadata, parse_metadata, parse_parameter_file, read_parameter_file
 
 MEGABYTE = 1 << 20
@@ -241,3 +242,30 @@ def test_dialect_with_empty_enum(tmp_path: Path) -> None:
     path = tmp_path / "private.xml"
     path.write_text(dialect('<enums><enum name="EMPTY"/></enums>'))
     assert Dialect.from_xml(path).enum("EMPTY").__members__ == {}
+
+
+# ----------------------------------------------------------------------------------------- huge numbers
+
+
+@pytest.mark.parametrize("columns", ["1\t1\tA\t5\t{}", "1\t{}\tA\t5\t9", "{}\t1\tA\t5\t9"])
+def test_parameter_file_with_thousands_of_digits_is_rejected(columns: str) -> None:
+    with pytest.raises(FileFormatError, match="line 1"):
+        parse_parameter_file(columns.format("1" * 5000))
+
+
+def test_huge_local_coordinate_in_waypoint_file_fails_the_check() -> None:
+    mission = parse_waypoints("QGC WPL 120\n0\t0\t1\t16\t0\t0\t0\t0\t1e305\t0\t0\t1\n")
+    with pytest.raises(InvalidArgument, match=r"x = 1e\+305"):
+        mission.check()
+
+
+def test_huge_number_in_metadata_is_ignored() -> None:
+    parsed = parse_metadata(px4(max="9" * 400, values=[{"value": "9" * 400, "description": "x"}]))
+    assert parsed["MPC_XY_VEL_MAX"].maximum is None
+    with pytest.raises(InvalidArgument, match=r"-1 is not in 0\.\."):
+        parsed.check("MPC_XY_VEL_MAX", -1)
+
+
+def test_mission_with_huge_parameter_can_be_compared() -> None:
+    huge, small = (Mission([MissionItem(93, 2, param1)]) for param1 in (1e39, 1.0))
+    assert huge.differences(small) == ("item 0 (NAV_DELAY): param1 is 1.0 instead of 1e+39",)

@@ -205,3 +205,8 @@ def test_custom_mode_must_fit_32_bits(number: int) -> None:
     for wrong in (-1, 1 << 32):
         with pytest.raises(InvalidArgument, match=f"mode = {wrong} .* from 0 to 4294967295"):
             autopilot_for(heartbeat(2)).find_mode(wrong)
+
+
+def test_mode_of_thousands_of_digits_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match=r"is not known; this vehicle's modes are"):
+        ardupilot("copter").find_mode("9" * 5000)

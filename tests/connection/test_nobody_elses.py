@@ -18,7 +18,7 @@ from aerokit.connection.frame_receiver import MAX_UNVERIFIED_PEERS
 from aerokit.connection.routes import MAX_CLAIMS, Routes
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.message import Message
-from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, SystemTime
+from aerokit.mavlink.messages import Attitude, CommandLong, Heartbeat, RadioStatus, SystemTime
 
 MAX_PEERS = 256
 MAX_ROUTES = 1024
@@ -534,3 +534,18 @@ async def test_system_broadcast_skips_duplicate_vehicle(
         link.sent.clear()
         vehicle.send(command(1, 100))
         assert link.peers_of(CommandLong) == ["14550@other"]
+
+
+@pytest.mark.parametrize("message", [RadioStatus(1, 1, 1, 1, 1, 1, 1), DISARMED])
+async def test_unverified_signature_of_accepted_frame_moves_no_route(message: Message, link: PeerKeepingLink) -> None:
+    """The link accepts RADIO_STATUS, and here heartbeats, with any signature, which then proves nothing."""
+    key, stranger = SigningKey.from_passphrase("ours"), signed_by(SigningKey.from_passphrase("another"))
+    signing = Signing(key, allow_unsigned=lambda frame: frame.message_id == Heartbeat.ID)
+    async with open_connection(link, signing=signing) as connection:
+        copter, unix_time = signed_by(key), connection.unix_time
+        connection.bytes_received(copter.encode(ARMED, unix_time()), "14550@copter")
+        async with aerokit.connect(connection, rates={}) as vehicle:
+            await anyio.sleep(5)
+            connection.bytes_received(stranger.encode(message, unix_time()), "666@stranger")
+            assert is_armed(vehicle)
+            assert peer_of(vehicle, link) == "14550@copter"

@@ -94,6 +94,30 @@ async def test_go_to_after_release_of_planned_member_sends_nothing() -> None:
         assert not stage.orders_to("north/1")
 
 
+async def test_go_to_after_obstacle_moved_into_plan_sends_nothing() -> None:
+    async with open_stage(3, spacing_m=30, min_distance_m=5.0) as stage:
+        await stage.take_off()
+        here = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        targets = {name: here[name].offset(north_m=60) for name in ("north/1", "north/2")}
+        plan = stage.fleet.plan_separation(targets)
+        assert plan.decision == "clear"
+        await stage.fleet.vehicles["north/3"].go_to(here["north/1"].offset(north_m=30))
+        with pytest.raises(OperationRejected, match="planned before north/3 came where it is; nothing was sent"):
+            await stage.fleet.go_to(targets, separation=plan)
+        assert not stage.orders_to("north/1")
+
+
+async def test_following_whose_entry_failed_is_not_running() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        following = stage.fleet.following(Formation.line(["north/2"], 10), leader="north/1")
+        stage.pilot_takes("north/1")
+        await anyio.sleep(2)
+        with pytest.raises(OperationRejected, match="the leader north/1 is taken over"):
+            await following.__aenter__()
+        assert not following.is_running
+
+
 async def test_go_to_with_corridors_delays_starts() -> None:
     async with open_stage(2, spacing_m=30) as stage:
         await stage.take_off()
@@ -602,6 +626,20 @@ async def test_compare_missions_includes_way_to_first_item() -> None:
         # A copter on the ground climbs before it flies, so it passes above its neighbour.
         above = stage.fleet.compare_missions({"north/1": mission_to(here[1]), "north/2": Mission([take_off(20)])})
         assert above.decision == "clear"
+
+
+async def test_upload_of_mission_through_hovering_member_is_refused() -> None:
+    async with open_stage(3, spacing_m=20, min_distance_m=5.0) as stage:
+        await stage.take_off(8)
+        here = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+
+        def mission_to(name: str) -> dict[str, Mission]:
+            return {"north/1": Mission([waypoint(here[name], altitude_relative_m=8)])}
+
+        with pytest.raises(OperationRejected, match=r"north/1 and north/2 \(.* come too close; nothing was sent"):
+            await stage.fleet.upload(mission_to("north/3"))
+        await stage.fleet.vehicles["north/2"].land()
+        assert stage.fleet.compare_missions(mission_to("north/2")).decision == "clear"
 
 
 async def test_compare_missions_ignores_regions_of_interest() -> None:

@@ -216,3 +216,8 @@ def test_clip_corners_stay_inside_within_tolerance() -> None:
     square = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
     clipped = _clip(square, lambda s, t: (0.9 + 0.2 * s) * TOLERANCE)
     assert all(0 <= s <= 1 and 0 <= t <= 1 for s, t in clipped)
+
+
+def test_altitude_limit_that_is_no_number_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match="max_altitude_m = nan"):
+        separate_by_altitude([], {}, 5.0, max_altitude_m=math.nan)

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import os
 from contextlib import AsyncExitStack
 from itertools import pairwise
 from pathlib import Path as FilePath
+from typing import Any
 
 import pytest
 from fleet_stage import HOME, open_stage
+from flight_harness import block_loop
 from hypothesis import given
 from hypothesis import strategies as st
 
 from aerokit import messages as m
 from aerokit.errors import FileFormatError, FleetError, InvalidArgument, OperationRejected
+from aerokit.fleets import show_flight
+from aerokit.fleets.distances import LocalOrigin
+from aerokit.fleets.members import Member
 from aerokit.fleets.opening import fleet
 from aerokit.fleets.paths import LocalPoint, Path, PathPoint
 from aerokit.fleets.show import Show, state_at
-from aerokit.fleets.show_flight import max_relative_error, measure_clock, track_deviation
+from aerokit.fleets.show_flight import ClockOffset, TrackRecorder, max_relative_error, measure_clock, track_deviation
 from aerokit.mavlink import FrameEncoder
 from aerokit.position import Position
 from aerokit.sim import SimulatedCopter, simulated_link
@@ -98,8 +104,6 @@ async def test_show_failure_applies_policy() -> None:
             await anyio.sleep(15)
             stage.pilot_takes("north/2")
 
-        import asyncio
-
         taking = asyncio.create_task(take())
         report = await stage.fleet.fly_show(show, ORIGIN)
         await taking
@@ -122,6 +126,53 @@ async def test_invalid_show_is_rejected() -> None:
         with pytest.raises(FleetError, match="did not answer TIMESYNC"):
             await stage.fleet.fly_show(far, ORIGIN)
         assert not stage.modes_ordered("north/2")
+
+
+async def test_show_beside_member_without_track_is_refused() -> None:
+    async with open_stage(3, min_distance_m=4.0) as stage:
+        await stage.take_off(10)
+        through = Show.from_points({"north/1": [(0, 0, 0, 10), (10, 0, 40, 10)]})
+        with pytest.raises(OperationRejected, match=r"north/1 and north/2 come within .* nothing was sent"):
+            await stage.fleet.fly_show(through, ORIGIN)
+        assert not any(map(stage.orders_to, stage.copters))
+        beside = Show.from_points({"north/1": [(0, 0, 0, 10), (2, -4, 0, 10)]})
+        assert (await stage.fleet.fly_show(beside, ORIGIN)).result.is_complete
+
+
+@pytest.mark.parametrize(("block_s", "is_late"), [(4.0, False), (5.8, True)])
+async def test_show_member_that_would_join_late_holds(
+    block_s: float, is_late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The event loop is blocked from five seconds before the start on."""
+
+    async def block_and_fly(member: Member, *args: Any, **options: Any) -> None:
+        if member.name == "north/1":
+            block_loop(block_s)
+        await fly_track(member, *args, **options)
+
+    fly_track = show_flight._fly_track
+    monkeypatch.setattr(show_flight, "_fly_track", block_and_fly)
+    async with open_stage(2, min_distance_m=4.0) as stage:
+        await stage.take_off(8)
+        show = Show.from_points({name: circle(0, 10.0 * number, 6) for number, name in enumerate(stage.copters)})
+        result = (await stage.fleet.fly_show(show, ORIGIN)).result
+        assert result.is_complete is not is_late
+        for error in result.failed.values():
+            assert "would join its track 1.0 s late, so it holds" in str(error)
+        assert set(stage.modes.values()) == {"BRAKE"}
+
+
+async def test_invalid_position_is_not_recorded() -> None:
+    """Autopilots that have lost their position report 0°N 0°E."""
+    async with open_stage(1) as stage:
+        vehicle, wire = stage.fleet.vehicles["north/1"], stage.wires["north"]
+        with TrackRecorder(vehicle, ClockOffset(0.0, 0.0, 1), LocalOrigin(ORIGIN), 0.0, HOME[2]) as recorder:
+            for latitude_deg in (0.0, HOME[0]):
+                position = m.GlobalPositionInt(
+                    0, round(latitude_deg * 1e7), round(latitude_deg * 1e7), 0, 0, 0, 0, 0, 0
+                )
+                wire.deliver(FrameEncoder(1, 1).encode(position))
+                assert recorder.has_position == (latitude_deg != 0)
 
 
 async def fly_many(networks: int, of_each: int, seconds: int) -> None:

@@ -141,7 +141,7 @@ def test_tlog_reader_closes_file_early(tmp_path: Path) -> None:
     records.close()  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("when", [-1.0, 1.9e13, 1e14])
+@pytest.mark.parametrize("when", [-1.0, 1.9e13, 1e14, float("nan"), float("inf")])
 def test_tlog_rejects_invalid_timestamp(when: float) -> None:
     with pytest.raises(InvalidArgument, match=r"timestamp_s = .* must be seconds since 1970"):
         TlogWriter(io.BytesIO()).write(b"", when)

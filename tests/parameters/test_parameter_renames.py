@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aerokit.errors import InvalidArgument
 from aerokit.parameters import (
     Parameter,
     ParameterRenamedWarning,
@@ -19,7 +21,7 @@ from aerokit.parameters import (
     resolve_rename,
     translate_values,
 )
-from aerokit.parameters.parameter import check_name, to_float32
+from aerokit.parameters.parameter import check_name, checked_value, to_float32
 from aerokit.parameters.rename_table import GROUPS, OLDER, ONE_WAY, REPLACED
 
 INT16, INT32, REAL32 = ParameterType.INT16, ParameterType.INT32, ParameterType.REAL32
@@ -241,3 +243,13 @@ def test_replaced_parameter_names_replacement() -> None:
     assert replacement_of("RATE_RLL_P").startswith("ATC_RAT_RLL_P")
     assert replacement_of("MNT_RC_IN_TILT").startswith("RCn_OPTION")
     assert replacement_of("WP_SPD") == replacement_of("NOPE") == ""
+
+
+@pytest.mark.parametrize("value", [0.7, 1.5, math.nan, math.inf, 2.0**31])
+def test_invalid_mask_is_not_converted_to_other_checks(value: float) -> None:
+    """ARMING_CHECK = 0.7 must not skip all checks: the vehicle's type then refuses the unchanged value."""
+    for requested, name in (("ARMING_CHECK", "ARMING_SKIPCHK"), ("ARMING_SKIPCHK", "ARMING_CHECK")):
+        renamed = resolve_rename(requested, {name})
+        assert renamed is not None
+        with pytest.raises(InvalidArgument):
+            checked_value(name, renamed.to_vehicle(value, ParameterType.INT32), ParameterType.INT32)

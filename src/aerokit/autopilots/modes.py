@@ -87,7 +87,7 @@ class ModeTable:
                 return number
         # The mode number is in "MODE 42", or is the whole text.
         digits = key[len(_PREFIX_OF_NUMBER) :] if key.startswith(_PREFIX_OF_NUMBER) else key
-        if digits.isdecimal():
+        if digits.isdecimal() and len(digits) < 20:  # int() refuses thousands of digits with another error.
             return self._check(int(digits))
         raise InvalidArgument(self._unknown_name_text(name, extra))
 

@@ -111,8 +111,12 @@ class SignatureGate:
         return refusal is None
 
     def has_verified(self, frame: Frame) -> bool:
-        """Return True if the signature of an admitted frame was verified with our key."""
-        return self._encoder.signing is not None and bool(frame.incompat_flags & SIGNED)
+        """Return True if an admitted frame was admitted because of its signature with our key.
+
+        Frames that need no signature are admitted with any signature, also a forged or replayed one.
+        """
+        signing = self._encoder.signing
+        return signing is not None and bool(frame.incompat_flags & SIGNED) and not signing.may_be_unsigned(frame)
 
     def _report(self, frame: Frame, signing: Signing, refusal: Refusal) -> None:
         """Log a refusal and publish it as an event. Called for the first refusal of each reason."""

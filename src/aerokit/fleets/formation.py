@@ -227,8 +227,8 @@ class Following:
     async def __aenter__(self) -> Self:
         if self._was_entered:
             raise BusyError("a Following can be entered only once; call following() again")
-        self._was_entered = True
         self._check_leader()
+        self._was_entered = True
         self._action = FleetAction(self._context, "following", self._followers, self._fly_follower)
         self._tasks.start(self._follow, "aerokit following")
         return self

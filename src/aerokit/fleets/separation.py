@@ -59,8 +59,10 @@ class Deconfliction(Snapshot):
     - ``"refused"``: the conflicts cannot be resolved.
 
     ``conflicts`` has the conflicts of the direct paths, without separation. Heights are in metres above sea level.
-    In corridors, a vehicle that would start more than ``slack_s`` seconds late does not start. ``routes`` are the paths
-    that were compared, in metres from the target of the first one.
+    In corridors, all vehicles fly at ``speed_m_s``, and a vehicle that would start more than ``slack_s`` seconds late
+    does not start. ``routes`` are the paths
+    that were compared, in metres from the target of the first one; ``stationary`` has the positions of the members that
+    do not move.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]
@@ -70,7 +72,9 @@ class Deconfliction(Snapshot):
     heights_m: Mapping[str, float] = {}
     delays_s: Mapping[str, float] = {}
     slack_s: float = SLACK_S
+    speed_m_s: float | None = None
     routes: Sequence[Route] = ()
+    stationary: Mapping[str, LocalPoint] = {}
 
 
 def find_conflicts(paths: Sequence[Path], min_distance_m: float, *, slack_s: float = math.inf) -> tuple[Conflict, ...]:
@@ -109,6 +113,8 @@ def separate_by_altitude(
         min_distance_m: minimum distance in metres, which is also the distance between layers.
         max_altitude_m: highest layer in metres above sea level.
     """
+    if math.isnan(max_altitude_m):
+        raise InvalidArgument("max_altitude_m = nan is not a number")
     conflicts = _conflicts(routes, stationary, min_distance_m)
     if not conflicts:
         return Deconfliction("clear", "no paths come too close", min_distance_m)
@@ -175,7 +181,8 @@ def separate_by_time(
             delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
             max_s = max(delays.values())
             reason = f"{describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
-            return Deconfliction("corridors", reason, min_distance_m, conflicts, delays_s=delays, slack_s=slack_s)
+            plan = Deconfliction("corridors", reason, min_distance_m, conflicts, delays_s=delays, slack_s=slack_s)
+            return plan.replace(speed_m_s=speed_m_s)
         refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
         # A route waits only for routes before it in the sequence, so the next try begins with the blocked route.
         sequence = [blocked_route, *(route for route in sequence if route is not blocked_route)]

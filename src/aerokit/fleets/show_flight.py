@@ -19,13 +19,15 @@ from aerokit.errors import InvalidArgument, OperationRejected, OperationTimeout,
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.members import Member
+from aerokit.fleets.paths import Path, PathPoint
 from aerokit.fleets.policy import FleetResult
-from aerokit.fleets.separation import METRES_PER_DEGREE
+from aerokit.fleets.separation import METRES_PER_DEGREE, find_conflicts
 from aerokit.fleets.show import Show, state_at
-from aerokit.fleets.travel import Travel
+from aerokit.fleets.travel import Travel, stationary_members
 from aerokit.mavlink.messages import GlobalPositionInt, Timesync
 from aerokit.position import Position
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
+from aerokit.vehicle.state.movement import valid_coordinates
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.connection.bus import Detach
-    from aerokit.fleets.paths import LocalPoint, Path
+    from aerokit.fleets.paths import LocalPoint
     from aerokit.vehicle.vehicle import Vehicle
 
 __all__ = [
@@ -52,6 +54,7 @@ TRACK_GAIN = 0.8
 # therefore catch up even where the track rests.
 CATCH_UP_FACTOR, CATCH_UP_M_S = 1.5, 1.0
 
+# By how much a member may be late on its track: the comparison of the tracks allows this.
 CONFLICT_SLACK_S = 0.5
 
 POSITION_MAX_AGE_S = 2.0
@@ -275,12 +278,16 @@ class TrackRecorder:
         frame = message.received_frame
         if frame is None or frame.component_id != self._vehicle.component_id:
             return
+        coordinates = valid_coordinates(message.lat, message.lon)
+        if coordinates is None:  # A member that lost its position must not fly towards its track from 0°N 0°E.
+            return
+        latitude, longitude = coordinates
         measured_at = self._clock.to_local_time(message.time_boot_ms / 1000)
         if abs(measured_at - frame.received_at) > MAX_CLOCK_ERROR_S:  # TIMESYNC uses another clock of the vehicle.
             measured_at = frame.received_at
         place = (
-            (message.lat / 1e7 - self._latitude) * self._metres_per_latitude_degree,
-            math.remainder(message.lon / 1e7 - self._longitude, 360.0) * self._metres_per_longitude_degree,
+            (latitude - self._latitude) * self._metres_per_latitude_degree,
+            math.remainder(longitude - self._longitude, 360.0) * self._metres_per_longitude_degree,
             message.alt / 1000 - self._origin_amsl_m,
         )
         self._latest = measured_at, place, (message.vx / 100, message.vy / 100, -message.vz / 100)
@@ -331,6 +338,9 @@ class Shows(Travel):
         The members have to be in the air. Their clocks are measured with TIMESYNC, so that the report does not count
         the delay of telemetry as a deviation. If a member fails, the fleet's policy decides about the others.
 
+        A fleet with a ``min_distance_m`` compares the tracks first. A member that would join its track more than half a
+        second late, for example because the event loop was blocked, fails and holds.
+
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
             origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
@@ -343,13 +353,14 @@ class Shows(Travel):
 
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
-            OperationRejected: tracks come too close, or a member is unavailable. Nothing was sent.
+            OperationRejected: tracks come too close to each other or to a member without a track, or a member is
+                unavailable. Nothing was sent.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """
         check_range("rate_hz", rate_hz, 2, 50)
         local_origin, origin_amsl_m = self._local_origin(show, origin)
-        self._check_show(show)
+        self._check_show(show, local_origin, origin_amsl_m)
         names = tuple(show.tracks)
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
@@ -357,6 +368,7 @@ class Shows(Travel):
         arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         begin_at = self._context.now() + start_in_s
+        max_late_s = math.inf if self._context.min_distance_m is None else CONFLICT_SLACK_S
         recorders: dict[str, TrackRecorder] = {}
         with ExitStack() as stack:
             for name in names:
@@ -366,7 +378,9 @@ class Shows(Travel):
 
             async def fly(member: Member) -> None:
                 track, recorder = show.tracks[member.name], recorders[member.name]
-                await _fly_track(member, track, recorder, begin_at, rate_hz=rate_hz, lead_s=lead_s or 0.0)
+                await _fly_track(
+                    member, track, recorder, begin_at, rate_hz=rate_hz, lead_s=lead_s or 0.0, max_late_s=max_late_s
+                )
 
             result = await self._run("show", fly, names=names)
         samples = {name: recorder.samples for name, recorder in recorders.items()}
@@ -402,15 +416,27 @@ class Shows(Travel):
             for name, start in starts.items()
         }
 
-    def _check_show(self, show: Show) -> None:
-        """Raise OperationRejected if a member is unavailable, or if tracks come too close."""
+    def _check_show(self, show: Show, origin: LocalOrigin, origin_amsl_m: float) -> None:
+        """Raise OperationRejected if a member is unavailable, or if tracks or other members come too close."""
         for name in show.tracks:
             member = self.members[name]
             member.refresh()
             if not member.is_available:
                 raise OperationRejected(f"fly_show: {name} is {member.status}; nothing was sent")
         min_m = self._context.min_distance_m
-        conflicts = () if min_m is None else show.conflicts(min_m, slack_s=CONFLICT_SLACK_S)
+        if min_m is None:
+            return
+        stationary = stationary_members(self._context.members, origin, moving=show.tracks)
+        resting = [
+            Path(name, [PathPoint(0.0, north, east, amsl_m - origin_amsl_m)])
+            for name, (north, east, amsl_m) in stationary.items()
+        ]
+        paths = [*(track.replace(name=name) for name, track in show.tracks.items()), *resting]
+        conflicts = [
+            conflict
+            for conflict in find_conflicts(paths, min_m, slack_s=CONFLICT_SLACK_S)
+            if conflict.name not in stationary  # two members that both stay where they are
+        ]
         if conflicts:
             conflict = conflicts[0]
             more = f" (and {len(conflicts) - 1} more pairs)" if len(conflicts) > 1 else ""
@@ -421,12 +447,28 @@ class Shows(Travel):
 
 
 async def _fly_track(
-    member: Member, path: Path, recorder: TrackRecorder, begin_at: float, *, rate_hz: float, lead_s: float
+    member: Member,
+    path: Path,
+    recorder: TrackRecorder,
+    begin_at: float,
+    *,
+    rate_hz: float,
+    lead_s: float,
+    max_late_s: float,
 ) -> None:
-    """Fly a member along its path, from the current time until the end of the path."""
+    """Fly a member along its path, from the current time until the end of the path.
+
+    Raises:
+        OperationRejected: the member is ready more than ``max_late_s`` after the path begins. Its way to the path was
+            not compared with the other paths.
+    """
     vehicle, period_s = member.vehicle, 1 / rate_hz
     with vehicle._session.streaming("position"):
         async with vehicle.guided.velocity(rate_hz=rate_hz) as stream:
+            late_s = vehicle.connection.now() - begin_at - path.begins_at_s
+            if late_s > max_late_s:
+                raise OperationRejected(f"show: {member.name} would join its track {late_s:.1f} s late, so it holds")
+            # From here on, the stream itself stops if the event loop is blocked.
             while (at_s := vehicle.connection.now() - begin_at) < path.ends_at_s:
                 # Before the start, a member waits for its first position. Later, a missing position is an error.
                 if at_s < 0 and not recorder.has_position:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Literal
 
 import anyio
@@ -69,8 +69,8 @@ class Travel(SelectionBase):
             separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
-            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` would change the delays of
-                corridors. Nothing was sent.
+            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` or another ``speed_m_s`` does
+                not fit the delays of corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
                 members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
@@ -137,7 +137,7 @@ class Travel(SelectionBase):
             if by == "refuse" and deconfliction.decision == "layers":  # the paths cross
                 reason = f"{describe_pairs(deconfliction.conflicts)} come too close"
                 deconfliction = deconfliction.replace(decision="refused", reason=reason, heights_m={})
-        deconfliction = deconfliction.replace(routes=tuple(routes))
+        deconfliction = deconfliction.replace(routes=tuple(routes), stationary=stationary)
         self._context.publish(
             PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
         )
@@ -175,6 +175,11 @@ class Travel(SelectionBase):
         if separation.decision == "corridors":
             if stagger_s:
                 raise InvalidArgument(f"{action}: stagger_s would change the delays of corridors; nothing was sent")
+            if speed_m_s != separation.speed_m_s:
+                raise InvalidArgument(
+                    f"{action}: speed_m_s = {speed_m_s} is not allowed: the delays of these corridors are for"
+                    f" {separation.speed_m_s} m/s; nothing was sent"
+                )
             return await self._fly_to(
                 action, targets, speed_m_s, timeout, max_distance_m=max_distance_m, names=names, corridors=separation
             )
@@ -193,7 +198,7 @@ class Travel(SelectionBase):
 
     def _check_plan(self, action: str, targets: Mapping[str, Position], plan: Deconfliction) -> None:
         """Raise OperationRejected unless the plan was made for these targets and the members' present positions."""
-        routes, _ = self._routes(targets)
+        routes, stationary = self._routes(targets)
         present = {route.name: route for route in routes}
         planned = {route.name: route for route in plan.routes}
         for name in {**planned, **present}:
@@ -208,6 +213,11 @@ class Travel(SelectionBase):
             else:
                 continue
             raise OperationRejected(f"{action}: {reason}; nothing was sent")
+        for name, place in stationary.items():
+            if name not in plan.stationary or math.dist(place, plan.stationary[name]) > MAX_PLAN_DRIFT_M:
+                raise OperationRejected(
+                    f"{action}: the separation was planned before {name} came where it is; nothing was sent"
+                )
 
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]
@@ -239,12 +249,7 @@ class Travel(SelectionBase):
             )
             for member in moving
         ]
-        stationary: dict[str, LocalPoint] = {}
-        for member in members.values():
-            position = member.vehicle.position.latest
-            if member not in moving and position is not None and position.altitude_amsl_m is not None:
-                stationary[member.name] = origin.to_local(position, position.altitude_amsl_m)
-        return routes, stationary
+        return routes, stationary_members(members, origin, moving=[member.name for member in moving])
 
     async def _fly_to(
         self,
@@ -304,6 +309,18 @@ class Travel(SelectionBase):
                 break
         assert result is not None
         return result
+
+
+def stationary_members(
+    members: Mapping[str, Member], origin: LocalOrigin, moving: Collection[str]
+) -> dict[str, LocalPoint]:
+    """Return the last known positions of all members that are not ``moving``."""
+    stationary: dict[str, LocalPoint] = {}
+    for name, member in members.items():
+        position = member.vehicle.position.latest
+        if name not in moving and position is not None and position.altitude_amsl_m is not None:
+            stationary[name] = origin.to_local(position, position.altitude_amsl_m)
+    return stationary
 
 
 def _target_from_function(targets: Callable[[Member], Position | Home], member: Member) -> Position:
@@ -424,7 +441,8 @@ class Missions(SelectionBase):
 
         Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
         item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
-        by the member's present altitude.
+        by the member's present altitude. Members without a mission that are in the air count as obstacles at their last
+        known positions.
 
         Args:
             missions: maps names of members to missions.
@@ -445,7 +463,15 @@ class Missions(SelectionBase):
             # A position of any age will do, because it is only the origin of the coordinates.
             origin = LocalOrigin(position_of(first_member, math.inf))
             paths = [_mission_path(origin, members[name], mission) for name, mission in missions.items()]
-        conflicts = find_conflicts(paths, min_m)
+            # Members on the ground are left out, because missions begin and end beside them.
+            flying = {
+                name: member
+                for name, member in self._context.members.items()
+                if member.vehicle.is_armed and not is_reported_on_ground(member.vehicle.telemetry)
+            }
+            stationary = stationary_members(flying, origin, moving=missions)
+            paths += [Path(name, [PathPoint(0.0, *place)]) for name, place in stationary.items()]
+        conflicts = tuple(conflict for conflict in find_conflicts(paths, min_m) if conflict.name in missions)
         reason = f"{describe_pairs(conflicts)} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)
         self._context.publish(

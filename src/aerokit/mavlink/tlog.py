@@ -131,10 +131,10 @@ class TlogWriter:
 
     def write(self, raw: bytes, timestamp_s: float) -> None:
         """Write one frame. ``timestamp_s`` is in seconds since 1970, stored with microseconds."""
-        microseconds = round(timestamp_s * 1e6)
-        if not 0 <= microseconds < 1 << 64:
+        microseconds = timestamp_s * 1e6
+        if not 0 <= microseconds < 1 << 64:  # NaN is refused, too
             raise InvalidArgument(f"timestamp_s = {timestamp_s!r} must be seconds since 1970")
-        self._file.write(_TIME.pack(microseconds) + raw)
+        self._file.write(_TIME.pack(round(microseconds)) + raw)
 
     def flush(self) -> None:
         """Pass all data to the operating system, so that it survives a crash of the program."""

@@ -184,8 +184,9 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 def _convert_special(letter: str, value: float) -> Iterator[float]:
     """Yield the stored value for the letters that `_convert` does not handle itself; ``value`` is finite."""
     whole = math.trunc(value)
-    if letter == "f":  # 32-bit float
-        yield struct.unpack("<f", struct.pack("<f", value))[0]
+    if letter == "f":  # 32-bit float, whose maximum is 3.4e38
+        if abs(value) <= 3.4028234663852886e38:
+            yield struct.unpack("<f", struct.pack("<f", value))[0]
     elif letter == "c":  # limited to 0..255
         yield float(max(0, min(255, whole)))
     elif letter == "U":  # 16 bits that wrap

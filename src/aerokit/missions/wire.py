@@ -120,7 +120,7 @@ def from_degrees(value: float, command: int, frame: int) -> int | float:
     if math.isnan(value):
         return DEFAULT_XY
     scale = xy_scale(command, frame)
-    if math.isinf(value) or (scale == 1 and value != int(value)):
+    if math.isinf(value * scale) or (scale == 1 and value != int(value)):
         return value
     return round(value * scale)
 

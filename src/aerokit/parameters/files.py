@@ -201,7 +201,8 @@ def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]
     if len(fields) != 5:
         raise error
     system_id, component_id, name, value, type_number = fields
-    if not all(text.isascii() and text.isdigit() for text in (system_id, component_id, type_number)):
+    # The numbers have at most three digits. int() refuses a text of thousands of digits, and not by a FileFormatError.
+    if not all(text.isascii() and text.isdigit() and len(text) < 9 for text in (system_id, component_id, type_number)):
         raise error
     kind = int(type_number)
     if not 1 <= kind <= 10:

@@ -312,8 +312,10 @@ def _number(value: Any) -> int | float | None:
     if not isinstance(value, (int, float, str)):
         return None
     try:
-        return parse_number(str(value).strip())
-    except ValueError:
+        number = parse_number(str(value).strip())
+        float(number)
+        return number
+    except (ValueError, OverflowError):  # OverflowError: a whole number of 400 digits, which no text can format
         return None
 
 

@@ -7,6 +7,7 @@ Changes that are not one to one are not converted; :func:`replacement_of` descri
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Container, Mapping
 from decimal import Decimal
 from functools import lru_cache
@@ -66,13 +67,13 @@ class Rename(Snapshot):
     def to_new(self, value: float) -> int | float:
         """Convert an old value to new units, in decimal arithmetic, so that 29 cm/s are exactly 0.29 m/s."""
         if self.is_inverted:
-            return _checks_to_skip(int(value))
+            return _checks_to_skip(int(value)) if _is_mask(value) else value
         return value if self.divisor == 1 else _scaled(value, lambda decimal: decimal / self.divisor)
 
     def to_old(self, value: float) -> int | float:
         """Convert a new value to old units."""
         if self.is_inverted:
-            return _checks_to_make(int(value))
+            return _checks_to_make(int(value)) if _is_mask(value) else value
         return value if self.divisor == 1 else _scaled(value, lambda decimal: decimal * self.divisor)
 
 
@@ -84,9 +85,13 @@ class Renamed(Snapshot):
     rename: Rename
 
     def to_vehicle(self, value: float, type: ParameterType | None = None) -> int | float:  # noqa: A002
-        """Convert a value from the program's to the vehicle's units; rounded if the ``type`` is an integer one."""
+        """Convert a value from the program's to the vehicle's units; rounded if the ``type`` is an integer one.
+
+        A value that the parameter cannot have, such as NaN or a fraction of a bit mask, is not converted.
+        """
         converted = self._convert(value, self.requested)
-        return round(converted) if type is not None and type.is_integer else converted
+        is_scaled = self._has_other_units and self.rename.divisor != 1 and math.isfinite(converted)
+        return round(converted) if is_scaled and type is not None and type.is_integer else converted
 
     def to_requested(self, value: float) -> int | float:
         """Convert a value of the vehicle to the program's units."""
@@ -192,6 +197,11 @@ def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
         return float(scale(Decimal(number_text(value))))
     except (ArithmeticError, ValueError):  # The value is infinite, NaN or beyond 32 bits, which no vehicle accepts.
         return value
+
+
+def _is_mask(value: float) -> bool:
+    """Return True if a value is a bit mask. Others would become the mask of other checks."""
+    return -(2**31) <= value < 2**31 and value == int(value)
 
 
 def _checks_to_skip(checks: int) -> int:

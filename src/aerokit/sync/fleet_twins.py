@@ -125,8 +125,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
             separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
-            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` would change the delays of
-                corridors. Nothing was sent.
+            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` or another ``speed_m_s`` does
+                not fit the delays of corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
                 members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
@@ -209,6 +209,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
         The members have to be in the air. Their clocks are measured with TIMESYNC, so that the report does not count
         the delay of telemetry as a deviation. If a member fails, the fleet's policy decides about the others.
 
+        A fleet with a ``min_distance_m`` compares the tracks first. A member that would join its track more than half a
+        second late, for example because the event loop was blocked, fails and holds.
+
         Args:
             show: tracks with the names of members; :meth:`Show.renamed` assigns tracks to members.
             origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
@@ -221,7 +224,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
-            OperationRejected: tracks come too close, or a member is unavailable. Nothing was sent.
+            OperationRejected: tracks come too close to each other or to a member without a track, or a member is
+                unavailable. Nothing was sent.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """
@@ -352,7 +356,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
 
         Paths begin at the members' present positions. Members on the ground first climb to the altitude of the first
         item. Items without a position are left out, and jumps are not followed. An altitude above terrain is replaced
-        by the member's present altitude.
+        by the member's present altitude. Members without a mission that are in the air count as obstacles at their last
+        known positions.
 
         Args:
             missions: maps names of members to missions.
