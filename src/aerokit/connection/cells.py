@@ -29,7 +29,7 @@ class Feed(Protocol):
 
     @property
     def pending(self) -> object:
-        """True if received messages are not decoded yet."""
+        """Truthy if at least one received message is not decoded yet."""
 
     def catch_up(self) -> None:
         """Decode the pending messages now."""

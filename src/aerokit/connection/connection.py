@@ -252,7 +252,7 @@ class Connection:
         """Key that signs sent frames and verifies received frames; None: frames are neither signed nor verified.
 
         ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
-        the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
+        the connection is open; setting a key raises InvalidArgument with MAVLink 1, which has no signatures.
         """
         return self._encoder.signing
 
@@ -370,7 +370,7 @@ class Connection:
     def _slept_since(self, at: float) -> float:
         """Return how many seconds the computer was suspended since this time, while the event loop's clock stood still.
 
-        Publishes :class:`ComputerSlept` before it returns, so that all ages are right.
+        If it notices a new suspension, it publishes :class:`ComputerSlept`, whose subscribers correct all ages.
         """
         return self._receiver.slept_since(at)
 
@@ -502,7 +502,7 @@ class Connection:
     # ------------------------------------------------------------------------------- internal
 
     async def _open_link(self) -> None:
-        """Open the link. A link that is already open belongs to another connection and stays open."""
+        """Open the link. Raise BusyError if another connection has opened it; this connection then never closes it."""
         try:
             await self.link.open(self)
         except BusyError:
@@ -572,7 +572,7 @@ class Connection:
         return bool(peers)
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
-        """Number, frame and write a message to one peer, e.g. a probe over each of several links."""
+        """Encode a message with the next sequence number, and write it to one peer, e.g. to probe one of the links."""
         data = self._encode(self._encoder, message)
         self.link.write(data, peer)
         self._observers.record_sent(data, self._clock())

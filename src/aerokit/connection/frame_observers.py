@@ -193,7 +193,7 @@ _ObserverT = TypeVar("_ObserverT")
 
 
 class FrameObservers:
-    """Holds the callbacks for received and for sent frames, and the recording, if any, which gets all of them.
+    """Holds the callbacks for received frames and those for sent frames, and the recording of both, if there is one.
 
     ``on_change()`` is called when :attr:`want_all` may have changed.
     """

@@ -36,7 +36,7 @@ _CLOCKS = tuple(getattr(time, clock) for clock in CLOCKS[sys.platform]) if sys.p
 
 
 def suspended_s() -> float:
-    """Return the seconds since boot that the computer was suspended and the loop's clock stood still."""
+    """Return for how many seconds in total, since boot, the computer was suspended and the loop's clock stood still."""
     if _CLOCKS is None:
         return 0.0
     total, awake = _CLOCKS
@@ -56,7 +56,7 @@ class LoopWatch:
     the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
     ages may be too small by up to this time. ``on_blocked`` gets the maximum length of each pause that delays the timer
     by more than ``BLOCKED_THRESHOLD_S``. ``on_slept`` gets the time that the computer was suspended. ``on_caught_up``
-    gets the length of a pause, and of the time after it in which waiting data was read, once all of it was read.
+    is called when all waiting data has been read, and gets the seconds from the start of the pause until then.
     """
 
     def __init__(

@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Evidence in a frame of another peer on whether it continues the stream of the route's owner; None if unknown."""
+    """Evidence, from a frame of another peer, on whether that peer continues the owner's stream; None: unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
@@ -86,9 +86,9 @@ class RouteClaim:
         return self._sequence_matches is not False and self._clock_matches is True
 
     def has_replaced(self, now: float, rate: float) -> bool:
-        """Return True if the claim continues the owner's stream, and the owner was silent for the time of three frames.
+        """Return True if the claim continues the owner's stream with at least three frames, while the owner sent none.
 
-        ``rate`` is the owner's number of frames per second.
+        In the same time, the owner would have sent at least three frames at its ``rate`` (frames per second).
         """
         return (
             self.continues_owner
@@ -98,7 +98,7 @@ class RouteClaim:
 
     @property
     def may_continue_owner(self) -> bool:
-        """True if no evidence contradicts that the owner itself sends from the new peer."""
+        """True unless the evidence shows that the new peer is another sender than the owner."""
         return self._sequence_matches is not False and self._clock_matches is not False
 
 
@@ -155,9 +155,10 @@ class Routes:
     2. after 3.5 s without a heartbeat, not counting pauses of the event loop, or when a TCP client has disconnected: if
        it is on the same host (a reboot or restart, with new numbers), or continues the stream as above from any host,
        or signs with our key;
-    3. in the same case from any host, if the system has no vehicle object or the program allows it (``may_move``).
+    3. after the same silence or disconnection, from any host, if the system has no vehicle object or the program allows
+       it (``may_move``).
 
-    A peer refused by rule 2 (``RouteChangeRefused``) is judged again after the owner has sent again. The route of a
+    Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.
 
     ``attached`` has the system ids with a vehicle object. ``boot_clocks[component](received_at)`` returns the expected

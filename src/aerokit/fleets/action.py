@@ -72,8 +72,8 @@ class FleetAction:
         timeout: seconds for each member; None: no limit.
         stagger_s: delay in seconds between the starts of consecutive members.
         is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
-        holds_if_cancelled: if the action is cancelled or a function of the program raises an error, members that have
-            already finished it hold, too.
+        holds_if_cancelled: if the action is cancelled or a function passed by the program raises an error, members that
+            have already finished the action are told to hold as well.
     """
 
     def __init__(

@@ -36,16 +36,16 @@ class FleetEvent(Event):
 
 
 class MemberEvent(FleetEvent):
-    """An event of one vehicle, such as ``ModeChanged``, ``StatusTextReceived`` or ``LinkReport``.
+    """An event of one vehicle, such as ``ModeChanged`` or ``LinkReport``, or of a network, such as ``LinkInterrupted``.
 
-    For an event about a link, ``member`` is the name of the network.
+    ``member`` is the name of the vehicle or of the network.
     """
 
     event: Event
 
 
 class StateUpdate(FleetEvent):
-    """A vehicle's state has a new ``value``. docs/states.md lists the names of states."""
+    """One of a vehicle's states, such as its mode, has a new ``value``. docs/states.md lists all states by name."""
 
     state: str
     value: Any

@@ -49,7 +49,7 @@ class Selection(Actions, Missions, Formations, Shows):
         return self._select("group", name)
 
     def role(self, name: str) -> Selection:
-        """Select the members with one role.
+        """Select the members with this role.
 
         Raises:
             InvalidArgument: no member has this role.

@@ -210,7 +210,7 @@ class Following:
             return math.inf
 
     async def wait_stopped(self) -> str:
-        """Wait until following stops. Return the reason of an early stop; an empty string after the block has ended."""
+        """Wait until following stops. Return the reason of an early stop; an empty string if the block ended first."""
         await self._stopped.wait()
         return self._reason
 
@@ -349,7 +349,7 @@ class Following:
         )
 
     def _on_error(self, error: Exception) -> None:
-        """Stop following because of an error in the program. Without orders of the policy, all followers hold."""
+        """Stop following after an error in the program. If the policy gave no orders, all available followers hold."""
         hold_orders = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
         self._stop(str(error) or type(error).__name__, self._action.orders or hold_orders, {})
 

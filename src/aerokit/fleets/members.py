@@ -120,7 +120,7 @@ class Member:
             self._on_unavailable(self)  # `_set_lost` above calls `_on_unavailable` itself.
 
     def record_failure(self, action: str, error: Exception) -> None:
-        """Set the state to FAILED, unless the member is lost or taken over, and publish :class:`MemberFailed`."""
+        """Set the state to FAILED if the member is available, and publish :class:`MemberFailed` in any case."""
         self.refresh()
         if self.is_available:
             self._set_state(MemberState.FAILED, str(error))

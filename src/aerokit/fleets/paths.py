@@ -100,7 +100,7 @@ class Path(Snapshot):
 
 
 class Approach(Snapshot):
-    """Closest approach of two paths: distance, and the time of the closest point on each path."""
+    """Closest approach of two paths: the distance, and for each path the time at its closest point."""
 
     distance_m: float
     at_s: float

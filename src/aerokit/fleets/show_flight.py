@@ -73,7 +73,7 @@ MAX_CLOCK_ERROR_S = 1.0
 class ClockOffset(Snapshot):
     """The offset of a vehicle's clock: its time minus that of the event loop's clock.
 
-    The offset is accurate to half of ``round_trip_s``, which is the shortest round trip of ``answers`` requests.
+    The offset is accurate to half of ``round_trip_s``, the shortest round trip. ``answers`` requests were answered.
     """
 
     offset_s: float
@@ -153,8 +153,9 @@ class TrackDeviation(Snapshot):
 class ShowReport(Snapshot):
     """Result of a show. Positions were timed by the vehicles' own clocks; ``clocks`` has the offsets of these clocks.
 
-    ``lag_spread_s`` is the difference between the largest and the smallest lag. ``max_relative_error_m`` is the largest
-    error of a vector from one member to another. Both are None if unknown.
+    ``lag_spread_s`` is the difference between the largest and the smallest ``lag_s`` of the tracks, None if unknown.
+    ``max_relative_error_m`` is the largest difference between the actual and the planned vector from one member to
+    another, None if unknown.
     """
 
     result: FleetResult
@@ -231,8 +232,8 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 class TrackRecorder:
     """Records a vehicle's positions (GLOBAL_POSITION_INT) in its ``with`` block, in seconds and metres of the show.
 
-    Times are ``time_boot_ms``, converted by the clock offset that TIMESYNC has measured. If this is the offset of
-    another clock of the vehicle, they are the times of arrival.
+    Times are ``time_boot_ms``, converted by the clock offset that TIMESYNC has measured. If TIMESYNC turns out to use
+    another clock of the vehicle, the times at which the messages arrived are used instead.
     """
 
     def __init__(

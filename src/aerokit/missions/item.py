@@ -184,8 +184,8 @@ class MissionItem(Snapshot):
     ``command`` is a MAV_CMD, ``frame`` a MAV_FRAME. ``param1`` to ``param4`` belong to the command; NaN means "not
     given" where the standard allows it. ``x`` and ``y`` are integers as in MISSION_ITEM_INT: latitude and longitude in
     1e-7 degrees in a global frame, or 1e-4 m in a local frame. For commands without a place they are the unscaled
-    parameters 5 and 6; fractions of these can only be sent as MISSION_ITEM. ``z`` is in metres; the frame defines its
-    reference.
+    parameters 5 and 6; fractions of these can only be sent as MISSION_ITEM. ``z`` is in metres, from the reference of
+    the frame; for commands without a place it is parameter 7.
 
     Values are not checked on construction, because vehicles and files may contain anything; the method ``check`` of the
     plan checks them. Items are equal if all their fields are equal; NaN equals NaN.
@@ -338,7 +338,7 @@ def in_range(name: str, value: object, low: float, high: float, *, also_allowed:
 
 
 def whole_number(name: str, value: object, low: int, high: int) -> float:
-    """Return the value as a float; raise :class:`InvalidArgument` unless it is a whole number from low to high."""
+    """Return the value as a float; raise :class:`InvalidArgument` unless it is an ``int`` from low to high."""
     if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
         return float(value)
     raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a whole number from {low} to {high}")

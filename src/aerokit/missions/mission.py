@@ -149,7 +149,7 @@ class Fence(Snapshot):
     return_point: Position | None = None
 
     def check(self, *, home_is_item_0: bool | None = None) -> None:
-        """Raise :class:`InvalidArgument` if the fence cannot be sent. A fence never includes home."""
+        """Raise :class:`InvalidArgument` if the fence cannot be sent. ``home_is_item_0`` has no effect on a fence."""
         check_items(self.to_items(), self.MISSION_TYPE)
 
     def differences(self, found: Fence, storage: ItemStorage = ItemStorage.ANY) -> tuple[str, ...]:

@@ -598,7 +598,7 @@ def _place_or_altitude(
 
 
 def _altitudes_or_home(*altitudes: float | None) -> Altitudes:
-    """Return the altitudes of the ground; if none is given, the altitude of home."""
+    """Return the altitudes of the ground at a landing place; if none is given, those of home."""
     relative, amsl, terrain = altitudes
     if altitudes == (None, None, None):
         return (0.0, None, None)

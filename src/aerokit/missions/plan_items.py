@@ -232,7 +232,7 @@ def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
 
 
 def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
-    """Return the frame and altitude that the planner displays (AltitudeMode, Altitude, AMSLAltAboveTerrain)."""
+    """Return the frame and altitude that the planner has saved; ``frame`` if the AltitudeMode does not define one."""
     mode_member = value.child("AltitudeMode")
     mode = 0 if mode_member is None else mode_member.integer(0, 0xFF)
     # Mode 3 is an altitude above the terrain, which the planner has converted to one above mean sea level.

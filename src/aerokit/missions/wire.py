@@ -134,13 +134,13 @@ def with_home(items: Sequence[MissionItem], home: Position | None = None) -> tup
 
 
 def without_home(items: Sequence[MissionItem]) -> tuple[tuple[MissionItem, ...], Position | None]:
-    """Remove item 0. Return the remaining items and home, which is None if item 0 has no valid place."""
+    """Return the items after item 0, with adapted jumps, and the place of item 0 (home), None if it is not valid."""
     home = items[0].position if items else None
     return shift_jumps(items[1:], -1), home
 
 
 def home_item(home: Position | None) -> MissionItem:
-    """Create a waypoint at home, with its altitude above mean sea level."""
+    """Create a waypoint at home, with its altitude above mean sea level (0 if unknown), or at 0°, 0° for None."""
     if home is None:
         return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
     x, y = round(home.latitude_deg * 1e7), round(home.longitude_deg * 1e7)

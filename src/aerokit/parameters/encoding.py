@@ -116,7 +116,7 @@ def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValu
 
 # ------------------------------------------------------------------------------------------ bits
 class _ExactParamSet(ParamSet):
-    """A PARAM_SET whose ``param_value`` is a signalling NaN, which a Python float cannot hold."""
+    """A PARAM_SET whose ``param_value`` is a signalling NaN, which conversion to a Python float would change."""
 
     bits: bytes
 

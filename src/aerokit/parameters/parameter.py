@@ -83,7 +83,7 @@ class Parameter(Snapshot):
 
     ``value`` is an ``int`` for integer types, else a ``float`` with 32-bit precision. ``default`` is None if unknown;
     only MAVFTP reports defaults. ``index`` is the index in the vehicle's list, or None if not reported. Values are not
-    checked: a vehicle may report NaN.
+    checked: NaN, or a fraction that a vehicle reports for an integer type, remains a ``float``.
     """
 
     name: str

@@ -13,7 +13,7 @@ from aerokit.parameters.parameter import Parameter, ParameterType, same_value
 
 
 class ParameterTable(Mapping[str, Parameter]):
-    """Maps names to :class:`Parameter`, in the vehicle's order; immutable.
+    """Maps names to :class:`Parameter`, in the order in which they were given; immutable.
 
     ``table["WP_SPD"].value`` is one value, ``table.values_by_name()`` a dict of all. If a name occurs twice, the last
     one counts.
@@ -118,7 +118,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
 
 def _merged(old: Parameter | None, new: Parameter) -> Parameter:
-    """Return the new value, with the old default and index if the new one has none."""
+    """Return the new parameter; a default or an index that it lacks is taken from the old one."""
     if old is None or (new.default is not None and new.index is not None):
         return new
     default = old.default if new.default is None else new.default

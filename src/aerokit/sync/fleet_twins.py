@@ -73,7 +73,7 @@ class Following(BlockTwin["AsyncFollowing"]):
         return self.aio.error_m(name)
 
     def wait_stopped(self) -> str:
-        """Wait until following stops. Return the reason of an early stop; an empty string after the block has ended."""
+        """Wait until following stops. Return the reason of an early stop; an empty string if the block ended first."""
         return self._loop.run(self.aio.wait_stopped)
 
     def raise_if_stopped(self) -> None:
@@ -511,7 +511,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
         return Selection(self._loop, self._loop.call(self.aio.group, name))
 
     def role(self, name: str) -> Selection:
-        """Select the members with one role.
+        """Select the members with this role.
 
         Raises:
             InvalidArgument: no member has this role.

@@ -389,7 +389,7 @@ class Connection(ConnectionTwin):
         """Key that signs sent frames and verifies received frames; None: frames are neither signed nor verified.
 
         ``signing.timestamp`` is the time stamp to store; ``signing.refused`` counts refused frames. May be set while
-        the connection is open. Raises InvalidArgument with MAVLink 1, which has no signatures.
+        the connection is open; setting a key raises InvalidArgument with MAVLink 1, which has no signatures.
         """
         return self.aio.signing
 

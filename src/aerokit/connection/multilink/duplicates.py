@@ -156,7 +156,7 @@ class _Stream:
         return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
 
     def is_repeated(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement of this link. Return True if another link delivered it at least as often."""
+        """Count an acknowledgement that arrived over this link; True if another link delivered it at least as often."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for index, count in enumerate(counts) if index != link)
@@ -165,9 +165,9 @@ class _Stream:
 class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
-    If two links carry separate streams (each port of an autopilot has its own sequence numbers), frames of the link
-    that is not in use may be older. Of these, only late answers, and frames of components that the link in use does not
-    reach, are accepted. ``choices`` has the links to each system.
+    If two links carry separate streams (each port of an autopilot has its own sequence numbers), frames over the link
+    that is not in use may be older than accepted ones. From that link, only late answers and frames of components that
+    the link in use does not reach are therefore accepted. ``choices`` has the links to each system.
     """
 
     def __init__(self, link_count: int, choices: Mapping[int, LinkChoice]) -> None:
@@ -270,7 +270,7 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
 
 
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:
-    """Return True if two frames with equal bytes may still be different, as heartbeats of separate streams are."""
+    """Return True if a frame that equals an accepted one may be new: heartbeats of separate streams can be equal."""
     used = choice.used
     if used is None or used.link != link or frame.message_id != m.Heartbeat.ID:
         return False

@@ -101,7 +101,7 @@ class Candidate:
             self._doubt()
 
     def record_copy(self, now: float) -> None:
-        """Record that a frame with the time since boot arrived both here and over the link in use."""
+        """Count a frame, with a time since boot, that also arrived over the link in use; MIN_COPIES prove this link."""
         self.shared_at = now
         self._copies += 1
         if self._copies >= MIN_COPIES and not self.is_other_hardware:
@@ -227,7 +227,10 @@ class LinkChoice:
         return candidate
 
     def start_with(self, candidate: Candidate) -> None:
-        """Make this link the reference for other links, because the system's autopilot was first received over it."""
+        """Require proof of other links from now on: the autopilot's first heartbeat arrived over this link.
+
+        If this link is not in use, forget all others, so that it is chosen.
+        """
         self.needs_proof = True
         if candidate is not self.used:
             self.used = None  # The link used so far leads to another component only, e.g. a camera.
@@ -326,7 +329,7 @@ class LinkChoice:
         return has_other_links and not is_attached and candidate.should_request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
-        """Return True if the link was proven before, its hardware id matches, and no other link is alive."""
+        """Return True if the link was proven before, its hardware id matches, and it is the only link that is alive."""
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
@@ -347,7 +350,7 @@ class LinkChoice:
             self.hardware, self._hardware_link = hardware, used.link
 
     def _must_wait(self, used: Candidate, now: float) -> bool:
-        """Return True while a command over a faster link could overtake an earlier command over the link in use."""
+        """Return True while a command over a faster link could overtake an earlier one (at most MAX_SWITCH_DELAY_S)."""
         transit_s = (used.round_trip_s or 0.0) + JITTER_S
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S

@@ -303,7 +303,7 @@ class MultiLinkRoutes:
     # ---------------------------------------------------------------------------- internal
 
     def _link_reaching(self, choice: LinkChoice, source: tuple[int, int]) -> int:
-        """Return the link in use, or another link to the same system if only that link reaches the component."""
+        """Return the link in use or, if it has no route to the component, another usable link that has one."""
         assert choice.used is not None
         if not self._routes[choice.used.link].has_route(source):
             for link, candidate in choice.candidates.items():

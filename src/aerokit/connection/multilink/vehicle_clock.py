@@ -32,9 +32,9 @@ class VehicleClock:
         # (our time, the vehicle's time) in seconds.
         self._samples: deque[tuple[float, float]] = deque(maxlen=MAX_SAMPLES)
         self.is_steady: bool = True
-        """True if the last sample was as expected from the speed; False after a pause or reboot."""
+        """True if the last sample was as expected from the rate; False after a pause or reboot."""
         # Clock rate before the last pause or reboot, and our time of the first sample after it.
-        self._previous_speed: tuple[float, float] | None = None
+        self._previous_rate: tuple[float, float] | None = None
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
@@ -42,75 +42,75 @@ class VehicleClock:
         A clock that was paused for a moment counts as continuing, although it is late.
         """
         continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
-        is_unexpected = self._fits(at, vehicle_s, round_trip_s) is False  # None: the speed is not known yet
+        is_unexpected = self._fits(at, vehicle_s, round_trip_s) is False  # None: the rate is not known yet
         self.is_steady = continues and not is_unexpected
         if not self.is_steady:
-            if (speed := self._measured_speed) is not None:
-                self._previous_speed = speed, at
-            self._samples.clear()  # A speed that is measured across a pause or reboot would be wrong.
+            if (rate := self._measured_rate) is not None:
+                self._previous_rate = rate, at
+            self._samples.clear()  # A rate that is measured across a pause or reboot would be wrong.
         self._samples.append((at, vehicle_s))
         return continues
 
     def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
         """Return True if a sample from another link agrees with this clock; ``at`` is the middle of the round trip.
 
-        While the speed is unknown, a simulation may run at any speed. The result is then None, unless the sample fits
-        the speed from before the last pause or reboot, which can confirm a sample, but not contradict it.
+        Until the clock's rate is measured, a mismatch proves nothing, because a simulation may run at any rate. The
+        result is then True if the sample fits the rate from before the last pause or reboot, otherwise None.
         """
         fits = self._fits(at, vehicle_s, round_trip_s)
-        if self._measured_speed is None and not fits:
+        if self._measured_rate is None and not fits:
             return None
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample is as expected from the last one and the speed; None if the speed is unknown."""
-        speed = self._speed
-        if speed is None:
+        """Return True if a sample is as expected from the last one and the clock's rate; None if this is unknown."""
+        rate = self._rate
+        if rate is None:
             return None
         last_at, last_vehicle_s = self._samples[-1]
-        tolerance = self._tolerance_s(at, round_trip_s, speed)
-        return abs(last_vehicle_s + speed * (at - last_at) - vehicle_s) <= tolerance
+        tolerance = self._tolerance_s(at, round_trip_s, rate)
+        return abs(last_vehicle_s + rate * (at - last_at) - vehicle_s) <= tolerance
 
     def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
         """Return True unless the clock went back, ran too fast, or was paused for too long since the last sample."""
         last_at, last_vehicle_s = self._samples[-1]
         advance_s = vehicle_s - last_vehicle_s
-        speed = self._measured_speed
-        if speed is None:
+        rate = self._measured_rate
+        if rate is None:
             # The rate of the vehicle's clock is not measured yet. A simulation may run up to MAX_SPEED times as fast.
             max_advance_s = MAX_SPEED * (at - last_at + MIN_TOLERANCE_S + round_trip_s)
             return -MIN_TOLERANCE_S - round_trip_s <= advance_s <= max_advance_s
-        tolerance_s = self._tolerance_s(at, round_trip_s, speed)
-        expected_s = speed * (at - last_at)
-        min_advance_s = max(0.0, expected_s - MAX_PAUSE_S * max(1.0, speed))
+        tolerance_s = self._tolerance_s(at, round_trip_s, rate)
+        expected_s = rate * (at - last_at)
+        min_advance_s = max(0.0, expected_s - MAX_PAUSE_S * max(1.0, rate))
         return min_advance_s - tolerance_s <= advance_s <= expected_s + tolerance_s
 
-    def _tolerance_s(self, at: float, round_trip_s: float, speed: float) -> float:
+    def _tolerance_s(self, at: float, round_trip_s: float, rate: float) -> float:
         last_at, _ = self._samples[-1]
         drift_s = min(MAX_SPEED_ERROR * abs(at - last_at), MAX_DRIFT_S)
-        return (MIN_TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, speed)
+        return (MIN_TOLERANCE_S + round_trip_s / 2 + drift_s) * max(1.0, rate)
 
     @property
-    def _speed(self) -> float | None:
-        """The measured speed. Shortly after a pause or reboot it is the speed from before; None if neither is known."""
-        if self._measured_speed is not None:
-            return self._measured_speed
-        if self._previous_speed is None:
+    def _rate(self) -> float | None:
+        """The measured rate or, for SPEED_MAX_AGE_S after a pause or reboot, the one from before; otherwise None."""
+        if self._measured_rate is not None:
+            return self._measured_rate
+        if self._previous_rate is None:
             return None
-        speed, interrupted_at = self._previous_speed
+        rate, interrupted_at = self._previous_rate
         last_at, _ = self._samples[-1]
-        return speed if last_at - interrupted_at <= SPEED_MAX_AGE_S else None
+        return rate if last_at - interrupted_at <= SPEED_MAX_AGE_S else None
 
     @property
-    def _measured_speed(self) -> float | None:
+    def _measured_rate(self) -> float | None:
         """Seconds of the vehicle's clock per second of ours; None if the stored samples span too short a time."""
         if not self._samples:
             return None
         (first_at, first_vehicle_s), (last_at, last_vehicle_s) = self._samples[0], self._samples[-1]
         if last_at - first_at < MIN_SPAN_S:
             return None
-        speed = (last_vehicle_s - first_vehicle_s) / (last_at - first_at)
-        return 1.0 if abs(speed - 1) <= REAL_TIME_TOLERANCE else speed
+        rate = (last_vehicle_s - first_vehicle_s) / (last_at - first_at)
+        return 1.0 if abs(rate - 1) <= REAL_TIME_TOLERANCE else rate
 
 
 class HardwareId(NamedTuple):
