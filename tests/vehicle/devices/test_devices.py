@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import anyio
@@ -10,10 +11,12 @@ from device_calls import components_of
 from flight_harness import Px4Flight
 from test_actuators import on_ground, on_px4, params
 
+import aerokit
 from aerokit import messages as m
 from aerokit.errors import CommandRejected, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd as C
+from aerokit.sim import SimulatedPx4, simulated_link
 from aerokit.vehicle.commanding.simple_orders import receive_once
 from aerokit.vehicle.files.log_stream import UlogAssembler
 
@@ -72,6 +75,17 @@ async def test_receive_once_ends_despite_messages_of_others() -> None:
         with anyio.fail_after(5.0):
             assert await receive_once(flight.vehicle._context, m.WinchStatus) is None
         tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("lost", ["acknowledgement", "message"])
+async def test_pay_out_waits_although_first_status_was_lost(lost: str) -> None:
+    async with on_ground() as flight:
+        if lost == "message":
+            flight.copter.faults.lose(m.WinchStatus, times=1)
+        else:
+            flight.copter.faults.lose_ack(C.REQUEST_MESSAGE, times=1)
+        await flight.vehicle.winch().pay_out(2.0)
+        assert flight.copter.devices.line_m == pytest.approx(2.0, abs=0.15)
 
 
 async def test_winch_newer_order_ends_wait_for_previous() -> None:
@@ -153,6 +167,15 @@ async def test_shell_returns_output_of_command() -> None:
             assert flight.px4.shell.is_open
         await anyio.sleep(0.1)
         assert not flight.px4.shell.is_open
+
+
+async def test_shell_that_outlives_vehicle_keeps_its_exception() -> None:
+    async with simulated_link(SimulatedPx4(boot_time_s=0.0)) as link, aerokit.open_connection(link) as connection:
+        with pytest.raises(ZeroDivisionError):
+            async with contextlib.AsyncExitStack() as outer:
+                async with aerokit.connect(connection) as vehicle:
+                    await outer.enter_async_context(vehicle.shell())
+                raise ZeroDivisionError
 
 
 async def test_shell_addresses_its_vehicle_only() -> None:

@@ -68,7 +68,7 @@ class Shell(ReadOnly):
     def _close(self) -> None:
         """Close the shell by a message that requests no response."""
         self._output.close()
-        if self._is_open and self._session.connection.is_open:
+        if self._is_open and self._session.connection.is_open and not self._session.is_closed:
             self._send(b"", flags=0)
         self._is_open = False
 
