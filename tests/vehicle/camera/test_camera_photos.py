@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 
 import anyio
 import pytest
 from camera_stage import commands_to, on_board, px4
 
+import aerokit
 from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
+    ConnectionClosed,
     InvalidArgument,
     NotSupported,
     OperationRejected,
@@ -19,7 +22,7 @@ from aerokit.errors import (
 )
 from aerokit.events import ImageCaptured
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
-from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4
+from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio
 
@@ -519,3 +522,27 @@ async def test_bad_radio_neither_repeats_nor_misses_photos(seed: int) -> None:
             assert [capture.index async for capture in captures] == list(range(8, 20))
             assert captures.missed == 0
         assert camera.image_count == 20
+
+
+@pytest.mark.parametrize("ended", ["connection", "vehicle"])
+async def test_interval_ends_soon_after_connection_or_vehicle(ended: str) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, components=[SimulatedCamera()])
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with contextlib.AsyncExitStack() as block:
+            vehicle = await block.enter_async_context(aerokit.connect(connection))
+
+            async def follow() -> None:
+                async with vehicle.camera.photo_interval(60.0) as photos:
+                    async for _ in photos:
+                        pass
+
+            following = asyncio.create_task(follow())
+            await anyio.sleep(10.0)
+            if ended == "connection":
+                connection.close()
+            else:
+                await block.aclose()
+            await asyncio.wait([following], timeout=2.0)
+        assert following.done()
+        with pytest.raises(ConnectionClosed):
+            await following

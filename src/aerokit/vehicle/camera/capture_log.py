@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 MAX_CAPTURES = 20_000
 FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
+# Interval at which a wait for a capture checks whether the vehicle's block or the connection has ended.
+END_POLL_INTERVAL_S = 1.0
 # PX4 may send CAMERA_IMAGE_CAPTURED, which has the position, up to this many seconds after CAMERA_TRIGGER.
 TRIGGER_GRACE_S = 0.3
 # Two messages of different types with the same index report the same picture if they arrive within this time.
@@ -333,7 +335,8 @@ class CaptureQueue:
             while not self._queue:
                 self._log.cell._raise_if_closed()
                 self._event = anyio.Event()
-                await self._event.wait()
+                with anyio.move_on_after(END_POLL_INTERVAL_S):
+                    await self._event.wait()
         return bool(self._queue)
 
     def _add(self, capture: Capture) -> None:
