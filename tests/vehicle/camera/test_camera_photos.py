@@ -8,6 +8,7 @@ import contextlib
 import anyio
 import pytest
 from camera_stage import commands_to, on_board, px4
+from flight_harness import open_px4
 
 import aerokit
 from aerokit import messages as m
@@ -21,6 +22,7 @@ from aerokit.errors import (
     OperationTimeout,
 )
 from aerokit.events import ImageCaptured
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
 from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4, simulated_link
 
@@ -429,6 +431,24 @@ async def test_camera_trigger_uses_the_vehicle_position() -> None:
         assert capture.place is not None
         assert capture.place.distance_to(vehicle.position.value) < 1
         assert capture.yaw_deg == pytest.approx(vehicle.attitude.value.yaw_deg % 360, abs=1)
+
+
+async def test_camera_trigger_before_discovery_has_its_own_position() -> None:
+    """The camera is known only 2.5 s after its first trigger, and the vehicle flies on meanwhile."""
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        here, encoder = flight.vehicle.position.value, FrameEncoder(1, 1)
+        triggered_at = anyio.current_time()
+        flight.wire.deliver(encoder.encode(m.CameraTrigger(time_usec=1_700_000_000_000_000, seq=0)))
+        flight.px4.faults.frozen = True
+        latitude, longitude = round(here.latitude_deg * 1e7) + 10_000, round(here.longitude_deg * 1e7)
+        for _ in range(30):
+            await anyio.sleep(0.1)
+            flight.wire.deliver(encoder.encode(m.GlobalPositionInt(0, latitude, longitude, 500_000, 9_000, 0, 0, 0, 0)))
+        (capture,) = flight.vehicle.camera.captures()
+        assert capture.place is not None
+        assert capture.place.distance_to(here) < 1
+        assert capture.received_at == triggered_at
 
 
 async def test_camera_trigger_without_recent_position_has_no_place() -> None:

@@ -16,9 +16,7 @@ from aerokit.vehicle.camera.capture import (
     FEEDBACK_INDEX_RANGE,
     UNIX_TIME_OF_1990_S,
     Capture,
-    from_feedback,
-    from_image,
-    from_trigger,
+    capture_of,
 )
 
 if TYPE_CHECKING:
@@ -115,9 +113,9 @@ class CaptureLog:
             "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"
         )
         link.on_cleared.append(self._reset)
-        link.listen(m.CameraImageCaptured, self._on_image)
-        link.listen(m.CameraFeedback, self._on_feedback)
-        link.listen(m.CameraTrigger, self._on_trigger)
+        link.listen(m.CameraImageCaptured, self._on_message)
+        link.listen(m.CameraFeedback, self._on_message)
+        link.listen(m.CameraTrigger, self._on_message)
         link.listen(m.CameraCaptureStatus, self._on_status)
 
     def captures(self) -> list[Capture]:
@@ -168,30 +166,20 @@ class CaptureLog:
         # `img_idx` counts pictures from 1, `index` from 0.
         return newest is not None and (newest.img_idx - 1) % FEEDBACK_INDEX_RANGE != index
 
-    def record(self, message: Message) -> None:
+    def _on_message(self, message: Message) -> None:
+        self.record(message, capture_of(message, self._link.number or 0, self._link.now(), self._link.telemetry))
+
+    def record(self, message: Message, capture: Capture) -> None:
+        """Store the capture that a message reports; `capture_of` has decoded it when the message arrived."""
         if isinstance(message, m.CameraImageCaptured):
-            self._on_image(message)
-        elif isinstance(message, m.CameraFeedback):
-            self._on_feedback(message)
-        elif isinstance(message, m.CameraTrigger):
-            self._on_trigger(message)
-
-    def _on_image(self, message: m.CameraImageCaptured) -> None:
-        self._has_images = True
-        self._add(message, from_image(message, self._link.number or 0, self._link.now()))
-
-    def _on_feedback(self, message: m.CameraFeedback) -> None:
-        """Store ArduPilot's report of a picture. Its index has 16 bits, so it may return to 0."""
-        number = message.cam_idx + 1
-        highest = self._highest
-        has_wrapped = highest is not None and highest.capture.index > HALF_RANGE
-        # Before the first picture, ArduPilot sends a message of zeros, which is not a capture.
-        if (message.img_idx > 0 or has_wrapped) and number == self._link.number:
-            self._add(message, from_feedback(message, number, self._link.now()))
-
-    def _on_trigger(self, message: m.CameraTrigger) -> None:
-        if self._link.is_autopilot_attached and not self._has_images:
-            capture = from_trigger(message, self._link.number or 0, self._link.now(), self._link.telemetry)
+            self._has_images = True
+            self._add(message, capture)
+        elif isinstance(message, m.CameraFeedback):  # Its index has 16 bits, so it may return to 0.
+            has_wrapped = self._highest is not None and self._highest.capture.index > HALF_RANGE
+            # Before the first picture, ArduPilot sends a message of zeros, which is not a capture.
+            if (message.img_idx > 0 or has_wrapped) and message.cam_idx + 1 == self._link.number:
+                self._add(message, capture)
+        elif isinstance(message, m.CameraTrigger) and self._link.is_autopilot_attached and not self._has_images:
             self._link.call_later(TRIGGER_GRACE_S, lambda: self._add_unless_reported(message, capture))
 
     def _add_unless_reported(self, message: m.CameraTrigger, capture: Capture) -> None:
