@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from typing import Any
 
@@ -13,10 +14,17 @@ from test_actuators import on_ground, on_px4, params
 
 import aerokit
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
+from aerokit.errors import (
+    CommandRejected,
+    ConnectionClosed,
+    InvalidArgument,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd as C
-from aerokit.sim import SimulatedPx4, simulated_link
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.commanding.simple_orders import receive_once
 from aerokit.vehicle.files.log_stream import UlogAssembler
 
@@ -86,6 +94,27 @@ async def test_pay_out_waits_although_first_status_was_lost(lost: str) -> None:
             flight.copter.faults.lose_ack(C.REQUEST_MESSAGE, times=1)
         await flight.vehicle.winch().pay_out(2.0)
         assert flight.copter.devices.line_m == pytest.approx(2.0, abs=0.15)
+
+
+@pytest.mark.parametrize("name", ["pay_out", "look_at"])
+async def test_call_ends_with_vehicle_although_connection_stays(name: str) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.parameters["MNT1_TYPE"] = copter.parameters["WINCH_TYPE"] = 1.0
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            copter.faults.lose(m.GimbalDeviceAttitudeStatus, times=1_000)
+            north = aerokit.Position(vehicle.position.value.latitude_deg + 1.0, vehicle.position.value.longitude_deg)
+            calls = {
+                "pay_out": lambda: vehicle.winch().pay_out(100.0),
+                "look_at": lambda: vehicle.gimbal.look_at(north),
+            }
+            call = asyncio.create_task(calls[name]())
+            await anyio.sleep(3.0)
+            assert not call.done()
+        await asyncio.wait([call], timeout=1.0)
+        with pytest.raises(ConnectionClosed):
+            call.result()
 
 
 async def test_winch_newer_order_ends_wait_for_previous() -> None:

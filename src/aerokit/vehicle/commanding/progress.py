@@ -80,7 +80,7 @@ async def await_progress(
     with ChangeSignal(session, *cells) as changes:
         while True:
             now = session.connection.now()
-            session.connection.raise_if_ended()
+            session.raise_if_ended()
             if not is_done():
                 done_since = None
             elif done_since is None:

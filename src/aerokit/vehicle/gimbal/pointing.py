@@ -149,7 +149,7 @@ async def wait_until_reached(
     with orders.device.in_use(), ChangeSignal(session, *watched, every_arrival=True) as changes:
         while True:
             source = orders.attitude_source
-            session.connection.raise_if_ended()
+            session.raise_if_ended()
             has_rebooted = orders.public_device.reboots != reboots_before
             if not order.is_newest or has_rebooted:
                 reason = "the vehicle rebooted" if has_rebooted else SUPERSEDED

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 
 from aerokit.autopilots import autopilot_for
+from aerokit.connection.bus import copy_exception
 from aerokit.connection.cells import Source, StateCell
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import (
@@ -229,6 +230,12 @@ class VehicleSession:
         if self.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
         self.connection.send(message)
+
+    def raise_if_ended(self) -> None:
+        """Raise the error that has ended the connection or this session."""
+        self.connection.raise_if_ended()
+        if self._ended_by is not None:
+            raise copy_exception(self._ended_by)
 
     # ----------------------------------------------------------------------------- receiving
 
