@@ -269,6 +269,25 @@ async def test_log_stream_is_valid_ulog() -> None:
         assert len(params(flight, C.LOGGING_START)) == len(params(flight, C.LOGGING_STOP)) == 1
 
 
+@pytest.mark.parametrize("first", ["stream", "vehicle"])
+async def test_log_stream_is_stopped_when_vehicle_block_ends(first: str) -> None:
+    px4, stops = SimulatedPx4(boot_time_s=0.0), []
+    px4.observe(m.CommandLong, lambda message, _: stops.append(message.command == C.LOGGING_STOP))
+    async with simulated_link(px4) as link, aerokit.open_connection(link) as connection:
+        with contextlib.suppress(ZeroDivisionError):
+            async with contextlib.AsyncExitStack() as outer, aerokit.connect(connection) as vehicle:
+                await vehicle.wait_ready()
+                inner = vehicle.logs.stream()
+                if first == "vehicle":
+                    await outer.enter_async_context(inner)
+                else:
+                    async with inner:
+                        raise ZeroDivisionError
+                raise ZeroDivisionError
+        await anyio.sleep(1.0)
+        assert any(stops)
+
+
 async def test_log_stream_of_other_station_is_not_stopped() -> None:
     async with on_px4() as flight:
         flight.px4.faults.refuse(C.LOGGING_START, 1)
