@@ -207,6 +207,24 @@ async def test_shell_that_outlives_vehicle_keeps_its_exception() -> None:
                 raise ZeroDivisionError
 
 
+async def test_vehicle_block_closes_shell_and_ends_read() -> None:
+    px4 = SimulatedPx4(boot_time_s=0.0)
+    async with (
+        simulated_link(px4) as link,
+        aerokit.open_connection(link) as connection,
+        contextlib.AsyncExitStack() as outer,
+    ):
+        async with aerokit.connect(connection) as vehicle:
+            shell = await outer.enter_async_context(vehicle.shell())
+            reading = asyncio.create_task(shell.read())
+            await anyio.sleep(1.0)
+        await asyncio.wait([reading], timeout=1.0)
+        with pytest.raises(ConnectionClosed):
+            reading.result()
+        await anyio.sleep(0.5)
+        assert not px4.shell.is_open
+
+
 async def test_shell_addresses_its_vehicle_only() -> None:
     async with on_px4() as flight:
         async with flight.vehicle.shell() as shell:
