@@ -31,6 +31,7 @@ from aerokit.errors import (
     BusyError,
     CommandRejected,
     CommandTimeout,
+    ConnectionClosed,
     GimbalTaken,
     InvalidArgument,
     NotSupported,
@@ -475,6 +476,28 @@ async def test_vehicle_block_stops_rates_before_releasing_control() -> None:
         await anyio.sleep(2.0)
         assert (gimbal.angles(), gimbal.primary) == (here, (0, 0))
         tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("entered", ["control", "rates"])
+async def test_vehicle_block_ends_while_gimbal_block_is_entered(entered: str) -> None:
+    gimbal = SimulatedGimbal()
+    copter = SimulatedCopter(boot_time_s=0.0, components=[gimbal])
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.gimbal.controllers.wait_until(lambda _: True, timeout=3)
+            block: Any = vehicle.gimbal.control()
+            if entered == "rates":
+                await block.__aenter__()
+                block = vehicle.gimbal.rates(0.0, 5.0)
+            gimbal.faults.lose_ack(CONFIGURE if entered == "control" else PITCHYAW, times=None)
+            entering = asyncio.create_task(block.__aenter__())
+            await anyio.sleep(0.2)
+        with pytest.raises(ConnectionClosed):
+            await entering
+        await anyio.sleep(0.5)
+        here = gimbal.angles()
+        await anyio.sleep(2.0)
+        assert (gimbal.angles(), gimbal.primary) == (here, (0, 0))
 
 
 async def test_rates_stay_with_their_gimbal() -> None:

@@ -246,6 +246,7 @@ class GimbalControl:
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
+        orders.context.on_finish.append(self._finish)  # The vehicle's block may end before the confirmation.
         since = self._session.connection.now()
         try:
             await self._request_control()
@@ -315,7 +316,6 @@ class GimbalControl:
         self._device = device
         device.control_blocks[self._is_primary] = self
         self._detach_callbacks.append(device.controllers.observe(self._on_controllers, every_arrival=True))
-        orders.context.on_finish.append(self._finish)
 
     def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
         """Record and publish the loss of control when the manager reports another controller."""
