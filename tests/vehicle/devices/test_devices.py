@@ -287,7 +287,7 @@ async def test_log_stream_is_valid_ulog() -> None:
         assert len(params(flight, C.LOGGING_START)) == len(params(flight, C.LOGGING_STOP)) == 1
 
 
-@pytest.mark.parametrize("first", ["stream", "vehicle"])
+@pytest.mark.parametrize("first", ["stream", "vehicle", "entering"])
 async def test_log_stream_is_stopped_when_vehicle_block_ends(first: str) -> None:
     px4, stops = SimulatedPx4(boot_time_s=0.0), []
     px4.observe(m.CommandLong, lambda message, _: stops.append(message.command == C.LOGGING_STOP))
@@ -296,7 +296,12 @@ async def test_log_stream_is_stopped_when_vehicle_block_ends(first: str) -> None
             async with contextlib.AsyncExitStack() as outer, aerokit.connect(connection) as vehicle:
                 await vehicle.wait_ready()
                 inner = vehicle.logs.stream()
-                if first == "vehicle":
+                if first == "entering":
+                    px4.faults.lose_ack(C.LOGGING_START)
+                    entering = asyncio.create_task(inner.__aenter__())
+                    await anyio.sleep(0.2)
+                    outer.push_async_callback(asyncio.gather, entering, return_exceptions=True)
+                elif first == "vehicle":
                     await outer.enter_async_context(inner)
                 else:
                     async with inner:

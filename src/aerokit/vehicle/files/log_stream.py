@@ -125,6 +125,7 @@ class LogStream(ReadOnly):
         self._messages.__enter__()
         session = self._context.session
         self._detach = session.connection.bus.attach(LoggingDataAcked, self._acknowledge, system_id=session.system_id)
+        self._context.on_finish.append(self._stop_soon)
         try:
             await START.send(self._context)
         except BaseException as error:
@@ -133,7 +134,6 @@ class LogStream(ReadOnly):
             if not isinstance(error, CommandRejected):
                 self._stop_soon()
             raise
-        self._context.on_finish.append(self._stop_soon)
         return self
 
     def _close(self) -> None:
