@@ -80,7 +80,8 @@ async def test_source_table_lists_mounts_in_error() -> None:
 
 @pytest.mark.parametrize("passes", range(5))
 async def test_cancellation_that_coincides_with_answer_is_kept(passes: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    reader, left = asyncio.StreamReader(), []
+    reader = asyncio.StreamReader()
+    left: list[str] = []
 
     async def connect(*_: object, **__: object) -> tuple[asyncio.StreamReader, Mock]:
         return reader, Mock(wait_closed=AsyncMock())
