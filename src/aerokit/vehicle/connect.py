@@ -199,6 +199,11 @@ def _check_arguments(
         )
     if not timeout > 0:
         raise InvalidArgument(f"timeout = {timeout} is not allowed: it must be above 0")
+    _check_rates(rates, dialect)
+
+
+def _check_rates(rates: Mapping[type[Message], float] | None, dialect: Dialect) -> None:
+    """Raise InvalidArgument for a rate that cannot be requested."""
     for message_type, hz in (rates or {}).items():
         check_rate(message_type, hz)
         if dialect.get(message_type.ID) is not message_type:
@@ -362,9 +367,11 @@ async def vehicles_on(
         Mapping of system id to vehicle, in the order in which they were found; grows while the block lasts.
 
     Raises:
+        InvalidArgument: a rate is invalid. Nothing was sent.
         ConnectionClosed, LinkLost: the connection has ended.
     """
     connection.raise_if_ended()
+    _check_rates(rates, connection.bus.dialect)
     vehicles: dict[int, Vehicle] = {}
     tasks = BackgroundTasks(connection.fail)
 

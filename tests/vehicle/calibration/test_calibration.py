@@ -24,7 +24,9 @@ from aerokit.errors import (
     OperationRejected,
     OperationTimeout,
 )
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd, MavSeverity
+from aerokit.mavlink.message import Message
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.calibration.calibration import Calibration
 from aerokit.vehicle.calibration.values import CalibrationPose as Pose
@@ -133,6 +135,20 @@ async def test_ardupilot_accelerometer_confirms_each_pose_once() -> None:
         assert step is not None
         assert step.result is not None
         assert step.result.reboot_due
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("accelerometer", m.CommandLong(255, 0, MavCmd.ACCELCAL_VEHICLE_POS, 0, 16_777_215, 0, 0, 0, 0, 0, 0)),
+        ("compass", m.MagCalReport(3, 8, 5, 0, 50.0, 0, 0, 0, 0, 0, 0, 0, 0, 0)),
+    ],
+)
+async def test_result_from_another_component_does_not_count(name: str, message: Message) -> None:
+    async with stage(SimulatedCopter) as (_, vehicle, wire):
+        frame = FrameEncoder(1, 191).encode(message)
+        asyncio.get_running_loop().call_later(1.0, wire.deliver, frame)
+        assert len(await steps_of(getattr(vehicle.calibrate, name)())) > 6
 
 
 async def test_failed_accelerometer_raises_and_can_be_repeated() -> None:

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 
 import anyio
 import pytest
 from camera_stage import commands_to, on_board, px4
+from flight_harness import open_px4
 
+import aerokit
 from aerokit import messages as m
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
+    ConnectionClosed,
     InvalidArgument,
     NotSupported,
     OperationRejected,
     OperationTimeout,
 )
 from aerokit.events import ImageCaptured
+from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import CameraCapFlags, MavCmd, MavResult
-from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4
+from aerokit.sim import SimulatedCamera, SimulatedCopter, SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio
 
@@ -428,6 +433,24 @@ async def test_camera_trigger_uses_the_vehicle_position() -> None:
         assert capture.yaw_deg == pytest.approx(vehicle.attitude.value.yaw_deg % 360, abs=1)
 
 
+async def test_camera_trigger_before_discovery_has_its_own_position() -> None:
+    """The camera is known only 2.5 s after its first trigger, and the vehicle flies on meanwhile."""
+    async with open_px4() as flight:
+        await flight.vehicle.wait_ready()
+        here, encoder = flight.vehicle.position.value, FrameEncoder(1, 1)
+        triggered_at = anyio.current_time()
+        flight.wire.deliver(encoder.encode(m.CameraTrigger(time_usec=1_700_000_000_000_000, seq=0)))
+        flight.px4.faults.frozen = True
+        latitude, longitude = round(here.latitude_deg * 1e7) + 10_000, round(here.longitude_deg * 1e7)
+        for _ in range(30):
+            await anyio.sleep(0.1)
+            flight.wire.deliver(encoder.encode(m.GlobalPositionInt(0, latitude, longitude, 500_000, 9_000, 0, 0, 0, 0)))
+        (capture,) = flight.vehicle.camera.captures()
+        assert capture.place is not None
+        assert capture.place.distance_to(here) < 1
+        assert capture.received_at == triggered_at
+
+
 async def test_camera_trigger_without_recent_position_has_no_place() -> None:
     simulated = px4()
     simulated.parameters["TRIG_MODE"] = 1.0
@@ -519,3 +542,27 @@ async def test_bad_radio_neither_repeats_nor_misses_photos(seed: int) -> None:
             assert [capture.index async for capture in captures] == list(range(8, 20))
             assert captures.missed == 0
         assert camera.image_count == 20
+
+
+@pytest.mark.parametrize("ended", ["connection", "vehicle"])
+async def test_interval_ends_soon_after_connection_or_vehicle(ended: str) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0, components=[SimulatedCamera()])
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with contextlib.AsyncExitStack() as block:
+            vehicle = await block.enter_async_context(aerokit.connect(connection))
+
+            async def follow() -> None:
+                async with vehicle.camera.photo_interval(60.0) as photos:
+                    async for _ in photos:
+                        pass
+
+            following = asyncio.create_task(follow())
+            await anyio.sleep(10.0)
+            if ended == "connection":
+                connection.close()
+            else:
+                await block.aclose()
+            await asyncio.wait([following], timeout=2.0)
+        assert following.done()
+        with pytest.raises(ConnectionClosed):
+            await following

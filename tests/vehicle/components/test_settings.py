@@ -66,6 +66,20 @@ async def on_board(*others: SimulatedCamera | SimulatedGimbal, **options: Any) -
 # -------------------------------------------------------------------------- without a definition
 
 
+async def test_download_begins_again_after_reboot_of_vehicle() -> None:
+    async with on_board() as shelf, anyio.create_task_group() as tasks:
+
+        async def reboot() -> None:
+            await anyio.sleep(0.05)
+            assert 0 < len(shelf.settings.table) < LISTED
+            shelf.vehicle._session._on_reboot()
+
+        tasks.start_soon(reboot)
+        found = await shelf.settings.download()
+        assert len(shelf.all(m.ParamExtRequestList)) == 2
+        assert len(found) == LISTED
+
+
 async def test_settings_download_with_numbers_and_texts() -> None:
     async with on_board() as shelf:
         found = await shelf.settings.download()

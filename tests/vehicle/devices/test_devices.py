@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from typing import Any
 
 import anyio
@@ -10,10 +12,19 @@ from device_calls import components_of
 from flight_harness import Px4Flight
 from test_actuators import on_ground, on_px4, params
 
+import aerokit
 from aerokit import messages as m
-from aerokit.errors import CommandRejected, InvalidArgument, NotSupported, OperationRejected, OperationTimeout
+from aerokit.errors import (
+    CommandRejected,
+    ConnectionClosed,
+    InvalidArgument,
+    NotSupported,
+    OperationRejected,
+    OperationTimeout,
+)
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd as C
+from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.commanding.simple_orders import receive_once
 from aerokit.vehicle.files.log_stream import UlogAssembler
 
@@ -72,6 +83,38 @@ async def test_receive_once_ends_despite_messages_of_others() -> None:
         with anyio.fail_after(5.0):
             assert await receive_once(flight.vehicle._context, m.WinchStatus) is None
         tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("lost", ["acknowledgement", "message"])
+async def test_pay_out_waits_although_first_status_was_lost(lost: str) -> None:
+    async with on_ground() as flight:
+        if lost == "message":
+            flight.copter.faults.lose(m.WinchStatus, times=1)
+        else:
+            flight.copter.faults.lose_ack(C.REQUEST_MESSAGE, times=1)
+        await flight.vehicle.winch().pay_out(2.0)
+        assert flight.copter.devices.line_m == pytest.approx(2.0, abs=0.15)
+
+
+@pytest.mark.parametrize("name", ["pay_out", "look_at"])
+async def test_call_ends_with_vehicle_although_connection_stays(name: str) -> None:
+    copter = SimulatedCopter(boot_time_s=0.0)
+    copter.parameters["MNT1_TYPE"] = copter.parameters["WINCH_TYPE"] = 1.0
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.wait_ready()
+            copter.faults.lose(m.GimbalDeviceAttitudeStatus, times=1_000)
+            north = aerokit.Position(vehicle.position.value.latitude_deg + 1.0, vehicle.position.value.longitude_deg)
+            calls = {
+                "pay_out": lambda: vehicle.winch().pay_out(100.0),
+                "look_at": lambda: vehicle.gimbal.look_at(north),
+            }
+            call = asyncio.create_task(calls[name]())
+            await anyio.sleep(3.0)
+            assert not call.done()
+        await asyncio.wait([call], timeout=1.0)
+        with pytest.raises(ConnectionClosed):
+            call.result()
 
 
 async def test_winch_newer_order_ends_wait_for_previous() -> None:
@@ -155,6 +198,33 @@ async def test_shell_returns_output_of_command() -> None:
         assert not flight.px4.shell.is_open
 
 
+async def test_shell_that_outlives_vehicle_keeps_its_exception() -> None:
+    async with simulated_link(SimulatedPx4(boot_time_s=0.0)) as link, aerokit.open_connection(link) as connection:
+        with pytest.raises(ZeroDivisionError):
+            async with contextlib.AsyncExitStack() as outer:
+                async with aerokit.connect(connection) as vehicle:
+                    await outer.enter_async_context(vehicle.shell())
+                raise ZeroDivisionError
+
+
+async def test_vehicle_block_closes_shell_and_ends_read() -> None:
+    px4 = SimulatedPx4(boot_time_s=0.0)
+    async with (
+        simulated_link(px4) as link,
+        aerokit.open_connection(link) as connection,
+        contextlib.AsyncExitStack() as outer,
+    ):
+        async with aerokit.connect(connection) as vehicle:
+            shell = await outer.enter_async_context(vehicle.shell())
+            reading = asyncio.create_task(shell.read())
+            await anyio.sleep(1.0)
+        await asyncio.wait([reading], timeout=1.0)
+        with pytest.raises(ConnectionClosed):
+            reading.result()
+        await anyio.sleep(0.5)
+        assert not px4.shell.is_open
+
+
 async def test_shell_addresses_its_vehicle_only() -> None:
     async with on_px4() as flight:
         async with flight.vehicle.shell() as shell:
@@ -215,6 +285,35 @@ async def test_log_stream_is_valid_ulog() -> None:
         assert stream.lost == 0
         assert len(flight.wire.all(m.LoggingAck)) == 2
         assert len(params(flight, C.LOGGING_START)) == len(params(flight, C.LOGGING_STOP)) == 1
+
+
+async def wait_for_end(task: asyncio.Task[Any]) -> None:
+    with contextlib.suppress(ConnectionClosed):
+        await task
+
+
+@pytest.mark.parametrize("first", ["stream", "vehicle", "entering"])
+async def test_log_stream_is_stopped_when_vehicle_block_ends(first: str) -> None:
+    px4, stops = SimulatedPx4(boot_time_s=0.0), []
+    px4.observe(m.CommandLong, lambda message, _: stops.append(message.command == C.LOGGING_STOP))
+    async with simulated_link(px4) as link, aerokit.open_connection(link) as connection:
+        with contextlib.suppress(ZeroDivisionError):
+            async with contextlib.AsyncExitStack() as outer, aerokit.connect(connection) as vehicle:
+                await vehicle.wait_ready()
+                inner = vehicle.logs.stream()
+                if first == "entering":
+                    px4.faults.lose_ack(C.LOGGING_START)
+                    entering = asyncio.create_task(inner.__aenter__())
+                    await anyio.sleep(0.2)
+                    outer.push_async_callback(wait_for_end, entering)
+                elif first == "vehicle":
+                    await outer.enter_async_context(inner)
+                else:
+                    async with inner:
+                        raise ZeroDivisionError
+                raise ZeroDivisionError
+        await anyio.sleep(1.0)
+        assert any(stops)
 
 
 async def test_log_stream_of_other_station_is_not_stopped() -> None:

@@ -24,12 +24,14 @@ from gimbal_stage import (
     with_gimbals,
 )
 
+import aerokit
 from aerokit import errors, events
 from aerokit import messages as m
 from aerokit.errors import (
     BusyError,
     CommandRejected,
     CommandTimeout,
+    ConnectionClosed,
     GimbalTaken,
     InvalidArgument,
     NotSupported,
@@ -39,7 +41,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavResult
-from aerokit.sim import SimulatedGimbal, SimulatedPx4
+from aerokit.sim import SimulatedCopter, SimulatedGimbal, SimulatedPx4, simulated_link
 
 pytestmark = pytest.mark.anyio
 
@@ -355,6 +357,19 @@ async def test_control_is_released_after_silence() -> None:
         assert gimbal.primary == (0, 0)
 
 
+async def test_release_of_control_is_retried_after_cancellation() -> None:
+    gimbal = SimulatedGimbal()
+    async with with_gimbals(gimbal) as flight:
+        with anyio.CancelScope() as scope:
+            async with flight.vehicle.gimbal.control():
+                gimbal.faults.drop_incoming = 1  # loses the release
+                asyncio.get_running_loop().call_later(0.1, scope.cancel)
+        assert scope.cancelled_caught
+        assert gimbal.primary == own_ids(flight)
+        await anyio.sleep(3.0)
+        assert gimbal.primary == (0, 0)
+
+
 # --------------------------------------------------------------------------------------------- rates
 
 
@@ -435,6 +450,54 @@ async def test_refused_first_rates_send_no_zero() -> None:
                 pass
         await anyio.sleep(2.0)
         assert len(flight.wire.commands(PITCHYAW)) == 1
+
+
+async def test_vehicle_block_stops_rates_before_releasing_control() -> None:
+    """Without control, the gimbal's manager would deny the rate of zero, and the gimbal would turn on."""
+    gimbal = SimulatedGimbal()
+    copter = SimulatedCopter(boot_time_s=0.0, components=[gimbal])
+    async with (
+        simulated_link(copter) as link,
+        aerokit.open_connection(link) as connection,
+        anyio.create_task_group() as tasks,
+    ):
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.gimbal.controllers.wait_until(lambda _: True, timeout=3)
+
+            async def turn() -> None:
+                async with vehicle.gimbal.control(), vehicle.gimbal.rates(0.0, 5.0, valid_for_s=60.0):
+                    await anyio.sleep_forever()
+
+            tasks.start_soon(turn)
+            await anyio.sleep(2.0)
+            assert gimbal.angles()[2] > 0
+        await anyio.sleep(0.5)
+        here = gimbal.angles()
+        await anyio.sleep(2.0)
+        assert (gimbal.angles(), gimbal.primary) == (here, (0, 0))
+        tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("entered", ["control", "rates"])
+async def test_vehicle_block_ends_while_gimbal_block_is_entered(entered: str) -> None:
+    gimbal = SimulatedGimbal()
+    copter = SimulatedCopter(boot_time_s=0.0, components=[gimbal])
+    async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            await vehicle.gimbal.controllers.wait_until(lambda _: True, timeout=3)
+            block: Any = vehicle.gimbal.control()
+            if entered == "rates":
+                await block.__aenter__()
+                block = vehicle.gimbal.rates(0.0, 5.0)
+            gimbal.faults.lose_ack(CONFIGURE if entered == "control" else PITCHYAW, times=None)
+            entering = asyncio.create_task(block.__aenter__())
+            await anyio.sleep(0.2)
+        with pytest.raises(ConnectionClosed):
+            await entering
+        await anyio.sleep(0.5)
+        here = gimbal.angles()
+        await anyio.sleep(2.0)
+        assert (gimbal.angles(), gimbal.primary) == (here, (0, 0))
 
 
 async def test_rates_stay_with_their_gimbal() -> None:

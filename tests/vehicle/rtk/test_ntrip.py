@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import reduce
 from operator import xor
+from unittest.mock import AsyncMock, Mock
 
 import anyio
 import pytest
@@ -75,6 +76,32 @@ async def test_source_table_lists_mounts_in_error() -> None:
         with pytest.raises(OperationRejected, match="it has MOUNT, OTHER"):
             async with vehicle.rtk.ntrip(caster.url("NOWHERE")):
                 pass
+
+
+@pytest.mark.parametrize("passes", range(5))
+async def test_cancellation_that_coincides_with_answer_is_kept(passes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = asyncio.StreamReader()
+    left: list[str] = []
+
+    async def connect(*_: object, **__: object) -> tuple[asyncio.StreamReader, Mock]:
+        return reader, Mock(wait_closed=AsyncMock())
+
+    async def use() -> None:
+        async with vehicle.rtk.ntrip("ntrip://127.0.0.1/MOUNT", send_position=False):
+            await anyio.sleep(0.1)
+            left.append("the cancellation was lost")
+
+    monkeypatch.setattr(ntrip, "open_connection", connect)
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link, aerokit.connect(link, rates={}) as vehicle:
+        using = asyncio.create_task(use())
+        await anyio.wait_all_tasks_blocked()
+        reader.feed_data(b"ICY 200 OK\r\n")
+        for _ in range(passes):
+            await asyncio.sleep(0)
+        using.cancel()
+        await asyncio.wait([using])
+        assert not left
+        assert using.cancelled()
 
 
 async def test_position_is_sent_if_table_asks_for_it() -> None:

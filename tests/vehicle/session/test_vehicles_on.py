@@ -9,7 +9,7 @@ import pytest
 
 import aerokit
 from aerokit.connection.opening import open_connection
-from aerokit.errors import BusyError, ConnectionClosed, NotSupported
+from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, NotSupported
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.connect import vehicles_on
 from aerokit.vehicle.vehicle import overview
@@ -83,3 +83,10 @@ async def test_vehicles_on_closed_connection_raises() -> None:
         with pytest.raises(ConnectionClosed):
             async with vehicles_on(connection):
                 raise AssertionError
+
+
+async def test_vehicles_on_refuses_invalid_rate() -> None:
+    async with simulated_link(SimulatedCopter(boot_time_s=0.0)) as link, open_connection(link) as connection:
+        with pytest.raises(InvalidArgument, match="ATTITUDE"):
+            async with vehicles_on(connection, rates={aerokit.messages.Attitude: -1.0}):
+                pass

@@ -188,6 +188,25 @@ def test_better_source_wins_in_any_read_order(telemetry: Telemetry) -> None:
     assert telemetry.heading_deg.value == 271.0
 
 
+@pytest.mark.parametrize("newer", ["Attitude", "AttitudeQuaternion"])
+def test_older_pending_frame_does_not_replace_newer_value(newer: str, telemetry: Telemetry) -> None:
+    older = "AttitudeQuaternion" if newer == "Attitude" else "Attitude"
+    for name in (older, newer):
+        take(telemetry, ANYTHING[name], 0.0)  # The first frame of each type is decoded at once.
+    take(telemetry, ANYTHING[older], 1.0)
+    take(telemetry, ANYTHING[newer], 1.7)
+    source = telemetry.attitude.source
+    assert source is not None
+    assert (source.message, telemetry.attitude.updated_at) == (message_type(newer).NAME, 1.7)
+
+
+def test_older_pending_frame_of_second_receiver_is_kept(telemetry: Telemetry) -> None:
+    for at in (0.0, 1.0):
+        take(telemetry, ANYTHING["Gps2Raw"], at)
+        take(telemetry, ANYTHING["GpsRawInt"], at + 0.5)
+    assert len(telemetry.gps.value) == 2
+
+
 def test_unread_value_is_decoded_every_five_seconds(telemetry: Telemetry) -> None:
     streamed = telemetry.streams[messages.GlobalPositionInt.ID]
     waits = []

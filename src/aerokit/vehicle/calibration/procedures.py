@@ -181,6 +181,8 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     def on_message(message: MagCalProgress | MagCalReport) -> None:
         """Record the progress or result of one compass. The same progress again does not count as a change."""
         nonlocal compass_mask, has_changed
+        if not run.is_from_autopilot(message):
+            return
         compass_mask |= message.cal_mask
         if isinstance(message, MagCalReport):
             reports[message.compass_id] = message
@@ -241,6 +243,8 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
     now = run.session.connection.now
 
     def on_request(message: CommandLong) -> None:
+        if not run.is_from_autopilot(message):  # A companion computer may confirm poses by the same command.
+            return
         is_repeated = message.param1 == confirmed_pose and now() - confirmed_at < POSE_REPEAT_S
         # ArduPilot also reports the result by this command: `param1` is then SUCCESS or FAILED instead of a pose.
         if message.command == MavCmd.ACCELCAL_VEHICLE_POS and not is_repeated:

@@ -28,6 +28,7 @@ from aerokit.vehicle.commanding.progress import await_progress
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
+    from aerokit.mavlink.message import Message
     from aerokit.vehicle.calibration.values import CompassFit
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import SentCommand
@@ -239,6 +240,10 @@ class CalibrationRun:
         return status.updated_at > self._cancel_sent_at and status.latest != MavState.CALIBRATING
 
     # --------------------------------------------------------------------------------------- steps
+
+    def is_from_autopilot(self, message: Message) -> bool:
+        frame = message.received_frame
+        return frame is None or frame.component_id == self.session.component_id
 
     async def wait(
         self,

@@ -13,7 +13,7 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import InvalidArgument, NotSupported
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavType
-from aerokit.vehicle.camera.capture import Capture
+from aerokit.vehicle.camera.capture import Capture, capture_of
 from aerokit.vehicle.camera.capture_log import MAX_CAPTURES, CaptureLog
 from aerokit.vehicle.camera.controls import LensMixin, StorageMixin, TrackingMixin
 from aerokit.vehicle.camera.link import DISCOVERY_TIMEOUT_S, CameraLink
@@ -194,9 +194,9 @@ class Cameras:
         self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
-        # Captures of cameras attached to the autopilot, as number and message, kept until it is known which camera is
-        # the first.
-        self._early_captures: list[tuple[int, Any]] = []
+        # Captures of cameras attached to the autopilot, as number, message and decoded capture, kept until it is known
+        # which camera is the first.
+        self._early_captures: list[tuple[int, Any, Capture]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
         # True once `first` has returned `_first`. From then on, `first` always returns this object.
@@ -263,22 +263,23 @@ class Cameras:
         has_object = number == self._first_link.number or number in self._cameras
         if not is_camera or has_object:  # The object of a known camera receives this message by itself.
             return
+        capture = capture_of(message, number, self._session.connection.now(), self._session.telemetry)
         if self._first_link.number is None:
             if not self._early_captures:
                 self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early_captures)
             # If the list is full, a new capture replaces the last one.
             del self._early_captures[MAX_EARLY_CAPTURES - 1 :]
-            self._early_captures.append((number, message))
+            self._early_captures.append((number, message, capture))
         else:
-            self.at(number)._log.record(message)
+            self.at(number)._log.record(message, capture)
 
     def _process_early_captures(self) -> None:
         # No camera with its own component id was discovered, so the first camera is attached to the autopilot.
         captures, self._early_captures = self._early_captures, []
-        first_number, _ = captures[0]
+        first_number, *_ = captures[0]
         self._first_link.bind(first_number)
-        for number, message in captures:
-            self.at(number)._log.record(message)
+        for number, message, capture in captures:
+            self.at(number)._log.record(message, capture)
 
     def _record(self, message: Any, device_id: int) -> int:
         """Add the camera to the state value `cell`; return its number, or 0 if the message is not from a camera.

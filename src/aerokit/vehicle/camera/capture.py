@@ -74,6 +74,13 @@ class Capture(Snapshot):
     file_url: str
 
 
+def capture_of(message: Any, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
+    """Decode a message that reports a picture, when it arrives: CAMERA_TRIGGER gets the vehicle's present position."""
+    if message.NAME == "CAMERA_TRIGGER":
+        return from_trigger(message, camera, received_at, telemetry)
+    return (from_feedback if message.NAME == "CAMERA_FEEDBACK" else from_image)(message, camera, received_at)
+
+
 def from_image(message: CameraImageCaptured, camera: int, received_at: float) -> Capture:
     """Decode CAMERA_IMAGE_CAPTURED."""
     w, x, y, z = message.q

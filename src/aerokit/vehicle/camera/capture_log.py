@@ -16,9 +16,7 @@ from aerokit.vehicle.camera.capture import (
     FEEDBACK_INDEX_RANGE,
     UNIX_TIME_OF_1990_S,
     Capture,
-    from_feedback,
-    from_image,
-    from_trigger,
+    capture_of,
 )
 
 if TYPE_CHECKING:
@@ -30,6 +28,8 @@ if TYPE_CHECKING:
 
 MAX_CAPTURES = 20_000
 FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
+# Interval at which a wait for a capture checks whether the vehicle's block or the connection has ended.
+END_POLL_INTERVAL_S = 1.0
 # PX4 may send CAMERA_IMAGE_CAPTURED, which has the position, up to this many seconds after CAMERA_TRIGGER.
 TRIGGER_GRACE_S = 0.3
 # Two messages of different types with the same index report the same picture if they arrive within this time.
@@ -113,9 +113,9 @@ class CaptureLog:
             "camera.capture", "CAMERA_IMAGE_CAPTURED, CAMERA_FEEDBACK or CAMERA_TRIGGER"
         )
         link.on_cleared.append(self._reset)
-        link.listen(m.CameraImageCaptured, self._on_image)
-        link.listen(m.CameraFeedback, self._on_feedback)
-        link.listen(m.CameraTrigger, self._on_trigger)
+        link.listen(m.CameraImageCaptured, self._on_message)
+        link.listen(m.CameraFeedback, self._on_message)
+        link.listen(m.CameraTrigger, self._on_message)
         link.listen(m.CameraCaptureStatus, self._on_status)
 
     def captures(self) -> list[Capture]:
@@ -166,31 +166,21 @@ class CaptureLog:
         # `img_idx` counts pictures from 1, `index` from 0.
         return newest is not None and (newest.img_idx - 1) % FEEDBACK_INDEX_RANGE != index
 
-    def record(self, message: Message) -> None:
+    def _on_message(self, message: Message) -> None:
+        self.record(message, capture_of(message, self._link.number or 0, self._link.now(), self._link.telemetry))
+
+    def record(self, message: Message, capture: Capture) -> None:
+        """Store the capture that a message reports; `capture_of` has decoded it when the message arrived."""
         if isinstance(message, m.CameraImageCaptured):
-            self._on_image(message)
-        elif isinstance(message, m.CameraFeedback):
-            self._on_feedback(message)
-        elif isinstance(message, m.CameraTrigger):
-            self._on_trigger(message)
-
-    def _on_image(self, message: m.CameraImageCaptured) -> None:
-        self._has_images = True
-        self._add(message, from_image(message, self._link.number or 0, self._link.now()))
-
-    def _on_feedback(self, message: m.CameraFeedback) -> None:
-        """Store ArduPilot's report of a picture. Its index has 16 bits, so it may return to 0."""
-        number = message.cam_idx + 1
-        highest = self._highest
-        # Before the first picture, ArduPilot sends a message of zeros, which is not a capture. An index of 0 belongs to
-        # a picture only if the indices may have returned to 0.
-        may_have_wrapped = highest is not None and highest.capture.index > HALF_RANGE
-        if (message.img_idx > 0 or may_have_wrapped) and number == self._link.number:
-            self._add(message, from_feedback(message, number, self._link.now()))
-
-    def _on_trigger(self, message: m.CameraTrigger) -> None:
-        if self._link.is_autopilot_attached and not self._has_images:
-            capture = from_trigger(message, self._link.number or 0, self._link.now(), self._link.telemetry)
+            self._has_images = True
+            self._add(message, capture)
+        elif isinstance(message, m.CameraFeedback):  # Its index has 16 bits, so it may return to 0.
+            # Before the first picture, ArduPilot sends a message of zeros, which is not a capture. An index of 0
+            # belongs to a picture only if the indices may have returned to 0.
+            may_have_wrapped = self._highest is not None and self._highest.capture.index > HALF_RANGE
+            if (message.img_idx > 0 or may_have_wrapped) and message.cam_idx + 1 == self._link.number:
+                self._add(message, capture)
+        elif isinstance(message, m.CameraTrigger) and self._link.is_autopilot_attached and not self._has_images:
             self._link.call_later(TRIGGER_GRACE_S, lambda: self._add_unless_reported(message, capture))
 
     def _add_unless_reported(self, message: m.CameraTrigger, capture: Capture) -> None:
@@ -334,7 +324,8 @@ class CaptureQueue:
             while not self._queue:
                 self._log.cell._raise_if_closed()
                 self._event = anyio.Event()
-                await self._event.wait()
+                with anyio.move_on_after(END_POLL_INTERVAL_S):
+                    await self._event.wait()
         return bool(self._queue)
 
     def _add(self, capture: Capture) -> None:

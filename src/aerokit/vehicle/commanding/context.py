@@ -47,7 +47,8 @@ class VehicleContext:
 
         Returns True if a hold was still to be confirmed when the block ended.
         """
-        for callback in tuple(self.on_finish):
+        # The newest first, as nested blocks end: a gimbal is stopped before its control is released.
+        for callback in tuple(reversed(self.on_finish)):
             try:
                 callback()
             except Exception:  # The vehicle must hold even if a device fails.

@@ -34,6 +34,8 @@ EFFECT_TIMEOUT_S = 5.0
 """Seconds after the acknowledgement within which a message must report the effect."""
 EFFECT_POLL_S = 0.4
 """Seconds between requests for the message that reports the effect."""
+RECEIVE_ATTEMPTS = 3
+"""How often `receive_once` requests a message, because a request or the message may be lost."""
 
 
 class Argument(Snapshot):
@@ -240,21 +242,23 @@ async def _has_message(context: VehicleContext, message_id: int, component_id: i
 async def receive_once(
     context: VehicleContext, message_type: type[MessageT], component_id: int | None = None
 ) -> MessageT | None:
-    """Request one message and return it; None if the vehicle refuses, does not acknowledge, or does not send it.
+    """Request one message and return it; None if the vehicle refuses, or sends nothing after three requests.
 
-    Waits up to a second for the acknowledgement, and up to another second for the message.
+    Waits up to half a second for each acknowledgement, and then as long for the message.
     """
     session = context.session
     target = session.component_id if component_id is None else component_id
     with (
         session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages,
-        suppress(CommandRejected, CommandTimeout),
+        suppress(CommandRejected),
     ):
-        await session.commands.send_long(
-            MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=1.0
-        )
-        with anyio.move_on_after(1.0):
-            async for message in messages:  # Other components may send this message, too.
-                if message.received_frame is None or message.received_frame.component_id == target:
-                    return message
+        for _ in range(RECEIVE_ATTEMPTS):
+            with suppress(CommandTimeout):  # The message may arrive although the acknowledgement was lost.
+                await session.commands.send_long(
+                    MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=0.5
+                )
+            with anyio.move_on_after(0.5):
+                async for message in messages:  # Other components may send this message, too.
+                    if message.received_frame is None or message.received_frame.component_id == target:
+                        return message
     return None

@@ -65,6 +65,7 @@ class Settings:
         self._known: dict[str, Setting] = {}
         self._missing: set[str] = set()  # names of settings that the component does not have
         self._is_complete = False
+        self._reboots = 0  # number of reboots of the vehicle so far
         self._definition: CameraDefinition | None = None
         self._download_lock = asyncio.Lock()
         self._write_lock = asyncio.Lock()
@@ -183,7 +184,8 @@ class Settings:
         transfers = self._transfers
         with transfers.limit(timeout):
             async with self._download_lock:
-                if refresh or not self._is_complete:
+                while refresh or not self._is_complete:
+                    reboots_before = self._reboots
                     exchange = SettingList(
                         transfers.system_id,
                         transfers.component_id,
@@ -192,10 +194,13 @@ class Settings:
                         on_progress=on_progress,
                     )
                     listed = await transfers.run(exchange)
+                    if self._reboots != reboots_before:
+                        continue  # A part of the list is from before the reboot.
                     unlisted = {name: setting for name, setting in self._known.items() if name not in listed}
                     # Values in `_known` are newer than those in the list, because `_store` has recorded every message.
                     self._known = {name: self._known.get(name, listed[name]) for name in listed} | unlisted
                     self._is_complete = True
+                    break
                 return self.table
 
     async def get(
@@ -376,6 +381,7 @@ class Settings:
         self._known.clear()
         self._missing.clear()
         self._is_complete = False
+        self._reboots += 1
 
 
 def _setting_or_raise(answer: SettingAnswer) -> Setting:

@@ -90,7 +90,7 @@ class DeviceActions(VehicleBase):
         """Open PX4's system shell for the duration of an ``async with`` block (SERIAL_CONTROL)."""
         from aerokit.vehicle.devices.shell import Shell
 
-        return Shell(self._session)
+        return Shell(self._context)
 
     def play_tune(self, tune: str) -> None:
         """Play a tune on the vehicle's buzzer (PLAY_TUNE), for example ``"T200 L8 CEGO5C"``; returns at once.

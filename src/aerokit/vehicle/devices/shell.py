@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.async_block import ReadOnly
-from aerokit.errors import InvalidArgument, NotSupported, OperationTimeout
+from aerokit.errors import ConnectionClosed, InvalidArgument, NotSupported, OperationTimeout
 from aerokit.mavlink.enums import SerialControlDev, SerialControlFlag
 from aerokit.mavlink.messages import SerialControl
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from aerokit.connection.bus import Subscription
-    from aerokit.vehicle.session.session import VehicleSession
+    from aerokit.vehicle.commanding.context import VehicleContext
 
 __all__ = ["Shell"]
 
@@ -41,8 +41,9 @@ class Shell(ReadOnly):
         OperationTimeout: there was no prompt within five seconds.
     """
 
-    def __init__(self, session: VehicleSession) -> None:
-        self._session = session
+    def __init__(self, context: VehicleContext) -> None:
+        self._context, self._session = context, context.session
+        session = context.session
         self._output: Subscription[SerialControl] = session.connection.subscribe(
             SerialControl, system_id=session.system_id, capacity=MAX_WAITING_MESSAGES
         )
@@ -55,6 +56,7 @@ class Shell(ReadOnly):
             raise NotSupported(f"shell: {autopilot.firmware} has no shell; nothing was sent")
         self._output.__enter__()
         self._is_open = True
+        self._context.on_finish.append(self._finish)
         try:
             await self.run("", timeout=OPEN_TIMEOUT_S)  # An empty command makes the shell show its prompt.
         except BaseException:
@@ -65,10 +67,15 @@ class Shell(ReadOnly):
     async def __aexit__(self, *_: object) -> None:
         self._close()
 
-    def _close(self) -> None:
-        """Close the shell by a message that requests no response."""
-        self._output.close()
-        if self._is_open and self._session.connection.is_open:
+    def _finish(self) -> None:
+        self._close(ConnectionClosed("the async with block of this vehicle was left"))
+
+    def _close(self, error: Exception | None = None) -> None:
+        """Close the shell by a message that requests no response. A waiting reader raises ``error``."""
+        if self._finish in self._context.on_finish:
+            self._context.on_finish.remove(self._finish)
+        self._output.close(error)
+        if self._is_open and self._session.connection.is_open and not self._session.is_closed:
             self._send(b"", flags=0)
         self._is_open = False
 

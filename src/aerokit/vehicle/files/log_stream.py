@@ -125,19 +125,29 @@ class LogStream(ReadOnly):
         self._messages.__enter__()
         session = self._context.session
         self._detach = session.connection.bus.attach(LoggingDataAcked, self._acknowledge, system_id=session.system_id)
+        self._context.on_finish.append(self._stop_soon)
         try:
             await START.send(self._context)
         except BaseException as error:
             self._close()
             # If the vehicle refused, a running stream may belong to another station, so do not stop the stream.
             if not isinstance(error, CommandRejected):
-                session.transfers.command_in_background(MavCmd.LOGGING_STOP)
+                self._stop_soon()
             raise
         return self
 
     def _close(self) -> None:
         self._messages.close()
         self._detach()
+        if self._stop_soon in self._context.on_finish:
+            self._context.on_finish.remove(self._stop_soon)
+
+    def _stop_soon(self) -> None:
+        """Stop the stream without waiting. The command is sent now, because the vehicle's block may end next."""
+        session = self._context.session
+        if session.connection.is_open and not session.is_closed:
+            session.commands.send_unconfirmed(MavCmd.LOGGING_STOP)
+            session.transfers.command_in_background(MavCmd.LOGGING_STOP, was_just_sent=True)
 
     def _acknowledge(self, message: LoggingDataAcked) -> None:
         """Acknowledge a message at once. PX4 repeats it every 50 ms until then, and ends the stream after 50 times."""
@@ -156,7 +166,7 @@ class LogStream(ReadOnly):
         finally:
             self._close()
             if not is_stopped:
-                self._context.session.transfers.command_in_background(MavCmd.LOGGING_STOP)
+                self._stop_soon()
 
     def __aiter__(self) -> Self:
         return self

@@ -69,14 +69,21 @@ class ReleaseCommand:
                 f" {self._session.describe_link()}"
             )
         self._send()
-        await self._confirm()
+        try:
+            await self._confirm()
+        except asyncio.CancelledError:
+            self.send_soon(was_just_sent=True)  # The command may have been lost, so it is retried in the background.
+            raise
 
-    def send_soon(self) -> None:
-        """Send the command without waiting, e.g. when a block exits by an error or cancellation."""
+    def send_soon(self, *, was_just_sent: bool = False) -> None:
+        """Send the command without waiting, e.g. when a block exits by an error or cancellation.
+
+        If it ``was_just_sent``, send it only to repeat it.
+        """
         if not self._session.connection.is_open or self._session.is_closed or not self._is_still_due():
             return
         can_send_now = self._orders.context.arbiter.is_state_recent
-        if can_send_now:
+        if can_send_now and not was_just_sent:
             self._send()
 
         async def send_until_acknowledged() -> None:
@@ -240,6 +247,7 @@ class GimbalControl:
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
+        orders.context.on_finish.append(self._finish)  # The vehicle's block may end before the confirmation.
         since = self._session.connection.now()
         try:
             await self._request_control()
@@ -309,7 +317,6 @@ class GimbalControl:
         self._device = device
         device.control_blocks[self._is_primary] = self
         self._detach_callbacks.append(device.controllers.observe(self._on_controllers, every_arrival=True))
-        orders.context.on_finish.append(self._finish)
 
     def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
         """Record and publish the loss of control when the manager reports another controller."""

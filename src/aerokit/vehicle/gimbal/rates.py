@@ -99,12 +99,13 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         orders = self._orders
         self._order = orders.begin_order()
         self._in_use.enter_context(orders.device.in_use())
+        # Registered before the gimbal may turn, because the vehicle's block may end before the acknowledgement.
+        orders.context.on_finish.append(self._finish)
         try:
             is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, rates=self._value, flags=self._flags)
             if not is_supported:
                 raise orders.not_supported("has no gimbal manager, which is needed for rates")
             self._began_at = self._now()
-            orders.context.on_finish.append(self._finish)
             self._begin_sending()
         except (CommandRejected, NotSupported):  # The gimbal does not turn, because the manager refused.
             self._end()

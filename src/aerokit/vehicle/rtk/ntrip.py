@@ -279,14 +279,16 @@ class NtripClient:
         body = response.body()
         try:
             while True:
-                data = await asyncio.wait_for(body.__anext__(), MAX_SILENCE_S)
+                # Until Python 3.12, asyncio.wait_for() loses a cancellation that coincides with the data.
+                with anyio.fail_after(MAX_SILENCE_S):
+                    data = await body.__anext__()
                 for message in reader.feed(data):
                     message_count += 1
                     if len(message) <= MAX_MESSAGE_SIZE:
                         self._send(message)
                     else:
                         self._oversized += 1
-        except asyncio.TimeoutError:
+        except TimeoutError:
             reason = f"no data for {MAX_SILENCE_S:g} s"
         except StopAsyncIteration:  # The body has ended.
             pass
@@ -330,15 +332,13 @@ class NtripClient:
         caster = self._caster
         context = ssl.create_default_context() if caster.is_encrypted else None
 
-        async def exchange() -> _Response:
-            reader, self._writer = await open_connection(caster.host, caster.port, ssl=context)
-            position = gga_sentence(self._session) if mount and self._sends_position else None
-            self._writer.write(caster.request(mount, position))
-            return await _Response.read(reader)
-
         try:
-            return await asyncio.wait_for(exchange(), self._timeout)
-        except asyncio.TimeoutError:
+            with anyio.fail_after(self._timeout):
+                reader, self._writer = await open_connection(caster.host, caster.port, ssl=context)
+                position = gga_sentence(self._session) if mount and self._sends_position else None
+                self._writer.write(caster.request(mount, position))
+                return await _Response.read(reader)
+        except TimeoutError:
             self._close()
             raise OperationTimeout(f"{self._name}: the caster did not answer within {self._timeout:g} s") from None
         except (OSError, ValueError) as error:

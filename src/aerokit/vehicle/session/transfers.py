@@ -151,14 +151,17 @@ class Transfers:
         if scope.cancelled_caught:
             raise OperationTimeout(f"the operation was not done within {timeout:g} s; {self._describe()}")
 
-    def command_in_background(self, command: int, *params: float) -> None:
-        """Send a command without waiting for its ack. The command is optional, so a failure is ignored."""
+    def command_in_background(self, command: int, *params: float, was_just_sent: bool = False) -> None:
+        """Send a command without waiting for its ack. The command is optional, so a failure is ignored.
+
+        If it ``was_just_sent``, send it only to repeat it.
+        """
         send = self._send_command
 
         async def send_command() -> None:
             if send is not None:
                 with suppress(AerokitError), anyio.move_on_after(BACKGROUND_COMMAND_TIMEOUT_S):
-                    await send(command, *params)
+                    await send(command, *params, was_just_sent=was_just_sent)
 
         if not self.is_closed:
             self.background.start(send_command, "aerokit command of a transfer")

@@ -246,16 +246,19 @@ class Telemetry(States):
         """
         decode, context = message_source.decode, self._context
         assert decode is not None
+        is_lazy = message_source.message in LAZY
 
         def update(message: Any, source: Source) -> None:
             value = decode(message)
-            if value is not None:
+            # A frame that was kept undecoded may be older than a value from a message of another type.
+            is_older = is_lazy and self._time_of_arrival() < cell._updated_at
+            if value is not None and not is_older:
                 cell.set(value, source)
 
         def update_with_context(message: Any, source: Source) -> None:
             context.before = cell.latest
             value = decode(message, context)
-            if value is not None:
+            if value is not None:  # The value may combine messages of several types, so older ones count too.
                 cell.set(value, source)
 
         chosen_update = update_with_context if message_source.needs_context else update
