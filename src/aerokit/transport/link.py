@@ -40,7 +40,7 @@ class DrainListener(Receiver, Protocol):
         """Called when no waiting data has left for a second. Commands in this data may arrive late or never."""
 
     def link_drained(self, stalled_s: float) -> None:
-        """Called when data leaves again, after ``stalled_s`` seconds."""
+        """Called when data leaves again, ``stalled_s`` seconds after `link_stalled`."""
 
 
 @runtime_checkable
@@ -48,16 +48,16 @@ class OrderRefusalListener(Receiver, Protocol):
     """A receiver that is notified when the other end of a zenoh network refuses a command (docs/network.md)."""
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
-        """Called when a message with this name was not forwarded to the vehicle.
+        """Called when the other end did not forward a message to the vehicle.
 
-        ``lease_holder`` is the client that has control, if its control is the reason. ``answers`` are the frames by
-        which a vehicle would reject the command; empty if there are none.
+        ``message`` is the name of the message. ``lease_holder`` is the client that has control, if its control is the
+        reason. ``answers`` are the frames by which a vehicle would reject the command; empty if there are none.
         """
 
 
 @runtime_checkable
 class PeerKeeper(Receiver, Protocol):
-    """A receiver that decides by `Link.keep_peer` which peers a link remembers. Senders of noise are then forgotten.
+    """A receiver that decides by `Link.keep_peer` which peers a link remembers, to exclude senders of noise.
 
     A link that wraps another link forwards `Link.keep_peer`, `Link.forget_peer` and `Link.host_of`.
     """
@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called at the end of a burst, after its last ``bytes_received`` and before the next."""
+        """Called at the end of a burst, after its last ``bytes_received`` and before the first of the next burst."""
 
 
 @runtime_checkable
@@ -139,7 +139,7 @@ class Link(ABC):
         return 0
 
     def unsent_bytes_to(self, peer: Peer) -> int:
-        """Return the unsent bytes of one peer; if the link does not count per peer, those of all peers."""
+        """Return the number of unsent bytes for one peer, or for all peers if the link does not count per peer."""
         return self.unsent_bytes
 
     def discard_unsent(self) -> None:
@@ -150,7 +150,7 @@ class Link(ABC):
         return
 
     def keep_peer(self, peer: Peer) -> None:
-        """Remember a peer, and write to it, until `forget_peer`; see `PeerKeeper`."""
+        """Remember a peer until `forget_peer`, so that `write` can send to it; see `PeerKeeper`."""
         return
 
     def forget_peer(self, peer: Peer) -> None:

@@ -43,7 +43,7 @@ class MemberLinkListener(Receiver, Protocol):
 
 
 class MultiLink(Link):
-    """Several links to the same vehicles. A link that cannot be opened is retried while another link is open.
+    """Several links to the same vehicles. Those that cannot be opened are retried, if at least one can.
 
     Args:
         factories: functions that create the links, called for the first and every later attempt to open them.

@@ -70,8 +70,8 @@ class ReconnectingLink(Link):
 
     The first opening is not retried. ``link_lost`` is called only at the end of a recording, and if ``make_link``
     raises. Data written while the link is lost is dropped and counted in `dropped_writes`. Each loss is logged as
-    WARNING, each recovery as INFO. A link also counts as lost if the server closes each connection just after accepting
-    it.
+    WARNING, each recovery as INFO. A reopened link counts as recovered when bytes arrive or when it has been open for
+    1 s, because a server may close each connection just after accepting it.
 
     ``make_link`` is called at once and for each attempt, and must return a new link each time.
     """

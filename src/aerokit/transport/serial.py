@@ -152,7 +152,7 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _close_when_sent(self, transport: Any, deadline: float) -> None:
-        """Close the port when all data is sent or the deadline has passed. Called repeatedly until then."""
+        """Close the port when all data is sent or the deadline has passed; until then, check every `_LINGER_STEP_S`."""
         assert self._loop is not None
         if self._waiting_to_be_sent(transport) and self._loop.time() < deadline:
             self._loop.call_later(_LINGER_STEP_S, self._close_when_sent, transport, deadline)
@@ -273,7 +273,8 @@ class PtyLink(BaseLink):
 
     ``path`` is the name of a symbolic link to the other end, which is removed when this link is closed. A dangling
     symbolic link of that name is replaced; any other existing file is a LinkOpenError. Baud rates have no effect.
-    Programs may open and close the other end repeatedly; unread data is dropped. Not available on Windows.
+    Programs may open and close the other end repeatedly. Unread data stays in the kernel's buffer for the next program;
+    further data is dropped while the buffer is full. Not available on Windows.
     """
 
     def __init__(self, path: str = "") -> None:

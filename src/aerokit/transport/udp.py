@@ -171,7 +171,7 @@ class UdpListen(_UdpLink):
 
     @property
     def peers(self) -> tuple[Peer, ...]:
-        """Remembered peers, most recent first."""
+        """Remembered peers. The first is the last one that sent or, if the receiver keeps peers, the last one added."""
         return tuple(reversed(self._peers))
 
     def write(self, data: bytes, peer: Peer = None) -> None:
@@ -289,10 +289,10 @@ class UdpBroadcast(_UdpLink):
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
-        """Return True if datagrams of another sender than the present peer may be delivered.
+        """Return True if datagrams of a sender other than the present peer may be delivered.
 
-        Those of another port of the same host are delivered if the receiver keeps peers. It checks the frames before
-        it accepts the port by `keep_peer`.
+        The host must be allowed. Besides, the present peer is silent, or the sender is another port of its host and the
+        receiver keeps peers: such a receiver checks the frames before it accepts the port by `keep_peer`.
         """
         host, *_ = source
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host

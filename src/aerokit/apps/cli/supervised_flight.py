@@ -112,7 +112,7 @@ class SupervisedFlight(ABC):
 
     @abstractmethod
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        """Return purposes. While the vehicle is in the mode for one of them, this program still has control."""
+        """Return the purposes whose flight modes show that this program still has control of the vehicle."""
 
     def _check_disarmed(self) -> None:
         now = self._vehicle.describe_now()

@@ -110,7 +110,7 @@ class MissingScreen(ModalScreen[None]):
         self._vehicle = vehicle
 
     def compose(self) -> ComposeResult:
-        """Yield the reasons in a frame that can be scrolled."""
+        """Yield a scrollable box with a title, and in it an empty label for the reasons."""
         frame = VerticalScroll(Label(markup=False))
         frame.border_title = f"vehicle {self._vehicle.system_id}: missing"
         yield frame

@@ -43,7 +43,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
-    """Return the publisher for an address, to be entered by ``async with``. zenoh's publisher rejects other schemes."""
+    """Return the publisher for an address, to be entered by ``async with``, which rejects unknown schemes."""
     scheme = address.partition(":")[0].strip().lower()
     return PUBLISHERS.get(scheme, zenoh_publisher)(address)
 

@@ -137,7 +137,7 @@ class FlightWatch:
         return None if known is None else float(known.value)
 
     def on_order(self, order: str) -> None:
-        """Record an order of this server. Disarming shortly after the order ``disarm`` is caused by the order."""
+        """Record the time of the order ``disarm``: it counts as the cause of a disarming shortly afterwards."""
         if order == "disarm":
             self._disarm_ordered_at = self._now()
 

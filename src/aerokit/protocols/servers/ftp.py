@@ -192,7 +192,7 @@ class SessionFtpServer(Generic[FilesT]):
             self._reply(peer, self._adapted(peer, request, answer))
 
     def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
-        """Return the answer with the fields that this firmware sends. Subclasses change them."""
+        """Return the answer with its fields set as the firmware sets them. Here, the offset is that of the request."""
         return answer.replace(offset=request.offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:

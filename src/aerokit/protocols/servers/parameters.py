@@ -159,7 +159,7 @@ class TypedParameterServer(ParameterProtocolServer):
 
     @property
     def names(self) -> Sequence[str]:
-        """Parameters that fit into PARAM_VALUE."""
+        """Names of the parameters whose type fits into PARAM_VALUE."""
         return self._store.small_names
 
     def value_message(self, name: str, index: int) -> m.ParamValue:

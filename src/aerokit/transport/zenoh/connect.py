@@ -98,7 +98,7 @@ class ZenohConnect(NetworkLink):
 
     @property
     def late_frames(self) -> int:
-        """Number of datagrams and beacons that were dropped because they arrived more than 2 s late."""
+        """Number of datagrams and beacons (not of MAVLink frames) dropped because they arrived more than 2 s late."""
         return self._tracker.late
 
     def write(self, data: bytes, peer: Peer = None) -> None:
@@ -249,7 +249,7 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        """Return why the vehicle side was not found, with the names that were found instead."""
+        """Return why opening timed out: the vehicle side is silent, or missing in the fleet, whose names are listed."""
         names = sorted({key.split("/")[2] for key in self._vehicle_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:

@@ -82,7 +82,7 @@ _MISSION_WRITES = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_
 
 
 def is_read_only(frame: Frame) -> bool:
-    """Return True if any client may send this frame. Unknown messages count as commands."""
+    """Return True if clients without control may send this frame too. Unknown messages count as commands."""
     if frame.message_id in _READ_IDS:  # Most frames need not be decoded.
         return True
     if frame.message_id in (CommandLong.ID, CommandInt.ID):

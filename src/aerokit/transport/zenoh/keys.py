@@ -126,7 +126,7 @@ class Beacon(Snapshot):
 
 
 class Stamp(Snapshot):
-    """Attachment of a client's datagrams, with the last beacon that the client received."""
+    """Attachment of a client's datagrams, with the number of the last beacon that the client received."""
 
     epoch: int
     beacon: int
@@ -204,7 +204,7 @@ class RefusalNotice(Snapshot):
 
 
 def encode_sent_at(epoch: int, clock_s: float) -> bytes:
-    """Return the attachment of a datagram from the vehicle's program: the send time on the clock of that program."""
+    """Return the attachment of a datagram from the vehicle side: `Beacon.epoch`, and the send time on its clock."""
     return _SENT.pack(VERSION, epoch, int(clock_s * 1000))
 
 

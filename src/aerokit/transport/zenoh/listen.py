@@ -263,7 +263,7 @@ class ZenohListen(NetworkLink):
         self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
     def _send_notices(self, client: str, notices: list[RefusalNotice], stamp: Stamp | None) -> None:
-        """Send notices to the sender of the datagram with this stamp; without one, to all with its client name."""
+        """Send notices to the client whose datagram had this stamp; if it is None, to all clients with this name."""
         nonce = None if stamp is None else stamp.nonce
         for notice in notices:
             self._put(self._keys.notices(client), notice.replace(nonce=nonce).encode(), b"")

@@ -146,7 +146,7 @@ class NetworkLink(BaseLink):
         self._timer: asyncio.TimerHandle | None = None
 
     def _on_release(self, session: Any) -> None:
-        """Announce the end, and release all objects of the session. ``session`` is None if no session is open."""
+        """Release the session's objects; a vehicle side also tells its clients. ``session`` is None if none is open."""
         raise NotImplementedError
 
     def _release(self) -> None:
@@ -264,7 +264,7 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
 
 
 def _reason(error: Exception) -> str:
-    """Return the error text without zenoh's source location."""
+    """Return the error text for the user, without zenoh's source location. A failed connection gets a clearer text."""
     text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
     if text.startswith(_CONNECT_FAILED):
         endpoints = ", ".join(_ENDPOINTS.findall(text)) or text
