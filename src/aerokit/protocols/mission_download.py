@@ -116,7 +116,10 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._wait_for_items(now)
 
     def link_changed(self, now: float) -> None:
-        """Request the list again, because PX4 sends items only over the port on which the list was requested."""
+        """Request the list again, because PX4 sends items only over the port on which the list was requested.
+
+        Nothing is sent before MISSION_COUNT has arrived, because `expire` then repeats the request anyway.
+        """
         if self._count is not None and not self.done:
             self._restart(now)
 
