@@ -75,10 +75,7 @@ def printable(text: str) -> str:
 
 
 def format_value(value: object) -> str:
-    """Format a field of an event for people: enum members by name, floats with three significant digits.
-
-    Floats with a magnitude of 1000 or more are rounded to whole numbers.
-    """
+    """Format an event's field for people: enum members by name, floats with three digits, or as integers from 1000."""
     if isinstance(value, float):
         return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     name = getattr(value, "name", None)

@@ -116,11 +116,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
             self._wait_for_items(now)
 
     def link_changed(self, now: float) -> None:
-        """Request the list again, because PX4 sends items only over the port on which the list was requested.
-
-        Nothing is sent before MISSION_COUNT has arrived, because `expire` then repeats the request anyway.
-        """
-        if self._count is not None and not self.done:
+        """Request the list again, because PX4 sends items only over the port on which the list was requested."""
+        if self._count is not None and not self.done:  # Before the count arrives, `expire` repeats the request anyway.
             self._restart(now)
 
     # --------------------------------------------------------------------------------- answers

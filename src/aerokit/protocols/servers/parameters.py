@@ -27,10 +27,7 @@ class NamedList(Protocol):
 
 
 class ParameterLists:
-    """Sends lists of parameters, in groups of ``burst``, at ``list_rate_hz`` parameters a second.
-
-    A new request restarts a list.
-    """
+    """Sends lists in groups of ``burst``, at ``list_rate_hz`` parameters a second. A new request restarts a list."""
 
     burst: int = 5
     starts_at_once: bool = False
