@@ -245,11 +245,11 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._finish(ParameterTable(self._in_order(parameters, names)))
 
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
-        """Return each parameter once with its latest value, by index. Those without an index come last or are left out."""
+        """Return each parameter once with its latest value, by index. Those without index come last or are left out."""
         indices: dict[str, int | None] = {}
         for index, parameter in enumerate(parameters):
             indices.setdefault(parameter.name, index)
-        if self._refreshes == 0:  # After a change of the list, they are left out, as they may no longer exist.
+        if self._refreshes == 0:  # After a change of the list, names without an index may no longer exist.
             indices.update(dict.fromkeys(name for name in self._parameters if name not in names))
         latest = self._parameters
         return [Parameter(name, latest[name].value, latest[name].type, index=index) for name, index in indices.items()]
