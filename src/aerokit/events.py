@@ -291,7 +291,7 @@ class LinkReport(Event):
 class LoopBlocked(Event):
     """The program blocked the event loop: nothing was received or sent meanwhile.
 
-    ``seconds`` is the greatest possible length of the pause, up to 0.12 s more than its real length.
+    ``seconds`` is an upper bound for the length of the pause. The real length is at most 0.12 s less.
     """
 
     seconds: float
@@ -336,16 +336,16 @@ class LinkRestored(Event):
 class LinkStalled(Event):
     """The link has not sent any of its queued data for a second, so commands may arrive late.
 
-    ``unsent_bytes`` is the size of the queued data. aerokit drops data that waited in its own queue for more than a
-    second, but cannot drop data that the operating system has accepted (``connection.unsent_bytes``). The next event is
-    :class:`LinkDrained`, unless the link ends.
+    ``unsent_bytes`` is the size of the data in the queues of aerokit and, on Linux, of the operating system. aerokit
+    drops data that waited in its own queue for more than a second, but cannot drop data that the operating system has
+    accepted. The next event is :class:`LinkDrained`, unless the link ends.
     """
 
     unsent_bytes: int
 
 
 class LinkDrained(Event):
-    """The link transmits again, after ``stalled_s`` seconds."""
+    """The link transmits again. ``stalled_s`` is the time in seconds since :class:`LinkStalled`."""
 
     stalled_s: float
 

@@ -40,8 +40,8 @@ class VideoFrame(Snapshot):
     """One video frame.
 
     - ``picture``: a PyAV frame: ``picture.to_ndarray(format="rgb24")`` (height, width, 3), ``picture.to_image()``
-    - ``received_at``: time of decoding on the loop's clock; ``stream_s``: time in the stream, None if the frame has
-      none
+    - ``received_at``: time on the loop's clock at which the frame was decoded (that of its reception is unknown)
+    - ``stream_s``: time in the stream; None if the frame has none
     - ``position``, ``attitude``: the vehicle's latest values at ``received_at``; None without a vehicle, or if unknown
     """
 

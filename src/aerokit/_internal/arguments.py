@@ -67,7 +67,10 @@ _SECONDS: dict[str, Rule] = {
 
 
 def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
-    """Class decorator: all public methods check their arguments and raise InvalidArgument for the first invalid one."""
+    """Class decorator: the class's own public methods raise InvalidArgument for the first invalid argument.
+
+    Inherited, static and class methods, and properties, are not checked. Every time must be above 0.
+    """
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and inspect.isfunction(member):
             setattr(cls, name, checked(member, times_are_above_zero=True))

@@ -93,9 +93,9 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 class PartFile:
-    """A download in progress: until :meth:`finish`, ``<destination>.part`` holds the beginning of the complete file.
+    """A download in progress: until :meth:`finish`, ``<destination><mark>.part`` holds the beginning of the file.
 
-    ``mark`` is inserted before ``.part``, so that a download continues only the partial file that has the same mark.
+    Because of ``mark``, a download continues only a partial file that has the same mark.
     """
 
     def __init__(self, destination: str | os.PathLike[str], mark: str = "") -> None:

@@ -70,12 +70,12 @@ def _fields(value: object) -> Mapping[str, object] | None:
 
 
 def printable(text: str) -> str:
-    """Replace control characters, which a terminal would interpret, in text received from a vehicle."""
+    """Replace unprintable characters, except newlines, in text from a vehicle: a terminal might interpret them."""
     return "".join(char if char.isprintable() or char == "\n" else "\N{REPLACEMENT CHARACTER}" for char in text)
 
 
 def format_value(value: object) -> str:
-    """Format a field of an event for people: enum members by name, numbers with three significant digits."""
+    """Format an event's field for people: enum members by name, floats with three digits, or as integers from 1000."""
     if isinstance(value, float):
         return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     name = getattr(value, "name", None)

@@ -46,7 +46,7 @@ class _CounterFields:
 
 
 class Copyable:
-    """Lets objects with compiled fields be copied and pickled like objects with slots."""
+    """Makes objects whose fields are defined by compiled code, not by ``__slots__``, copyable and picklable."""
 
     __slots__ = ()
 

@@ -82,7 +82,7 @@ class AdaptiveWindow:
 
 
 class _BlockRequest:
-    """The request for one block. Of all transmissions, its latest one has the number ``transmission_number``."""
+    """The request for one block. Its latest transmission has the number ``transmission_number`` in the transfer."""
 
     __slots__ = ("attempts", "previous_sent_at", "sent_at", "transmission_number")
 
@@ -260,7 +260,7 @@ class Reassembly:
 
     @property
     def received_bytes(self) -> int:
-        """Number of bytes received, including those before ``start``."""
+        """Number of bytes received, including those before offset ``start``, which an earlier download received."""
         return self.position + self._bytes_ahead
 
     @property

@@ -240,7 +240,7 @@ class FtpClient:
         self._session = first_sequence
 
     def next_sequence(self, replies: int = 1) -> int:
-        """Return the sequence number of a new request. The next ``replies`` numbers are reserved for its replies."""
+        """Return the number of a new request. The next one is greater by ``replies``, as replies are numbered, too."""
         sequence = self._sequence % SEQUENCE_COUNT
         self._sequence = sequence + replies
         return sequence
@@ -347,7 +347,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
         return self._result is not None
 
     def start(self, now: float) -> None:
-        """Send the request, unless ``is_sent``."""
+        """Start the exchange: send the request, unless the caller sends it (``is_sent``)."""
         self._start_clock(now)
         self._transmit(now)
         if self._is_sent:  # The caller itself sends the first message.
@@ -392,7 +392,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._wait(now)
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
-        """Process a reply to another request, which only shows that the vehicle is still busy with a burst."""
+        """Process a reply to another request: ignore it, unless it shows that a burst delays TERMINATESESSION."""
         # ArduPilot answers TERMINATESESSION only after the current burst, so the blocks of the burst count as progress.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._progress_at = now

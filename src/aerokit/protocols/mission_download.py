@@ -117,7 +117,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     def link_changed(self, now: float) -> None:
         """Request the list again, because PX4 sends items only over the port on which the list was requested."""
-        if self._count is not None and not self.done:
+        if self._count is not None and not self.done:  # Before the count arrives, `expire` repeats the request anyway.
             self._restart(now)
 
     # --------------------------------------------------------------------------------- answers

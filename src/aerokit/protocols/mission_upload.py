@@ -34,8 +34,8 @@ class UploadResult(Snapshot):
     """Result of an upload that was not refused.
 
     ``is_confirmed`` is True if the vehicle has confirmed the plan. Otherwise all items were sent, but the answers are
-    ambiguous, and the plan must be read back; ``item`` is then the first unconfirmed item. ``opaque_id`` identifies the
-    plan on the vehicle; 0 if the vehicle sends none.
+    ambiguous, and the plan must be read back; ``item`` is then the index of the first unconfirmed item, and otherwise
+    has no meaning. ``opaque_id`` identifies the plan on the vehicle; 0 if the vehicle sends none.
     """
 
     is_confirmed: bool
@@ -105,7 +105,7 @@ class MissionUpload(MissionExchange[UploadResult]):
     @property
     def may_have_changed_items(self) -> bool:
         """True if the vehicle may have overwritten old items. False until the vehicle has requested an item."""
-        # If a partial upload fails after its first item alone, the vehicle has refused this item and replaced nothing.
+        # If a partial upload fails when only its first item was sent, the vehicle refused it and has replaced nothing.
         has_sent_only_first = self.is_partial and self._sent_end == self._first + 1
         return self.was_started and not has_sent_only_first
 
@@ -227,7 +227,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _is_refusal_of_partial_upload(self) -> bool:
-        """True if an ERROR refuses MISSION_WRITE_PARTIAL_LIST."""
+        """True while an ERROR would refuse MISSION_WRITE_PARTIAL_LIST: no item has been requested since it was sent."""
         return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
@@ -357,7 +357,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _in_flight_s(self) -> float:
-        """Seconds from the transmission of an item to the earliest possible arrival of the answer."""
+        """Seconds after its transmission for which an item counts as in flight; see `IN_FLIGHT_ROUND_TRIPS`."""
         round_trip_s = self.round_trip.smoothed_s
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()

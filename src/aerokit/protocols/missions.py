@@ -102,7 +102,7 @@ class MissionExchange(Transfer[ResultT]):
 
     @property
     def kind(self) -> str:
-        """Name of the mission type, for error texts: ``"mission"``, ``"fence"`` or ``"rally points"``."""
+        """Name of the mission type for errors: ``"mission"``, ``"fence"``, ``"rally points"``, or else ``"items"``."""
         return NAMES.get(MavMissionType(self.mission_type), "items")
 
     def cancellation(self) -> list[Message]:
@@ -196,7 +196,7 @@ class SetCurrentItem(Transfer[None]):
     item, this also counts as confirmation.
 
     With an ``order_status``, a retry waits for a HEARTBEAT that is newer than the last transmission. Retries stop when
-    ``order_status.end`` says that the order must not be sent any more.
+    ``order_status.end`` has a reason why this command must not be sent any more.
     """
 
     expects: tuple[type[Message], ...] = (MissionCurrent,)
@@ -225,7 +225,7 @@ class SetCurrentItem(Transfer[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process a MISSION_CURRENT. The first one may have been sent before the request arrived."""
+        """Finish if the item in MISSION_CURRENT is ours, or shows, compared with the last one, that ours was passed."""
         if not isinstance(message, MissionCurrent) or not self._is_from_target(message):
             return
         if message.seq == self._seq or self._has_passed(message.seq):

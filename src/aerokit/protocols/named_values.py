@@ -270,7 +270,7 @@ class NamedReads(NamedRequests[ValueT]):
 
 
 class UnexpectedAnswers(Generic[ValueT]):
-    """Collects consecutive answers to a write that have the same value, if one answer alone does not end the write."""
+    """Collects consecutive equal answers to a write, until there are enough of them to end the write."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same

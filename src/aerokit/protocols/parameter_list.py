@@ -61,8 +61,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
 
     The vehicle reports the number of parameters. If this number changes during the transfer, indices shift: ArduPilot
     reveals a group of parameters when the group is enabled, PX4 counts only the parameters in use. If a name then has
-    two indices or none, values received before the change are requested again. Values with index 65535 are not part of
-    the list.
+    two indices, or has lost its index, all values received before the change are requested again. Values with index
+    65535 are not part of the list.
 
     Raises from ``result()``:
         ParameterTimeout: no progress for ``idle_timeout_s`` seconds; ``missing`` has the missing indices.
@@ -86,7 +86,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ---------------------------------------------------------------------------- as an exchange
 
     def start(self, now: float) -> None:
-        """Request the list, and also one value by index to measure the round trip."""
+        """Request the list and, unless the round trip was measured before, one value by index to measure it."""
         self._start_clock(now)
         self._send_list_request(now)
         if self.round_trip.smoothed_s is None:
@@ -204,9 +204,9 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._must_request_missing = True
 
     def _quiet_s(self) -> float:
-        """Return the seconds without a message after which the stream has stopped.
+        """Return the seconds of silence after which the stream counts as stopped.
 
-        Except near the end, answers to requests also count as messages, because they delay the stream.
+        Except near the end, an answer to a request also ends the silence, because answers delay the stream.
         """
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed_count < MIN_STREAMED:  # A single value may be the answer to our request by index.
@@ -245,7 +245,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._finish(ParameterTable(self._in_order(parameters, names)))
 
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
-        """Return the parameters by index, each name once with its latest value. Names without an index come last."""
+        """Return each parameter once with its latest value, by index. Those without index come last or are left out."""
         indices: dict[str, int | None] = {}
         for index, parameter in enumerate(parameters):
             indices.setdefault(parameter.name, index)

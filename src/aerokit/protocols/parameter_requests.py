@@ -189,10 +189,10 @@ class ParameterWrites(ParameterRequests):
     """Set some parameters. The result has the value that each parameter has afterwards, as the vehicle reports it.
 
     An answer with the requested value and type completes a write. If no answer arrives, the value is read. PARAM_SET is
-    sent again only if the vehicle still reports the last known value, which is in ``before``, or if none is known. If
-    the vehicle keeps reporting it, it becomes the result. Any other value that it reports twice is the result as well:
-    the vehicle rounded or clamped the value, or another station set it. A later change by another station is therefore
-    not undone.
+    sent again only if the vehicle still reports the last known value, which is in ``before``, or if none is known. A
+    value that the vehicle keeps reporting meanwhile becomes the result. If the last known value is known, any other
+    value that is reported twice is the result as well: the vehicle rounded or clamped the value, or another station set
+    it. A later change by another station is therefore not undone.
 
     ``recent`` has names that an earlier call has just written. Answers to the earlier write may still arrive, so the
     first matching answer is verified by another read.

@@ -31,7 +31,7 @@ OVERTAKEN = 3
 
 
 class _Request:
-    """Times and numbers of the first and the latest transmission. All transmissions of the window are numbered."""
+    """Times and numbers of a request's first and latest transmission. Numbers count transmissions of all requests."""
 
     __slots__ = ("attempts", "due_at", "first_at", "first_number", "last_number", "sent_at", "was_duplicated")
 
@@ -46,10 +46,10 @@ class _Request:
 
 
 class RequestWindow(Generic[KeyT]):
-    """Requests by key. ``size`` requests may be in flight, or more while their answers do not become slower.
+    """Requests by key. Up to ``size`` may be in flight; this limit grows while answers do not become slower.
 
-    With ``duplicate_last``, the last few requests are sent twice from their third attempt on. A request is repeated
-    when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
+    With ``duplicate_last``, once only a few requests are left, each is sent twice from its third attempt on. A request
+    is repeated when its answer is overdue (:class:`RoundTrip`), or when later requests were answered first.
     """
 
     def __init__(self, round_trip: RoundTrip, *, size: int = DEFAULT_SIZE, duplicate_last: bool = True) -> None:

@@ -100,7 +100,7 @@ class CameraDevice:
         raise NotImplementedError
 
     def failed_shot(self) -> Shot:
-        """Return the content of CAMERA_IMAGE_CAPTURED for an image that could not be taken."""
+        """Return a `Shot` for an image that could not be taken; the caller adds its index and result."""
         return partial(
             CameraImageCaptured, time_boot_ms=self.host.time_boot_ms, time_utc=0, camera_id=0, lat=0, lon=0, alt=0,
             relative_alt=0, q=UNKNOWN_ATTITUDE, file_url="",

@@ -300,7 +300,7 @@ class FileTree:
         folder[name] = node
 
     def reserve(self, size: int) -> None:
-        """Take ``size`` from the free bytes; a negative size returns bytes. FileFault if too few bytes are free."""
+        """Subtract ``size`` from the free bytes; a negative size frees bytes. FileFault if too few bytes are free."""
         if self.free_bytes is None:
             return
         if size > self.free_bytes:

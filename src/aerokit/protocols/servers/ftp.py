@@ -140,7 +140,7 @@ class SessionFtpServer(Generic[FilesT]):
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
         """Return the number for a new session.
 
-        The client may request a number, as MAVProxy does. Otherwise, a free number is used.
+        The client may request a number, as MAVProxy does. If it requests 0 or a number in use, a free one is used.
         """
         if request.session and request.session not in peer.sessions:
             return request.session
@@ -262,7 +262,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
     def _size(self, path: str, *, reading: bool) -> int:
-        """Return the size of a file; 0 for a missing file that is opened for writing."""
+        """Return the size of a file. If it is unknown, raise FileFault when reading; otherwise return 0."""
         try:
             return self.files.size(path)
         except FileFault:
@@ -311,7 +311,7 @@ class SessionFtpServer(Generic[FilesT]):
         return None
 
     def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
-        """Send the next blocks of a burst, none while the link is congested, until the burst has ended."""
+        """Send the next `self.burst` blocks, or none while the link is congested; repeat until the burst has ended."""
         max_blocks = 0 if self._is_congested() else self.burst
         for number in range(max_blocks):
             if session.next_block is None:

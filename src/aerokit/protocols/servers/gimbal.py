@@ -102,7 +102,7 @@ class GimbalMount:
         raise NotImplementedError
 
     def follow(self, system_id: int) -> None:
-        """Point at another vehicle, as soon as its position is received."""
+        """Keep pointing at another vehicle, from the first position on that is received from it."""
         raise NotImplementedError
 
     def update_followed(self, system_id: int, place: Place) -> None:
@@ -294,7 +294,7 @@ class GimbalRequests:
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        """Apply the angles, or the rates. A rate is a fraction of the slew rate, from -1 to 1."""
+        """Apply the angles, taken as radians, or the rates, which are fractions of the slew rate, from -1 to 1."""
         gimbal = self._gimbal
         if self._selects_gimbal(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
             rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)

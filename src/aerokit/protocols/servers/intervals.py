@@ -22,7 +22,7 @@ _NOT_STREAMED = -1  # interval in MESSAGE_INTERVAL
 
 
 class MessageStreams:
-    """Sends the messages of ``builders``, by message id, on request or periodically.
+    """Sends messages on request or periodically. ``builders`` maps each message id to its `Builder`.
 
     A stream with an interval below ``min_interval_s`` is sent every ``min_interval_s``. At most ``max_streams`` run.
     """

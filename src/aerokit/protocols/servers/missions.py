@@ -264,7 +264,7 @@ class MissionServer:
         self._watch(upload)
 
     def _drop(self, upload: ListUpload) -> None:
-        """End an upload without an answer."""
+        """End an upload. This sends no answer to the client."""
         self._uploads.pop(self._key(upload.mission_type), None)
 
     def _end(self, upload: ListUpload, result: int) -> None:
@@ -324,7 +324,7 @@ class MissionServer:
             self._receive_item(upload, message)
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
-        """Answer an item that no upload expects. Ignored here, because the expected item is requested again anyway."""
+        """Called for an unexpected item. Sends nothing here: an upload requests its expected item again anyway."""
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
         """Store the expected item of an upload, and request the next one."""
@@ -355,7 +355,7 @@ class MissionServer:
             answer(_Result.INVALID)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """Drop an upload that its client cancels. The ACCEPTED at the end of a download is ignored."""
+        """Drop an upload that its client cancels before validation. The ACCEPTED that ends a download is ignored."""
         upload = self._uploads.get(self._key(ack.mission_type))
         if (
             upload is not None

@@ -27,7 +27,7 @@ class NamedList(Protocol):
 
 
 class ParameterLists:
-    """Sends lists of parameters: ``list_rate_hz`` a second, in groups of ``burst``. A new request restarts a list."""
+    """Sends lists in groups of ``burst``, at ``list_rate_hz`` parameters a second. A new request restarts a list."""
 
     burst: int = 5
     starts_at_once: bool = False
@@ -127,7 +127,7 @@ class TypedStore(NamedList, Protocol):
 
     @property
     def small_names(self) -> Sequence[str]:
-        """Names of the parameters whose type `fits_param_value`. Read for every PARAM_VALUE, so it must be fast."""
+        """Names of the parameters whose type `fits_param_value`. Needed for every PARAM_VALUE, so it must be fast."""
         ...
 
     def __contains__(self, name: object) -> bool: ...
