@@ -84,10 +84,11 @@ def test_connect_failure_has_short_traceback(failing: object, monkeypatch: pytes
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
 def test_ctrl_c_during_connect_has_short_traceback() -> None:
     before = threading.enumerate()
+    timers = []
     with pytest.raises(KeyboardInterrupt) as caught:
-        timer = interrupt_soon()
+        timers.append(interrupt_soon())
         dronekit.connect("udpin:127.0.0.1:0")
-    timer.join()
+    timers[0].join()
     assert len(caught.traceback) <= 3
     assert [thread for thread in threading.enumerate() if thread not in before] == []
 

@@ -74,11 +74,13 @@ async def test_function_error_that_ends_block_holds_finished_members() -> None:
             await anyio.sleep(30)
             raise KeyError("mine")
 
+    stages = []
     with pytest.raises(KeyError, match="mine"):
         async with open_stage(2) as stage:
+            stages.append(stage)
             await stage.take_off()
             await stage.fleet.do(fly)
-    assert stage.modes_ordered("north/1") == ["BRAKE"]
+    assert stages[0].modes_ordered("north/1") == ["BRAKE"]
 
 
 async def test_exception_in_block_propagates_and_members_hold_concurrently() -> None:

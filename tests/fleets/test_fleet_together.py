@@ -591,7 +591,7 @@ async def test_formation_needs_recent_heading_of_leader(monkeypatch: pytest.Monk
 
         def send_without_heading(message: Any, *arguments: Any) -> None:
             if isinstance(message, m.GlobalPositionInt):
-                message.hdg = 2**16 - 1
+                message = m.GlobalPositionInt(**message.to_dict() | {"hdg": 2**16 - 1})
             send(message, *arguments)
 
         monkeypatch.setattr(leader, "send", send_without_heading)

@@ -177,7 +177,7 @@ def test_return_point_in_fence_of_version_1_is_refused() -> None:
     document = samples.document()
     document["geoFence"] = {"version": 1}
     assert read(document).fence == Fence()
-    document["geoFence"]["breachReturn"] = [47.0, 8.0]
+    document["geoFence"] = {"version": 1, "breachReturn": [47.0, 8.0]}
     with pytest.raises(FileFormatError, match=r"geoFence.version = 1: expected 2"):
         read(document)
 

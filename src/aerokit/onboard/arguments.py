@@ -132,8 +132,9 @@ def _argument(function_name: str, name: str, number: int, hint: Any) -> CommandA
             members = [member for member in get_args(hint) if member is not type(None)]
             is_optional = len(members) < len(get_args(hint))
             hint = members[0] if len(members) == 1 else None  # None is refused below.
-    is_enum = isinstance(hint, type) and issubclass(hint, Enum)
-    is_number = hint in (float, int, bool) or (is_enum and all(isinstance(member.value, int) for member in hint))
+    members = list(hint) if isinstance(hint, type) and issubclass(hint, Enum) else []
+    is_enum_of_integers = bool(members) and all(isinstance(member.value, int) for member in members)
+    is_number = hint in (float, int, bool) or is_enum_of_integers
     if not is_number:
         raise InvalidArgument(
             f"{function_name}(): argument {name} must be annotated with float, int, bool or an enum of integers"

@@ -207,8 +207,8 @@ async def test_load_storage_returns_all_media() -> None:
     def storage(number: int) -> list[m.StorageInformation]:
         """A camera that is slow to report its second medium unless that one is requested."""
         (card,) = camera.card.information(camera, 1)
-        fields = {name: getattr(card, name) for name in card.__match_args__}
-        return [m.StorageInformation(**fields | {"storage_count": 2, "storage_id": number or 1})]
+        fields: dict[str, Any] = card.to_dict() | {"storage_count": 2, "storage_id": number or 1}
+        return [m.StorageInformation(**fields)]
 
     camera.storage = storage  # type: ignore[method-assign]
     async with on_board(camera) as vehicle:

@@ -108,6 +108,7 @@ async def test_mission_replaced_by_another_station_is_flown_to_landing() -> None
 async def test_mission_with_another_id_is_flown_to_landing() -> None:
     """PX4 reports another id of the mission after another station has replaced it by one of the same length."""
     async with armed(open_px4, waypoint(*near_home(18), altitude_relative_m=4)) as flight:
+        assert isinstance(flight, Px4Flight)
         flight.px4.missions.replace(MavMissionType.MISSION, short_mission(flight, return_to_launch()).to_items())
         await anyio.sleep(2.0)
         await flight.vehicle.mission.start()
@@ -119,6 +120,7 @@ async def test_mission_with_another_id_is_flown_to_landing() -> None:
 async def test_mission_accepted_from_another_station_is_finished_in_air(station: tuple[int, int]) -> None:
     """On a shared link, ArduPilot's answer to the other station, which may have our ids, shows a new mission."""
     async with armed(open_flight, return_to_launch()) as flight:
+        assert isinstance(flight, Flight)
         replacement = short_mission(flight, waypoint(*near_home(18), altitude_relative_m=4))
         flight.copter.missions.replace(MavMissionType.MISSION, replacement.to_items(home_is_item_0=True))
         flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(*station, MavMissionResult.ACCEPTED)))

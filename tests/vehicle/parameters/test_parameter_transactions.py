@@ -308,11 +308,13 @@ async def test_transaction_write_of_other_task_does_not_outlive_it() -> None:
     async with open_flight(copter()) as flight:
         parameters = flight.vehicle.parameters
         await parameters.get("RTL_ALT")
+        writes = []
         with pytest.raises(InvalidArgument, match="RTL_ALT"):
             async with parameters.transaction() as transaction:
-                failing_write = asyncio.create_task(transaction.set("RTL_ALT", 1e12))
-                slow_write = asyncio.create_task(transaction.set("WPNAV_SPEED", 700))
-                await asyncio.gather(failing_write, slow_write)
+                writes += [asyncio.create_task(transaction.set("RTL_ALT", 1e12))]
+                writes += [asyncio.create_task(transaction.set("WPNAV_SPEED", 700))]
+                await asyncio.gather(*writes)
+        _, slow_write = writes
         with pytest.raises(InvalidArgument, match="the block of these parameters has ended"):
             await slow_write
         assert flight.copter.parameters["WPNAV_SPEED"] == 1000.0
