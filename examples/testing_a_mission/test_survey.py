@@ -47,7 +47,7 @@ async def test_low_battery_prevents_take_off(flight: Flight) -> None:
 async def test_survey_succeeds_in_wind_with_bad_radio(flight: Flight) -> None:
     flight.faults.set_wind(east_m_s=6, gusts_m_s=1)
     flight.faults.drop_packets(0.1)  # the command to arm is sent once; if it is lost, arm() raises CommandTimeout
-    flight.faults.go_silent(for_s=8, after_s=15)
+    flight.faults.go_silent(for_s=6, after_s=15)
     await survey(flight.vehicle)
     assert_surveyed(flight.track)
 

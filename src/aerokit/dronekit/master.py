@@ -224,11 +224,13 @@ class Master:
 
         ``alt`` is in metres above home with ``relative_alt``, otherwise above sea level.
         """
-        self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
+        fix = self.recv_match(condition="GPS_RAW_INT.fix_type>=3", type="GPS_RAW_INT", blocking=True)
         self.recv_match(type="VFR_HUD", blocking=True)  # As in pymavlink, the altitude is from VFR_HUD.
         self.recv_match(type="GLOBAL_POSITION_INT", blocking=True)
         # The messages that were waited for may have been stored for seconds, so the last ones are used.
         gps, hud, position = map(self.messages.__getitem__, ("GPS_RAW_INT", "VFR_HUD", "GLOBAL_POSITION_INT"))
+        if gps.fix_type < 3:  # The fix was lost meanwhile.
+            gps = fix
         alt = position.relative_alt * 1e-3 if relative_alt else hud.alt
         return mavutil.location(gps.lat * 1e-7, gps.lon * 1e-7, alt, hud.heading)
 

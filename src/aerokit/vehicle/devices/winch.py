@@ -89,6 +89,7 @@ class Winch(ReadOnly):
         # order.
         order = self._context.arbiter.device_order(self._topic)
         status_before = await receive_once(self._context, m.WinchStatus, self._component_id)
+        await self._context.sender.await_recent_state(order)  # The vehicle may have become silent during the wait.
 
         def has_paid_out(status: m.WinchStatus) -> bool:
             assert status_before is not None

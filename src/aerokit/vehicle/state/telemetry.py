@@ -251,7 +251,8 @@ class Telemetry(States):
         def update(message: Any, source: Source) -> None:
             value = decode(message)
             # A frame that was kept undecoded may be older than a value from a message of another type.
-            is_older = is_lazy and self._time_of_arrival() < cell._updated_at
+            is_other_type = is_lazy and cell.source is not None and cell.source.message != source.message
+            is_older = is_other_type and self._time_of_arrival() < cell._updated_at
             if value is not None and not is_older:
                 cell.set(value, source)
 
