@@ -334,7 +334,7 @@ async def test_finished_block_leaves_no_finish_callback() -> None:
             assert len([capture async for capture in captures]) == 2
         async with vehicle.camera.zooming():
             pass
-        assert vehicle.camera._link.on_finish == []
+        assert vehicle._context.finish_callbacks == []
 
 
 async def test_unsent_operation_is_not_stopped() -> None:

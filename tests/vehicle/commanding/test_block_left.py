@@ -42,7 +42,7 @@ async def test_block_left_holds_although_callback_raises(caplog: pytest.LogCaptu
     with anyio.move_on_after(30) as scope:
         async with in_the_air() as flight:
             flights.append(flight)
-            flight.vehicle._context.on_finish.append(fail)
+            flight.vehicle._context.on_finish(fail)
             scope.deadline = anyio.current_time() + 2
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(flight.vehicle.go_to, flight.vehicle.position.value.offset(north_m=500))

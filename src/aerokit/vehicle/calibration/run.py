@@ -104,7 +104,7 @@ class CalibrationRun:
         self._cannot_cancel_reason = cannot_cancel_reason
         self._started_at = self.session.connection.now()
         self._runs.append(self)
-        self.context.on_finish.append(self.abandon)
+        self._detach_finish = self.context.on_finish(self.abandon)
         self.session.on_reboot.append(self._on_reboot)
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
@@ -132,7 +132,7 @@ class CalibrationRun:
             self._cancel_order_stack.close()  # The cancel command, if one was sent, need not be repeated.
             if self in self._runs:
                 self._runs.remove(self)
-                self.context.on_finish.remove(self.abandon)
+                self._detach_finish()
                 self.session.on_reboot.remove(self._on_reboot)
 
     def _on_reboot(self) -> None:

@@ -308,7 +308,7 @@ class ActiveOperation:
         self.order: Order = link.begin_order(subject)
         # True once the stop command was sent, or is no longer needed.
         self._is_over = False
-        link.on_finish.append(self._finish)
+        self._detach_finish = link.on_finish(self._finish)
 
     def record_start(self) -> None:
         """Record that the camera has accepted the start."""
@@ -327,8 +327,7 @@ class ActiveOperation:
     def discard(self) -> None:
         """Mark the operation as ended without sending its stop command."""
         self._is_over = True
-        if self._finish in self._link.on_finish:
-            self._link.on_finish.remove(self._finish)
+        self._detach_finish()
 
     async def stop(self, *, is_awaited: bool) -> None:
         """Stop the operation, once. Does nothing if a newer order was given."""

@@ -19,6 +19,7 @@ from aerokit.vehicle.commanding.order import SUPERSEDED
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
+    from aerokit.connection.bus import Detach
     from aerokit.connection.cells import StateCell
     from aerokit.vehicle.commanding.context import VehicleContext
     from aerokit.vehicle.commanding.order import Order, SentCommand, Topic
@@ -87,8 +88,8 @@ class CameraOrders:
         return received_at if self._context.arbiter.is_state_recent else -math.inf
 
     @property
-    def on_finish(self) -> list[Callable[[], None]]:
-        """Callbacks for the end of the vehicle's block. They may send messages, but must not wait."""
+    def on_finish(self) -> Callable[[Callable[[], None]], Detach]:
+        """See :meth:`VehicleContext.on_finish`."""
         return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
@@ -177,7 +178,7 @@ class CameraOrders:
 
     def send_now(self, command: int, *params: float) -> None:
         """Send a command once without waiting, e.g. when a block exits by cancellation."""
-        if self._component is None or self._session.is_closed or not self._session.connection.is_open:
+        if self._component is None or not self._session.is_open:
             return
         self._session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from aerokit.autopilots import Autopilot
+    from aerokit.connection.bus import Detach
     from aerokit.connection.cells import StateCell
     from aerokit.connection.connection import Connection
     from aerokit.events import LinkReport
@@ -38,9 +39,22 @@ class VehicleContext:
         self.arm_cleanup: ArmCleanup = ArmCleanup(session, self.arbiter, self.sender)
         self.health: Health = Health(session)
         self.vehicle_position: VehiclePosition = VehiclePosition(session)
-        self.on_finish: list[Callable[[], None]] = []
-        """Callbacks for the end of the vehicle's `async with` block. They may send messages, but must not wait."""
+        self.finish_callbacks: list[Callable[[], None]] = []
+        """Callbacks of :meth:`on_finish`, in the order in which they were added."""
         session.on_reboot.append(self.arbiter.on_reboot)
+
+    def on_finish(self, callback: Callable[[], None]) -> Detach:
+        """Call ``callback`` at the end of the vehicle's `async with` block. Returns a function that removes it.
+
+        The callback may send messages, but must not wait.
+        """
+        self.finish_callbacks.append(callback)
+
+        def detach() -> None:
+            if callback in self.finish_callbacks:
+                self.finish_callbacks.remove(callback)
+
+        return detach
 
     async def finish(self) -> bool:
         """At the end of the vehicle's `async with` block, hold the vehicle if a flight was abandoned.
@@ -48,7 +62,7 @@ class VehicleContext:
         Returns True if a hold was still to be confirmed when the block ended.
         """
         # The newest first, as nested blocks end: a gimbal is stopped before its control is released.
-        for callback in tuple(reversed(self.on_finish)):
+        for callback in tuple(reversed(self.finish_callbacks)):
             try:
                 callback()
             except Exception:  # The vehicle must hold even if a device fails.

@@ -56,7 +56,7 @@ class Shell(ReadOnly):
             raise NotSupported(f"shell: {autopilot.firmware} has no shell; nothing was sent")
         self._output.__enter__()
         self._is_open = True
-        self._context.on_finish.append(self._finish)
+        self._detach_finish = self._context.on_finish(self._finish)
         try:
             await self.run("", timeout=OPEN_TIMEOUT_S)  # An empty command makes the shell show its prompt.
         except BaseException:
@@ -72,10 +72,9 @@ class Shell(ReadOnly):
 
     def _close(self, error: Exception | None = None) -> None:
         """Close the shell by a message that requests no response. A waiting reader raises ``error``."""
-        if self._finish in self._context.on_finish:
-            self._context.on_finish.remove(self._finish)
+        self._detach_finish()
         self._output.close(error)
-        if self._is_open and self._session.connection.is_open and not self._session.is_closed:
+        if self._is_open and self._session.is_open:
             self._send(b"", flags=0)
         self._is_open = False
 

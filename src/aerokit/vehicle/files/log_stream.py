@@ -125,7 +125,7 @@ class LogStream(ReadOnly):
         self._messages.__enter__()
         session = self._context.session
         self._detach = session.connection.bus.attach(LoggingDataAcked, self._acknowledge, system_id=session.system_id)
-        self._context.on_finish.append(self._stop_soon)
+        self._detach_finish = self._context.on_finish(self._stop_soon)
         try:
             await START.send(self._context)
         except BaseException as error:
@@ -139,13 +139,12 @@ class LogStream(ReadOnly):
     def _close(self) -> None:
         self._messages.close()
         self._detach()
-        if self._stop_soon in self._context.on_finish:
-            self._context.on_finish.remove(self._stop_soon)
+        self._detach_finish()
 
     def _stop_soon(self) -> None:
         """Stop the stream without waiting. The command is sent now, because the vehicle's block may end next."""
         session = self._context.session
-        if session.connection.is_open and not session.is_closed:
+        if session.is_open:
             session.commands.send_unconfirmed(MavCmd.LOGGING_STOP)
             session.transfers.command_in_background(MavCmd.LOGGING_STOP, was_just_sent=True)
 

@@ -80,7 +80,7 @@ class ReleaseCommand:
 
         If it ``was_just_sent``, send it only to repeat it.
         """
-        if not self._session.connection.is_open or self._session.is_closed or not self._is_still_due():
+        if not self._session.is_open or not self._is_still_due():
             return
         can_send_now = self._orders.context.arbiter.is_state_recent
         if can_send_now and not was_just_sent:
@@ -247,7 +247,8 @@ class GimbalControl:
         self._control_request = ControlRequest(orders.manager_id, orders.gimbal_id_param, is_primary=self._is_primary)
         orders.registry.control_requests.append(self._control_request)
         release = self._release_command()
-        orders.context.on_finish.append(self._finish)  # The vehicle's block may end before the confirmation.
+        # The vehicle's block may end before the confirmation.
+        self._detach_callbacks.append(orders.context.on_finish(self._finish))
         since = self._session.connection.now()
         try:
             await self._request_control()
@@ -367,8 +368,6 @@ class GimbalControl:
             requests.remove(self._control_request)
         if self._device is not None and self._device.control_blocks.get(self._is_primary) is self:
             del self._device.control_blocks[self._is_primary]
-        if self._finish in self._orders.context.on_finish:
-            self._orders.context.on_finish.remove(self._finish)
         for detach in self._detach_callbacks:
             detach()
         self._detach_callbacks.clear()

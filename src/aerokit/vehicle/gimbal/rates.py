@@ -69,7 +69,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         # The error that describes the loss of control; None until control is lost.
         self._taken: AerokitError | None = None
         # Marks the gimbal as in use, so that ``vehicle.gimbal`` does not change to another gimbal.
-        self._in_use = ExitStack()
+        self._cleanup = ExitStack()
 
     def set(self, pitch_deg_s: float = 0.0, yaw_deg_s: float = 0.0) -> None:
         """Set new rates. They are sent at the next tick, and repeated until ``valid_for_s`` seconds have passed.
@@ -98,9 +98,9 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._was_entered = True
         orders = self._orders
         self._order = orders.begin_order()
-        self._in_use.enter_context(orders.device.in_use())
+        self._cleanup.enter_context(orders.device.in_use())
         # Registered before the gimbal may turn, because the vehicle's block may end before the acknowledgement.
-        orders.context.on_finish.append(self._finish)
+        self._cleanup.callback(orders.context.on_finish(self._finish))
         try:
             is_supported = await orders.send_pitch_yaw(self._order, NAN, NAN, rates=self._value, flags=self._flags)
             if not is_supported:
@@ -186,9 +186,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
 
     def _end(self) -> None:
         super()._end()
-        self._in_use.close()
-        if self._finish in self._orders.context.on_finish:
-            self._orders.context.on_finish.remove(self._finish)
+        self._cleanup.close()
 
 
 def _check_rates(pitch_deg_s: float, yaw_deg_s: float) -> None:

@@ -228,6 +228,11 @@ class VehicleSession:
         if self.end.error is not None:
             cell.close(self.end.error)
 
+    @property
+    def is_open(self) -> bool:
+        """True while messages can be sent: neither the connection nor the vehicle's `async with` block has ended."""
+        return self.connection.is_open and not self.is_closed
+
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
         """Make time-out errors of these state cells mention rejected signatures, which are a likely cause."""
         for cell in cells:
