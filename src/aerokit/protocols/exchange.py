@@ -298,7 +298,7 @@ class Transfer(Exchange[ResultT]):
         self.round_trip: RoundTrip = RoundTrip() if round_trip is None else round_trip
         self._idle_timeout_s = idle_timeout_s
         self.on_progress: OnProgress | None = on_progress
-        """Called with each progress. It must not raise, because the next request is sent only after it."""
+        """Called with each progress report. It must not raise, because the next request is sent only after it."""
 
     def _start_clock(self, now: float) -> None:
         self._started_at = now

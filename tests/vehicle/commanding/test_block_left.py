@@ -21,6 +21,12 @@ from aerokit.vehicle.connect import vehicles_on
 pytestmark = pytest.mark.anyio
 
 
+async def fly_up(vehicle: aerokit.Vehicle) -> None:
+    await vehicle.wait_ready()
+    await vehicle.arm()
+    await vehicle.take_off(10.0)
+
+
 async def test_block_left_after_cancelled_flight_warns_that_vehicle_holds(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -73,9 +79,7 @@ async def test_block_left_warns_only_with_active_order(
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
         async with aerokit.connect(connection) as vehicle:  # another program, as it were
-            await vehicle.wait_ready()
-            await vehicle.arm()
-            await vehicle.take_off(10.0)
+            await fly_up(vehicle)
 
         async def log_after(*orders: Callable[[aerokit.Vehicle], Awaitable[object]]) -> str:
             caplog.clear()
@@ -169,9 +173,7 @@ async def test_block_left_with_stream_in_other_task_holds() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link:
         async with aerokit.connect(link) as vehicle:
-            await vehicle.wait_ready()
-            await vehicle.arm()
-            await vehicle.take_off(10.0)
+            await fly_up(vehicle)
             stream = await vehicle.guided.velocity().__aenter__()
         with pytest.raises(SetpointStreamStopped, match="the async with block of its vehicle was left"):
             stream.set(VelocitySetpoint())
@@ -187,9 +189,7 @@ async def test_block_left_with_flight_in_other_task_holds(caplog: pytest.LogCapt
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, anyio.create_task_group() as tasks:
         async with aerokit.connect(link) as vehicle:
-            await vehicle.wait_ready()
-            await vehicle.arm()
-            await vehicle.take_off(10.0)
+            await fly_up(vehicle)
 
             async def go() -> None:
                 try:
@@ -209,9 +209,7 @@ async def test_block_left_before_order_is_acknowledged_holds(call: str) -> None:
     simulated = SimulatedPx4(boot_time_s=0.0) if call == "orbit" else SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(simulated, latency_s=0.3) as link, aerokit.open_connection(link) as connection:
         async with aerokit.connect(connection) as vehicle:
-            await vehicle.wait_ready()
-            await vehicle.arm()
-            await vehicle.take_off(10.0)
+            await fly_up(vehicle)
             place = vehicle.position.value.offset(north_m=300)
             arguments = {"radius_m": 10} if call == "orbit" else {}
             task = asyncio.create_task(getattr(vehicle, call)(place, **arguments))
@@ -230,9 +228,7 @@ async def test_block_left_while_follow_waits_for_target_ends_earlier_flight() ->
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
         async with aerokit.connect(connection) as vehicle:
-            await vehicle.wait_ready()
-            await vehicle.arm()
-            await vehicle.take_off(10.0)
+            await fly_up(vehicle)
             flight = asyncio.create_task(vehicle.go_to(vehicle.position.value.offset(north_m=300)))
             await anyio.sleep(1.0)
             following = asyncio.create_task(follow(vehicle))
@@ -252,9 +248,7 @@ async def test_block_left_before_hold_of_stream_is_acknowledged_holds() -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
         async with aerokit.connect(connection) as vehicle:
-            await vehicle.wait_ready()
-            await vehicle.arm()
-            await vehicle.take_off(10.0)
+            await fly_up(vehicle)
             task = asyncio.create_task(fly(vehicle))
             await anyio.sleep(1.9)
             copter.faults.ignore(MavCmd.DO_SET_MODE, times=1)
@@ -333,9 +327,7 @@ async def test_call_that_outlives_block_ends_with_it(call: Callable[[aerokit.Veh
     copter = SimulatedCopter(boot_time_s=0.0)
     async with simulated_link(copter) as link, aerokit.open_connection(link) as connection:
         async with aerokit.connect(connection) as vehicle:
-            await vehicle.wait_ready()
-            await vehicle.arm()
-            await vehicle.take_off(10.0)
+            await fly_up(vehicle)
             task = asyncio.create_task(run(vehicle))
             await anyio.sleep(0.01)
         left_at = anyio.current_time()
@@ -374,9 +366,7 @@ async def test_autotune_polls_no_more_after_block() -> None:
         wire = Wire(link)
         async with aerokit.open_connection(wire) as connection:
             async with aerokit.connect(connection) as vehicle:
-                await vehicle.wait_ready()
-                await vehicle.arm()
-                await vehicle.take_off(10.0)
+                await fly_up(vehicle)
                 task = asyncio.create_task(vehicle.autotune())
                 await anyio.sleep(3.0)
             wire.clear()
@@ -390,9 +380,7 @@ async def test_call_on_left_vehicle_disturbs_no_other_flight() -> None:
         wire = Wire(link)
         async with aerokit.open_connection(wire) as connection:
             async with aerokit.connect(connection) as left_vehicle:
-                await left_vehicle.wait_ready()
-                await left_vehicle.arm()
-                await left_vehicle.take_off(10.0)
+                await fly_up(left_vehicle)
             async with aerokit.connect(connection) as vehicle:
                 await vehicle.armed.wait_until(bool)
                 wire.clear()
