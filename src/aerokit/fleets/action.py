@@ -464,7 +464,8 @@ class SelectionBase:
         ``is_function`` is True if the action is a function of the program, whatever its name.
         """
         members = [member for member in self if names is None or member.name in names]
-        is_safe = name in FLIGHT_ENDING_ACTIONS and not is_function
+        built_in_action = "" if is_function else name
+        is_safe = built_in_action in FLIGHT_ENDING_ACTIONS
         return await FleetAction(
             self._context,
             name,
@@ -473,5 +474,5 @@ class SelectionBase:
             timeout=timeout,
             stagger_s=stagger_s,
             is_safe=is_safe,
-            holds_if_cancelled=not is_safe and (name not in ACTIONS_ON_GROUND or is_function),
+            holds_if_cancelled=not is_safe and built_in_action not in ACTIONS_ON_GROUND,
         ).run()

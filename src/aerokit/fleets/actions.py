@@ -58,8 +58,9 @@ class Actions(SelectionBase):
                 raise InvalidArgument("do: arguments and options are allowed only if action is the name of a method")
             execute = action  # type: ignore[assignment]
             name = getattr(action, "__name__", "action")
-        is_function = not isinstance(action, str)
-        return await self._run(name, execute, timeout=timeout, stagger_s=stagger_s, is_function=is_function)
+        return await self._run(
+            name, execute, timeout=timeout, stagger_s=stagger_s, is_function=not isinstance(action, str)
+        )
 
     async def wait_ready(self, *, timeout: float = 90.0) -> FleetResult:
         """Wait until each member is ready to fly; see :meth:`aerokit.Vehicle.wait_ready`.

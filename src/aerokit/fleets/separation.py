@@ -170,19 +170,26 @@ def separate_by_time(
     conflicts = _conflicts(routes, stationary, min_distance_m)
     if not conflicts:
         return Deconfliction("clear", "no paths come too close", min_distance_m)
-    resting_paths = _resting_paths(stationary)
+    resting = resting_paths(stationary)
     refusal = ""
     sequence = list(routes)
     for _ in routes:  # at most one try for each route
         delays, blocked_route, blocker = _delays(
-            sequence, resting_paths, min_distance_m, speed_m_s, slack_s=slack_s, max_delay_s=max_delay_s
+            sequence, resting, min_distance_m, speed_m_s, slack_s=slack_s, max_delay_s=max_delay_s
         )
         if blocked_route is None:
             delays = {route.name: delays[route.name] for route in routes}  # in the sequence of `routes` again
             max_s = max(delays.values())
             reason = f"{describe_pairs(conflicts)} come too close; starts are delayed by up to {max_s:g} s"
-            plan = Deconfliction("corridors", reason, min_distance_m, conflicts, delays_s=delays, slack_s=slack_s)
-            return plan.replace(speed_m_s=speed_m_s)
+            return Deconfliction(
+                "corridors",
+                reason,
+                min_distance_m,
+                conflicts,
+                delays_s=delays,
+                slack_s=slack_s,
+                speed_m_s=speed_m_s,
+            )
         refusal = f"{blocked_route.name} would have to wait for {blocker} longer than {max_delay_s:g} s"
         # A route waits only for routes before it in the sequence, so the next try begins with the blocked route.
         sequence = [blocked_route, *(route for route in sequence if route is not blocked_route)]
@@ -197,16 +204,17 @@ def _conflicts(
     # Times are ignored here, so the paths can have any speed.
     paths = [Path.straight(route.name, route.start, route.target, speed_m_s=1.0) for route in routes]
     conflicts = list(find_conflicts(paths, min_distance_m))
-    resting_paths = _resting_paths(stationary)
+    resting = resting_paths(stationary)
     for path in paths:
-        for resting_path in resting_paths:
+        for resting_path in resting:
             approach = min_path_distance(path, resting_path, below_m=min_distance_m)
             if approach.distance_m < min_distance_m:
                 conflicts.append(Conflict(path.name, resting_path.name, approach.distance_m))
     return tuple(conflicts)
 
 
-def _resting_paths(stationary: Mapping[str, LocalPoint]) -> list[Path]:
+def resting_paths(stationary: Mapping[str, LocalPoint]) -> list[Path]:
+    """Return a path of one point for each stationary vehicle."""
     return [Path(name, (PathPoint(0.0, *point),)) for name, point in stationary.items()]
 
 

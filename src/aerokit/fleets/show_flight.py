@@ -19,9 +19,9 @@ from aerokit.errors import InvalidArgument, OperationRejected, OperationTimeout,
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.members import Member
-from aerokit.fleets.paths import Path, PathPoint
+from aerokit.fleets.paths import Path
 from aerokit.fleets.policy import FleetResult
-from aerokit.fleets.separation import METRES_PER_DEGREE, find_conflicts
+from aerokit.fleets.separation import METRES_PER_DEGREE, find_conflicts, resting_paths
 from aerokit.fleets.show import Show, state_at
 from aerokit.fleets.travel import Travel, stationary_members
 from aerokit.mavlink.messages import GlobalPositionInt, Timesync
@@ -428,11 +428,11 @@ class Shows(Travel):
         if min_m is None:
             return
         stationary = stationary_members(self._context.members, origin, moving=show.tracks)
-        resting = [
-            Path(name, [PathPoint(0.0, north, east, amsl_m - origin_amsl_m)])
-            for name, (north, east, amsl_m) in stationary.items()
-        ]
-        paths = [*(track.replace(name=name) for name, track in show.tracks.items()), *resting]
+        above_origin = {
+            name: (north, east, amsl_m - origin_amsl_m) for name, (north, east, amsl_m) in stationary.items()
+        }
+        tracks = [track.replace(name=name) for name, track in show.tracks.items()]
+        paths = [*tracks, *resting_paths(above_origin)]
         conflicts = [
             conflict
             for conflict in find_conflicts(paths, min_m, slack_s=CONFLICT_SLACK_S)

@@ -23,6 +23,7 @@ from aerokit.fleets.separation import (
     Route,
     describe_pairs,
     find_conflicts,
+    resting_paths,
     separate_by_altitude,
     separate_by_time,
 )
@@ -470,7 +471,7 @@ class Missions(SelectionBase):
                 if member.vehicle.is_armed and not is_reported_on_ground(member.vehicle.telemetry)
             }
             stationary = stationary_members(flying, origin, moving=missions)
-            paths += [Path(name, [PathPoint(0.0, *place)]) for name, place in stationary.items()]
+            paths += resting_paths(stationary)
         conflicts = tuple(conflict for conflict in find_conflicts(paths, min_m) if conflict.name in missions)
         reason = f"{describe_pairs(conflicts)} come too close" if conflicts else "no paths come too close"
         deconfliction = Deconfliction("refused" if conflicts else "clear", reason, min_m, conflicts)

@@ -227,9 +227,7 @@ class TargetFields:
         return message_id not in self._dialect.rows
 
     def is_order(self, message_id: int) -> bool:
-        if self.offsets.get(message_id) is None:
-            return False
-        return kind_of(self._dialect[message_id].NAME, has_target=True) is MessageKind.ORDER
+        return self.offsets.get(message_id) is not None and self.is_command(message_id)
 
     def is_command(self, message_id: int) -> bool:
         """Like :meth:`is_order`, but include messages without a target, such as LANDING_TARGET."""

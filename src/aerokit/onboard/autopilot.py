@@ -7,8 +7,9 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from aerokit.errors import InvalidArgument, NotSupported
-from aerokit.mavlink.enums import MavCmd, MavModeFlag
-from aerokit.onboard.commands import RELATIVE_FRAMES, overrides
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavModeFlag
+from aerokit.missions.item import canonical_frame
+from aerokit.onboard.commands import overrides
 
 if TYPE_CHECKING:
     from aerokit.onboard.commands import CommandRequest
@@ -95,7 +96,7 @@ def add_autopilot(
     async def take_off(request: CommandRequest) -> None:
         *_, altitude_m = request.params
         is_given = not math.isnan(altitude_m)
-        is_relative = request._command.altitude_frame in RELATIVE_FRAMES
+        is_relative = canonical_frame(request._command.altitude_frame) == MavFrame.GLOBAL_RELATIVE_ALT
         if is_given and not (is_relative and math.isfinite(altitude_m)):
             raise InvalidArgument(f"altitude = {altitude_m:g} is not allowed: it must be metres above home")
         await call("take_off", altitude_m if is_given else None)

@@ -17,7 +17,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import BusyError, InvalidArgument, NotSupported
 from aerokit.mavlink.enums import MavFrame, MavResult
 from aerokit.mavlink.messages import CommandAck
-from aerokit.missions.item import command_name
+from aerokit.missions.item import canonical_frame, command_name
 from aerokit.onboard.arguments import CommandArgument, arguments_of
 from aerokit.position import Position
 from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS, CommandDispatcher, Outcome, RunningCommands
@@ -29,9 +29,7 @@ if TYPE_CHECKING:
     from aerokit.onboard.host import ComponentHost
     from aerokit.protocols.servers.commands import CommandHandler, CommandProgress, ReceivedCommand, RunningCommand
 
-_AMSL_FRAMES = frozenset((MavFrame.GLOBAL, MavFrame.GLOBAL_INT))
 MAX_THREADS = MAX_RUNNING_COMMANDS + 2  # One takes a picture of a series, another one checks a mission.
-RELATIVE_FRAMES: frozenset[int] = frozenset((MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT))
 
 
 class CommandResult(Snapshot):
@@ -79,9 +77,9 @@ class CommandRequest:
         frame = self._command.altitude_frame
         *_, latitude, longitude, altitude = self.params
         altitude_m = altitude if math.isfinite(altitude) else None
-        if frame in _AMSL_FRAMES:
+        if canonical_frame(frame) == MavFrame.GLOBAL:
             return Position(latitude, longitude, altitude_amsl_m=altitude_m)
-        if frame in RELATIVE_FRAMES:
+        if canonical_frame(frame) == MavFrame.GLOBAL_RELATIVE_ALT:
             return Position(latitude, longitude, altitude_relative_m=altitude_m)
         raise InvalidArgument(
             f"frame = {frame} is not allowed: it must be a global MAV_FRAME with the altitude above home or sea level"

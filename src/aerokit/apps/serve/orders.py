@@ -432,18 +432,20 @@ class OrderRunner:
             if record.problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
-            record.ended_unix_s = vehicle.connection.unix_time()
-            record.ended.set()
-            self._publish(record)
+            self._end(vehicle, record)
 
     def _end_unstarted(self, vehicle: Vehicle, record: OrderRecord) -> None:
         """End an order whose task was cancelled before its first step, so that no request waits for it."""
         if not record.ended.is_set():
             record.state = "failed"
             record.problem = problem_of(HttpProblem(503, "Ended", "the server has ended; nothing was sent"))
-            record.ended_unix_s = vehicle.connection.unix_time()
-            record.ended.set()
-            self._publish(record)
+            self._end(vehicle, record)
+
+    def _end(self, vehicle: Vehicle, record: OrderRecord) -> None:
+        """Record the time of the order's end, and publish the order."""
+        record.ended_unix_s = vehicle.connection.unix_time()
+        record.ended.set()
+        self._publish(record)
 
     def _replacing(self, record: OrderRecord, error: Exception) -> str | None:
         """Return the key of the vehicle's newest motion order, if a later one has superseded this order; else None."""
