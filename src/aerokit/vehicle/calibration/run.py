@@ -243,7 +243,7 @@ class CalibrationRun:
 
     def is_from_autopilot(self, message: Message) -> bool:
         frame = message.received_frame
-        return frame is None or frame.component_id == self.session.component_id
+        return frame is None or self.session.telemetry.accepts(frame)
 
     async def wait(
         self,

@@ -194,9 +194,9 @@ class Cameras:
         self.cell: StateCell[tuple[int, ...]] = session.connection.new_cell(
             "cameras", "HEARTBEAT or CAMERA_INFORMATION of a camera"
         )
-        # Captures of cameras attached to the autopilot, as number, message and decoded capture, kept until it is known
-        # which camera is the first.
-        self._early_captures: list[tuple[int, Any, Capture]] = []
+        # Captures of cameras attached to the autopilot, as message and decoded capture, kept until it is known which
+        # camera is the first.
+        self._early_captures: list[tuple[Any, Capture]] = []
         self._first_link = CameraLink(context, components.component, None, on_bound=self._on_first_bound)
         self._first = Camera(self._first_link)
         # True once `first` has returned `_first`. From then on, `first` always returns this object.
@@ -269,17 +269,17 @@ class Cameras:
                 self._first_link.call_later(DISCOVERY_TIMEOUT_S, self._process_early_captures)
             # If the list is full, a new capture replaces the last one.
             del self._early_captures[MAX_EARLY_CAPTURES - 1 :]
-            self._early_captures.append((number, message, capture))
+            self._early_captures.append((message, capture))
         else:
             self.at(number)._log.record(message, capture)
 
     def _process_early_captures(self) -> None:
         # No camera with its own component id was discovered, so the first camera is attached to the autopilot.
         captures, self._early_captures = self._early_captures, []
-        first_number, *_ = captures[0]
-        self._first_link.bind(first_number)
-        for number, message, capture in captures:
-            self.at(number)._log.record(message, capture)
+        _, first_capture = captures[0]
+        self._first_link.bind(first_capture.camera)
+        for message, capture in captures:
+            self.at(capture.camera)._log.record(message, capture)
 
     def _record(self, message: Any, device_id: int) -> int:
         """Add the camera to the state value `cell`; return its number, or 0 if the message is not from a camera.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from aerokit.connection.bus import once
 from aerokit.vehicle.commanding.arbiter import CommandArbiter
 from aerokit.vehicle.commanding.cleanup import ArmCleanup, FlightCleanup
 from aerokit.vehicle.commanding.health import Health
@@ -49,12 +51,7 @@ class VehicleContext:
         The callback may send messages, but must not wait.
         """
         self.finish_callbacks.append(callback)
-
-        def detach() -> None:
-            if callback in self.finish_callbacks:
-                self.finish_callbacks.remove(callback)
-
-        return detach
+        return once(partial(self.finish_callbacks.remove, callback))
 
     async def finish(self) -> bool:
         """At the end of the vehicle's `async with` block, hold the vehicle if a flight was abandoned.

@@ -96,17 +96,11 @@ class TuningActions(VehicleBase):
         until = self.connection.now() + ANSWER_TIMEOUT_S
         while self.connection.now() < until:
             for answer in answers:
-                if self._is_autotune_answer(answer):
+                if self._session.is_answer(answer, MavCmd.DO_AUTOTUNE_ENABLE):
                     return answer
             await anyio.sleep(POLL_INTERVAL_S / 20)
         link = self._session.describe_link()
         raise CommandTimeout(f"autotune: MAV_CMD_DO_AUTOTUNE_ENABLE was not acknowledged; PX4 may go on tuning; {link}")
-
-    def _is_autotune_answer(self, answer: CommandAck) -> bool:
-        frame = answer.received_frame
-        is_from_autopilot = frame is not None and frame.component_id == self.component_id
-        is_ours = is_from_autopilot and self._session.commands.is_for_us(answer)
-        return is_ours and answer.command == MavCmd.DO_AUTOTUNE_ENABLE
 
     def _age_of(self, answer: CommandAck) -> float:
         """Return the seconds since the answer was received, including the time for which the computer slept."""

@@ -53,7 +53,7 @@ def _limit(
     with anyio.move_on_after(timeout) as scope:
         yield
     if scope.cancelled_caught:
-        raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing()) from None
+        raise FileTimeout(f"{description}: not done within {timeout:g} s", missing=missing())
 
 
 class FileChannel:
@@ -136,9 +136,8 @@ class FileChannel:
                 self._close_soon(file.session, path)
                 raise
             except Exception:
-                with suppress(
-                    AerokitError
-                ):  # The error of the transfer must reach the caller, not an error of closing.
+                # The error of the transfer must reach the caller, not an error of closing.
+                with suppress(AerokitError):
                     await self._close(file.session, path, min(idle_timeout_s, CLOSE_TIMEOUT_S))
                 raise
             except BaseException:  # A cancelled call must not wait.

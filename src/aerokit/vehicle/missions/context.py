@@ -151,7 +151,7 @@ class PlanContext:
         transfer is not for this program either.
         """
         frame, connection = ack.received_frame, self.session.connection
-        is_from_autopilot = frame is not None and frame.component_id == self.session.component_id
+        is_from_autopilot = frame is not None and self.session.telemetry.accepts(frame)
         is_addressed = is_addressed_to(ack, connection.source_system, connection.source_component)
         is_ours = is_addressed and self.lock.locked()
         if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:

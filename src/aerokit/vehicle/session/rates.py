@@ -42,9 +42,6 @@ The interval doubles with each further request of the stream, up to ``MAX_RETRY_
 
 MAX_RETRY_INTERVAL_S = 60.0
 
-# After n consecutive requests without an ack, the interval is 2**n seconds. This is the maximum of n.
-MAX_BACKOFF_EXPONENT = 10
-
 # This number in place of a rate in Hz restores the autopilot's own default rate.
 AUTOPILOT_DEFAULT = 0.0
 
@@ -250,7 +247,7 @@ class MessageRates:
             # counted.
             if reset_count == self._reset_count:
                 stream.failures += 1
-                interval_s = min(2.0 ** min(stream.failures, MAX_BACKOFF_EXPONENT), MAX_RETRY_INTERVAL_S)
+                interval_s = min(2**stream.failures, MAX_RETRY_INTERVAL_S)
                 stream.next_attempt_at = self._connection.now() + interval_s
             return
         if reset_count != self._reset_count:

@@ -281,6 +281,12 @@ class VehicleSession:
             lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
         )
 
+    def is_answer(self, ack: CommandAck, command: int) -> bool:
+        """Return True if the autopilot sent this ack, and if it is for us and for this command."""
+        frame = ack.received_frame
+        is_from_autopilot = frame is not None and self.telemetry.accepts(frame)
+        return is_from_autopilot and ack.command == command and self.commands.is_for_us(ack)
+
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
         """Collect the acks that refuse a command during a `with` block.
@@ -291,9 +297,7 @@ class VehicleSession:
         refusals: list[CommandAck] = []
 
         def collect(ack: CommandAck) -> None:
-            frame = ack.received_frame
-            is_from_autopilot = frame is not None and frame.component_id == self.component_id
-            if ack.command != command or not is_from_autopilot or not self.commands.is_for_us(ack):
+            if not self.is_answer(ack, command):
                 return
             if ack.result == MavResult.ACCEPTED:
                 refusals.clear()
