@@ -102,7 +102,7 @@ async def test_go_to_after_obstacle_moved_into_plan_sends_nothing() -> None:
         plan = stage.fleet.plan_separation(targets)
         assert plan.decision == "clear"
         await stage.fleet.vehicles["north/3"].go_to(here["north/1"].offset(north_m=30))
-        with pytest.raises(OperationRejected, match="planned before north/3 came where it is; nothing was sent"):
+        with pytest.raises(OperationRejected, match="planned for another place of north/3; nothing was sent"):
             await stage.fleet.go_to(targets, separation=plan)
         assert not stage.orders_to("north/1")
 

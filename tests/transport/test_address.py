@@ -119,7 +119,7 @@ def test_accepted(text: str, address: LinkAddress) -> None:
         ("udpin:0.0.0.0", "the port is missing"),
         ("udpin:0.0.0.0:", "the port is missing"),
         ("[::1]", "the port is missing"),
-        ("[::1]14550", "follows the host, not :port"),
+        ("[::1]14550", "expected :port after the host"),
         ("udpin:127.0.0.1:http", "the port 'http' is not a whole number"),
         ("udpin:127.0.0.1:-1", "the port '-1' is not a whole number"),
         ("udpin:127.0.0.1:٣", "is not a whole number"),

@@ -76,7 +76,8 @@ class ParameterDownload:
     async def wait_for(self, name: str) -> None:
         """Wait until the parameter is received, alone or with the list, or reported as missing by the vehicle.
 
-        If the list is complete, wait for one request only, answered or not. Return if the connection ends.
+        If the list is complete, the vehicle may hide the parameter from it, so the parameter is requested once, and the
+        call returns even without an answer. The call also returns if the connection ends.
         """
         if self.is_complete:
             await self._request(name)

@@ -146,7 +146,7 @@ class Show(Snapshot):
             )
         tracks = data.get("tracks")
         if not isinstance(tracks, dict):
-            raise InvalidArgument('the "tracks" of the show must be a JSON object with the names of the tracks')
+            raise InvalidArgument('the "tracks" of the show must be a JSON object with track names as keys')
         return cls.from_points(tracks)
 
     def to_csv(self) -> str:

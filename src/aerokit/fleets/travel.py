@@ -216,9 +216,8 @@ class Travel(SelectionBase):
             raise OperationRejected(f"{action}: {reason}; nothing was sent")
         for name, place in stationary.items():
             if name not in plan.stationary or math.dist(place, plan.stationary[name]) > MAX_PLAN_DRIFT_M:
-                raise OperationRejected(
-                    f"{action}: the separation was planned before {name} came where it is; nothing was sent"
-                )
+                reason = f"the separation was planned for another place of {name}"
+                raise OperationRejected(f"{action}: {reason}; nothing was sent")
 
     def _resolve_targets(
         self, targets: Mapping[str, Position | Home] | Callable[[Member], Position | Home]

@@ -136,8 +136,9 @@ class Router(Generic[PortT]):
         self.on_change: Callable[[HubEventKind, int, PortT, PortT | None], object] | None = None
         """Called with the kind of event, the sender, the port of the frame, and another port of this sender.
 
-        If the sender has moved, the other port is the one it came from; if it is received at two ports, the one that
-        its messages go to; in a loop, the one at which its frames arrive first; None if that port was removed since.
+        The other port depends on the kind. After a move, it is the sender's previous port. If the sender is received at
+        two ports, it is the port to which messages for the sender are forwarded. In a loop, it is the port at which its
+        frames arrive first. It is None if that port was removed since.
         """
 
     def add(self, port: PortT) -> RouterPort[PortT]:

@@ -29,7 +29,7 @@ def _prefixed(prefix: str, new_prefix: str, pairs: str) -> str:
     return " ".join(f"{prefix}{old}>{new_prefix}{new}" for old, new in halves)
 
 
-def _same(prefix: str, new_prefix: str, names: str) -> str:
+def _change_prefix(prefix: str, new_prefix: str, names: str) -> str:
     return " ".join(f"{prefix}{name}>{new_prefix}{name}" for name in names.split())
 
 
@@ -47,17 +47,19 @@ _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 
 
 def _position_controller(prefix: str) -> tuple[tuple[int, str], ...]:
-    """Return the pairs of the position controller, which changed from north-east-up in cm to north-east-down in m."""
+    """Return the renames of the position controller, each with its divisor; see `GROUPS`.
+
+    The controller changed from north-east-up in centimetres to north-east-down in metres.
+    """
     moved = (
-        _same(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _VELOCITY_CONTROLLER),
-        _same(f"{prefix}VELZ_", f"{prefix}D_VEL_", _VELOCITY_CONTROLLER),
-        _same(f"{prefix}ACCZ_", f"{prefix}D_ACC_", _VERTICAL_ACCELERATION),
+        _change_prefix(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _VELOCITY_CONTROLLER),
+        _change_prefix(f"{prefix}VELZ_", f"{prefix}D_VEL_", _VELOCITY_CONTROLLER),
+        _change_prefix(f"{prefix}ACCZ_", f"{prefix}D_ACC_", _VERTICAL_ACCELERATION),
         _prefixed(prefix, prefix, "POSXY_P>NE_POS_P POSZ_P>D_POS_P JERK_XY>NE_JERK JERK_Z>D_JERK"),
     )
-    # Each entry has the divisor from old to new units, and the pairs that it applies to.
     return (
         (1, " ".join(moved)),
-        (10, _same(f"{prefix}ACCZ_", f"{prefix}D_ACC_", "P I D")),
+        (10, _change_prefix(f"{prefix}ACCZ_", f"{prefix}D_ACC_", "P I D")),
         (100, _prefixed(prefix, prefix, "VELXY_IMAX>NE_VEL_IMAX VELZ_IMAX>D_VEL_IMAX")),
         (1000, _prefixed(prefix, prefix, "ACCZ_IMAX>D_ACC_IMAX")),
     )
@@ -74,7 +76,7 @@ _COPTER_CENTI = (
 GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (_ALL, 1, "SYSID_THISMAV>MAV_SYSID SYSID_MYGCS>MAV_GCS_SYSID TELEM_DELAY>MAV_TELEM_DELAY"),
     (_ALL, 1, "ARMING_CHECK>ARMING_SKIPCHK EK3_MAX_FLOW>EK3_FLOW_MAX"),
-    *((_ALL, 1, _same(f"SR{port}_", f"MAV{port + 1}_", _STREAMS)) for port in range(10)),
+    *((_ALL, 1, _change_prefix(f"SR{port}_", f"MAV{port + 1}_", _STREAMS)) for port in range(10)),
     *(
         (
             _ALL,
@@ -95,7 +97,7 @@ GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (_COPTER, 100, _COPTER_CENTI),
     (_COPTER, 1, "PHLD_BRAKE_RATE>PHLD_BRK_RATE"),
     (_COPTER_AND_SUB, 100, _prefixed("WPNAV_", "WP_", _WAYPOINT)),
-    (_COPTER_AND_SUB, 1, _same("WPNAV_", "WP_", "JERK RFND_USE TER_MARGIN")),
+    (_COPTER_AND_SUB, 1, _change_prefix("WPNAV_", "WP_", "JERK RFND_USE TER_MARGIN")),
     (_COPTER_AND_SUB, 100, _prefixed("LOIT_", "LOIT_", _LOITER)),
     (_COPTER_AND_SUB, 100, _prefixed("ATC_", "ATC_", _ATTITUDE)),
     (_COPTER_AND_SUB, 100, "ANGLE_MAX>ATC_ANGLE_MAX CIRCLE_RADIUS>CIRCLE_RADIUS_M"),
@@ -106,7 +108,7 @@ GROUPS: tuple[tuple[tuple[str, ...], int, str], ...] = (
     (_PLANE, 100, "Q_ANGLE_MAX>Q_A_ANGLE_MAX"),
     *((_PLANE, divisor, pairs) for divisor, pairs in _position_controller("Q_P_")),
     (_PLANE, 1, "GLIDE_SLOPE_MIN>ALT_SLOPE_MIN GLIDE_SLOPE_THR>ALT_SLOPE_MAXHGT"),
-    (("Sub",), 1, _same("ORIGIN_", "AHRS_ORIGIN_", "LAT LON ALT")),
+    (("Sub",), 1, _change_prefix("ORIGIN_", "AHRS_ORIGIN_", "LAT LON ALT")),
 )
 
 INVERTED = frozenset({"ARMING_CHECK"})

@@ -322,7 +322,7 @@ class FtpRequest(FtpExchange[FtpMessage]):
     ) -> None:
         super().__init__(client, path, **options)
         self.attempts = 0
-        """Number of times the request was sent, including a first transmission by the caller."""
+        """Number of times the request was sent, including the one by the caller (``is_sent``), which `start` counts."""
         self._request = FtpMessage(
             client.next_sequence(), opcode, session=session, size=len(data), offset=offset, data=data
         )

@@ -119,7 +119,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._on_streamed_value(index, now)
         else:
             self._window.on_answer(index, now)
-        # Near the end of the list, answers to requests do not delay the requests for the last missing values.
+        # Missing values are requested at `_quiet_at`. Near the end of the list, only streamed values postpone it.
         if self._is_streaming and (is_streamed or not self._is_near_end):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)

@@ -227,7 +227,11 @@ class ParameterWrites(ParameterRequests):
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
-        """Return PARAM_SET if the name is in `_to_set`, and remove it there; otherwise a request to read."""
+        """Return the messages of the next request for a name.
+
+        This is PARAM_SET if the name is in `_to_set`, from which it is removed, and otherwise a request to read. After
+        an unexpected answer, the request has both.
+        """
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
         if name not in self._to_set:
             return [read]

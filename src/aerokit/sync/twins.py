@@ -3282,7 +3282,8 @@ class Camera(TwinOf["AsyncCamera"]):
         """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
         If the camera does not report its status, like a camera attached to the autopilot, the call returns when the
-        camera has accepted the command. If you cancel the call, the camera may record; :meth:`video` stops it.
+        camera has accepted the command. If you cancel the call, the camera may go on to record;
+        the block of :meth:`video` stops it in any case.
 
         Args:
             status_hz: rate at which the camera sends its status while recording, 0 to 10.

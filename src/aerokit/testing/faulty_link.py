@@ -60,7 +60,7 @@ class StalledQueue:
         self._accepted: list[tuple[bytes, Peer]] = []
         self._outboxes: dict[Peer, Outbox] = {}
         self._stalled_peers: set[Peer] = set()  # Peers whose outbox has reported a stall.
-        self._is_stalled = True  # True until `drain`: the whole connection stalls, not single peers.
+        self._is_stalled = True  # True until `drain`. The stall affects all peers.
 
     @property
     def unsent_bytes(self) -> int:
@@ -425,7 +425,7 @@ class _DeliveryQueue:
                     break
                 heappop(self._waiting)
                 action()
-        finally:  # The other actions must run even if one raises an exception, which the loop then reports.
+        finally:  # The other actions run even if one raises an exception. The event loop reports it.
             # An action may have called `put`, which may have set a timer for an action that has run since.
             if self._timer is not None:
                 self._timer.cancel()

@@ -343,7 +343,7 @@ class RecordedVehicle(SimulatedVehicle):
             candidates = answers
         if not candidates:
             return None
-        # Count the answers from each list of candidates. Lists may have candidates in common.
+        # The commands are counted by their list of candidates. An answer may be in several lists.
         list_id = tuple(map(id, candidates))
         count = self._answered_counts.get(list_id, 0)
         self._answered_counts[list_id] = count + 1

@@ -272,7 +272,7 @@ class _Parser:
         if tail in ("", ":"):
             raise self.error("the port is missing")
         if not tail.startswith(":"):
-            raise self.error(f"{tail!r} follows the host, not :port")
+            raise self.error(f"expected :port after the host, got {tail!r}")
         port = self.parse_whole_number("the port", tail[1:])
         min_port = 0 if kind in _LISTENING else 1
         if not min_port <= port <= 65535:

@@ -51,7 +51,7 @@ class Outbox:
         self._progress_at = 0.0  # time at which data last left this machine, or at which polling began
         self._is_full = False  # True between pause() and resume()
         self._is_stalled = self._is_closed = False
-        self._timer: asyncio.TimerHandle | None = None  # None while nothing is unsent
+        self._timer: asyncio.TimerHandle | None = None  # None when all data has been sent
 
     @property
     def is_stalled(self) -> bool:

@@ -218,9 +218,10 @@ def simplification_note(deviation_m: float) -> list[Part]:
 def drawn_track(
     places: Sequence[tuple[float, float]], max_rows: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
-    """Choose the places of a track that are drawn.
+    """Choose the places of a track that are drawn. Places in ``keep`` are always drawn.
 
-    Return their indices, which include ``keep``, and the largest distance of any place from the drawn line.
+    Return the indices of these places, and the largest distance of any place from the drawn line. If no place is known,
+    nothing is drawn.
     """
     if len(places) <= MAX_POINTS:  # short lines are drawn completely
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)

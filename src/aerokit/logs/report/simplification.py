@@ -71,9 +71,9 @@ def simplify(
 
 
 def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> tuple[float, int]:
-    """Return the negative square of the largest distance of a point from the segment, and the index of this point.
+    """Find the point between ``first`` and ``last`` that is farthest from the straight line segment between them.
 
-    The segment is the straight line between the points ``first`` and ``last``.
+    Return the square of its distance, negated because a heap has the smallest value first, and its index.
     """
     x, y = places[first]
     last_x, last_y = places[last]

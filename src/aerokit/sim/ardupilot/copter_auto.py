@@ -358,7 +358,7 @@ class CopterAuto(MissionMode):
         return True
 
     def _land_or_continue(self, index: int) -> bool:
-        """Land, and disarm the copter. Return True if it continues with a take-off instead (MIS_OPTIONS)."""
+        """Land; then disarm, or return True if MIS_OPTIONS lets the mission continue with a take-off."""
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
             if self._leg.is_complete:

@@ -368,7 +368,7 @@ class ArduPilotHost(SimulatedAutopilot):
         raise NotImplementedError
 
     def send_home(self, channel: Channel | None = None) -> None:
-        """Send GPS_GLOBAL_ORIGIN and HOME_POSITION, if origin and home are set."""
+        """Send GPS_GLOBAL_ORIGIN if the origin is set, and HOME_POSITION if home is set."""
         self.send_built(m.GpsGlobalOrigin.ID, channel)
         self.send_built(m.HomePosition.ID, channel)
 

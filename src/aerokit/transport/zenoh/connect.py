@@ -249,7 +249,7 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        """Return why opening timed out: the vehicle side is silent, or missing in the fleet, whose names are listed."""
+        """Return why opening timed out: the vehicle sent nothing, or the fleet has no vehicle of this name."""
         names = sorted({key.split("/")[2] for key in self._vehicle_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:

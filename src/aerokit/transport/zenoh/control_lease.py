@@ -363,7 +363,7 @@ class DelayEstimator:
 
 
 class VehicleSideTracker:
-    """Used by a client: tracks one vehicle side by its beacons, and makes the stamps of datagrams."""
+    """Tracks a vehicle's end of the link by its beacons, and creates the stamps of datagrams. Used by clients."""
 
     def __init__(self, nonce: int, mode: ControlMode = "free") -> None:
         self.epoch: int | None = None

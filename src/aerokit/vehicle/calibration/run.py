@@ -201,10 +201,11 @@ class CalibrationRun:
                     # Nothing is sent to a silent vehicle, so wait for a HEARTBEAT since the last attempt.
                     await self.session.wait_for_heartbeat(self._cancel_sent_at)
                     is_taken_over = self._cancel_command_status is not None and bool(self._cancel_command_status.end)
-                    if self._has_rebooted or is_taken_over:
-                        # A reboot has ended the calibration. After a takeover, the command might disturb the other
-                        # party.
-                        self._is_unconfirmed = not self._has_rebooted
+                    if self._has_rebooted:  # The reboot has ended the calibration.
+                        self._is_unconfirmed = False
+                        return
+                    if is_taken_over:  # The command might disturb the other party.
+                        self._is_unconfirmed = True
                         return
                     if not self.context.arbiter.is_state_recent:
                         continue

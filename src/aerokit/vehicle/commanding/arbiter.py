@@ -342,9 +342,8 @@ class CommandArbiter:
     def changing_mode(self) -> Iterator[None]:
         """Distrust the reported mode until the vehicle has answered a command that changes the mode.
 
-        After a cancellation or a time-out, the mode stays in doubt until a newer change is confirmed. After a refusal,
-        the mode is in doubt only if an earlier order may still change it. A newer order may open its block before the
-        block of the order that it replaces has ended.
+        After a cancellation or a time-out, the mode stays in doubt until a later change is confirmed. A refusal adds no
+        doubt. Blocks may overlap, because a new order replaces one whose block has not ended.
         """
         change = next(self._order_numbers)
         self._open_mode_changes += 1

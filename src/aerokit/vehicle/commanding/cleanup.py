@@ -238,10 +238,10 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Register the order that a call gives and awaits, so that `end_flights` can hold the vehicle meanwhile.
+        """While a call awaits the effect of its order, let `end_flights` replace the order by a hold.
 
-        If the vehicle hits the ground, this block orders the hold itself, because the target of the order may still be
-        in the air.
+        If the vehicle hits the ground in the block, it is ordered to hold. Otherwise, it could climb again to the
+        target of the order.
         """
         self._awaited_order = order
         try:

@@ -69,7 +69,8 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
     check_range("rate_hz", rate_hz, 0, 1000, above=True)
     tasks = BackgroundTasks(session.connection.fail)
     with ExitStack() as cleanup:
-        # Otherwise, the next request would fail, and end the connection of other vehicles, too.
+        # Cancel the tasks when the session ends: their next request would fail, and that would end the connection
+        # for other vehicles, too.
         cleanup.callback(session.end.on_end(lambda _: tasks.cancel()))
         if session.autopilot.stream_groups:
             monitor = _StreamMonitor(session, cleanup)

@@ -267,7 +267,8 @@ class Order:
             elif has_taken_effect:  # A mode that the program ordered shortly before may still appear.
                 self._accepted_modes -= self._modes_before
         elif is_expected and is_settled:
-            # An earlier order of the program has taken effect, so only another party can restore the mode before it.
+            # An earlier order of the program has replaced these modes. If one of them appears again, it was set by
+            # another party.
             self._accepted_modes -= self._modes_before
         elif is_first_report or reported_at < self._any_mode_until:  # The mode may be the effect of a raw command.
             if not is_first_report and number not in self._accepted_modes:

@@ -125,7 +125,7 @@ class TargetLanding:
         self._source_error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
-        """Read the source until it ends or fails. ``acquire`` and ``await_disarmed`` raise the source's exception."""
+        """Read the source until it ends or fails. Its error is raised by `acquire` or `await_disarmed`, not here."""
         try:
             if isinstance(source, AsyncIterable):
                 async for target in source:

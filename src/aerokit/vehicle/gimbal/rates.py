@@ -121,7 +121,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         if reason:
             self._stop(reason, hold=False)
         if self._stop_error is None:
-            # Create the command before `_end`, after which another gimbal may be the first one.
+            # Create the command before `_end`: afterwards it might address another gimbal.
             zero = self._zero_rates_command()
             self._end()
             self._stop_error = SetpointStreamStopped("the block of these rates has ended")

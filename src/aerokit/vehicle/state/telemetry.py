@@ -323,8 +323,8 @@ class Telemetry(States):
             self._mode_names[message.custom_mode] = name
 
     def _on_status_text(self, message: messages.Statustext, source: Source) -> None:
-        # A text gets the time of its processing, not of its arrival. Otherwise a text that explains a refusal could be
-        # older than the refused command.
+        # A text gets the time of its processing, because its time of arrival may be before that of the command whose
+        # refusal it explains.
         joins_id_0 = self.autopilot.has_status_text_id_0
         self._publish_texts(self._texts.receive(message, self._clock(), joins_id_0=joins_id_0), source)
 
