@@ -417,6 +417,19 @@ async def test_gimbal_denies_infinite_angles() -> None:
     assert head.targets == []
 
 
+@pytest.mark.parametrize("is_pointed", [False, True])
+async def test_turning_gimbal_stops_at_end_of_block(is_pointed: bool) -> None:
+    head = Head()
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(head)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, math.nan, math.nan, 5, 9, 0, 0, 154)
+        if is_pointed:
+            await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, -30, 0, math.nan, math.nan, 0, 0, 154)
+    assert [target.rates is not None and any(target.rates) for target in head.targets] == [True, False]
+    assert (head.targets[-1].rates is None) == is_pointed
+
+
 async def test_error_of_gimbal_is_result_of_command() -> None:
     class Jammed(Head):
         def point(self, target: GimbalTarget) -> None:
@@ -442,6 +455,46 @@ class Spool(WinchDriver):
 
     def report(self) -> WinchReport:
         return WinchReport(length_m=self.length_m, speed_m_s=0.0, flags=self.flags)
+
+
+class Reel(Spool):
+    """Records its rates; it stops by a rate of zero."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rates: list[float] = []
+
+    async def set_rate(self, rate_m_s: float) -> None:
+        self.rates.append(rate_m_s)
+
+
+class HoldingReel(Reel):
+    async def hold(self) -> None:
+        self.rates.append(0.0)
+
+
+@pytest.mark.parametrize(("reel", "rates"), [(Reel, [1.0]), (HoldingReel, [1.0]), (Reel, [1.0, 0.0])])
+async def test_running_winch_stops_at_end_of_block(reel: type[Reel], rates: list[float]) -> None:
+    spool = reel()
+    async with payload_and_station(component_id=169, type=MavType.WINCH) as (component, station):
+        component.add_winch(spool)
+        for rate in rates:
+            await station.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, rate)
+    assert spool.rates == [1.0, 0.0]
+
+
+async def test_block_ends_although_winch_never_stops() -> None:
+    class Jammed(Reel):
+        async def hold(self) -> None:
+            await asyncio.sleep(math.inf)
+
+    async with payload_and_station(component_id=169, type=MavType.WINCH) as (component, station):
+        component.add_winch(Jammed())
+        await station.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 1.0)
+        with station.collecting(m.Statustext) as texts:
+            await component._aclose()
+            await asyncio.sleep(0.1)
+    assert any("stopping the winch" in text.text for text in texts)
 
 
 async def test_winch_pays_out_and_retracts() -> None:

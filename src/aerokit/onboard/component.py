@@ -102,11 +102,15 @@ class OnboardComponent:
             await self._tasks.aclose()
         finally:
             try:
-                await run_shielded(self.parameters.aclose())  # A cancelled program must save its parameters too.
+                await run_shielded(self._stop_and_save())  # A cancelled program must stop and save, too.
             finally:
                 self._commands.close()
                 self._ftp.close()
                 self._host.close()
+
+    async def _stop_and_save(self) -> None:
+        await self._services.stop_motions()
+        await self.parameters.aclose()
 
     def _use_threads(self) -> None:
         """Call the program's plain functions in threads, because they may block. aerokit.sync calls this method."""

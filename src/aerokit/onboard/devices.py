@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from aerokit._internal.values import Snapshot
@@ -49,7 +50,10 @@ class WinchDriver:
         raise NotImplementedError
 
     async def set_rate(self, rate_m_s: float) -> None:
-        """Wind the line out (positive rate) or in (negative rate) until the next command."""
+        """Wind the line out (positive rate) or in (negative rate) until the next command.
+
+        If the line still runs at the end of the component's block, aerokit calls :meth:`hold`, or this method with 0.
+        """
         raise NotImplementedError
 
     async def lock(self) -> None:
@@ -132,7 +136,12 @@ def add_winch(services: ComponentServices, winch: WinchDriver) -> None:
             raise InvalidArgument(f"this action needs {needed}; NaN is not allowed")
         if method == "pay_out" and rate is not None and rate <= 0:
             raise InvalidArgument(f"rate = {rate:g} is not allowed: it must be above 0")
+        if method == "set_rate":
+            can_hold = overrides(winch, WinchDriver, "hold")
+            services.motions["winch"] = winch.hold if can_hold else partial(winch.set_rate, 0.0)
         await services.commands.call(getattr(winch, method), *arguments)
+        if method != "set_rate" or rate == 0:
+            services.motions.pop("winch", None)
 
     def status() -> m.WinchStatus:
         report = winch.report()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
@@ -14,7 +15,7 @@ from aerokit.position import Position
 from aerokit.protocols.servers.gimbal import ALL_CAPABILITIES, Angles, GimbalMount, Place
 
 if TYPE_CHECKING:
-    from aerokit.onboard.host import ComponentHost
+    from aerokit.onboard.services import ComponentServices
     from aerokit.protocols.servers.host import ServerHost
 
 STATUS_INTERVAL_S = 1.0
@@ -77,7 +78,10 @@ class GimbalDriver:
         self.attitude_hz: float = attitude_hz
 
     def point(self, target: GimbalTarget) -> None:
-        """Start to turn to a target within the limits. Called on the event loop, so it must return at once."""
+        """Start to turn to a target within the limits. Called on the event loop, so it must return at once.
+
+        Rates last until the next target. At the end of the component's block, they are set to zero.
+        """
         raise NotImplementedError
 
     def attitude(self) -> tuple[float, float, float]:
@@ -99,7 +103,7 @@ class GimbalDriver:
 class GimbalAdapter(GimbalMount):
     """Serves the gimbal protocol for a `GimbalDriver`."""
 
-    def __init__(self, gimbal: GimbalDriver, host: ComponentHost) -> None:
+    def __init__(self, gimbal: GimbalDriver, services: ComponentServices) -> None:
         self.vendor: str = gimbal.vendor
         self.model: str = gimbal.model
         roll, pitch, yaw = gimbal.limits_deg
@@ -114,7 +118,7 @@ class GimbalAdapter(GimbalMount):
                 self.capabilities &= ~axis_flags
         if yaw == _FULL_TURN_DEG:
             self.capabilities |= DeviceCapFlags.SUPPORTS_INFINITE_YAW
-        self._gimbal, self._host = gimbal, host
+        self._gimbal, self._host, self._motions = gimbal, services.host, services.motions
         self._is_yaw_locked = False
         self._followed_system_id = 0  # system at which the gimbal points; 0 if there is none
 
@@ -153,8 +157,12 @@ class GimbalAdapter(GimbalMount):
         limit = self.slew_rad_s
         roll, pitch, yaw = (math.degrees(max(-limit, min(limit, rate))) for rate in rates)
         self._apply(GimbalTarget(angles=None, rates=(roll, pitch, yaw), yaw_locked=locked), flags)
+        if any(rates):
+            zero_rates = GimbalTarget(angles=None, rates=(0.0, 0.0, 0.0), yaw_locked=locked)
+            self._motions["gimbal"] = partial(self._gimbal.point, zero_rates)
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
+        self._motions.pop("gimbal", None)
         self._gimbal.point(target)
         self.flags = flags
         self._is_yaw_locked = target.yaw_locked
@@ -166,6 +174,7 @@ class GimbalAdapter(GimbalMount):
         else:
             latitude_e7, longitude_e7, altitude_amsl_m = place
             position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
+        self._motions.pop("gimbal", None)
         self._gimbal.look_at(position)
         self.flags: int = 0
         # While the gimbal looks at a position, turns of the vehicle do not turn the gimbal.

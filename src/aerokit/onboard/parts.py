@@ -89,7 +89,7 @@ def add_gimbal(services: ComponentServices, gimbal: GimbalDriver) -> GimbalAdapt
     streams = services.streams
     if m.GimbalManagerInformation.ID in streams.builders:
         raise InvalidArgument("this component already has a gimbal: open another component for the second one")
-    adapter = GimbalAdapter(gimbal, services.host)
+    adapter = GimbalAdapter(gimbal, services)
     streams.builders.update(gimbal_builders(adapter))
     services.commands.add_guarded(gimbal_commands(adapter))
     listen_for_gimbal(adapter)

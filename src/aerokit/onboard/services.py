@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import anyio
 
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.message import Message
@@ -21,6 +23,7 @@ logger: logging.Logger = logging.getLogger("aerokit")
 
 MAX_STREAMS = 64
 MIN_STREAM_INTERVAL_S = 0.005
+STOP_TIMEOUT_S = 2.0
 
 
 class ComponentServices:
@@ -36,6 +39,18 @@ class ComponentServices:
         )
         self.commands.add_guarded(self.streams.commands())
         self.memory: FileTree = FileTree()
+        self.motions: dict[str, Callable[[], Any]] = {}
+        """Motions that go on until the next command: the program's function that stops each, by the part's name."""
+
+    async def stop_motions(self) -> None:
+        """Stop these motions, because nobody can order it after the end of the component. Errors are reported."""
+        while self.motions:
+            part, stop = self.motions.popitem()
+            try:
+                with anyio.fail_after(STOP_TIMEOUT_S):
+                    await self.commands.call(stop)
+            except Exception as error:
+                self.host.report_error(f"stopping the {part}", error)
 
     def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:
         """Send the message that ``function`` returns: on request, and at a rate of ``hz``.
