@@ -220,6 +220,8 @@ async def test_fleet_methods_wrong_types_are_rejected_and_nothing_sent() -> None
         (await stage.fleet.wait_ready()).raise_for_errors()
         place = fleet.vehicles["north/1"].position.value
         line = aerokit.Formation.line(["north/2"], 5.0)
+        corridors = {"by": "corridors", "min_distance_m": 5, "speed_m_s": 5}
+        show = aerokit.Show.from_points({"north/1": [(0, 0, 0, 5), (5, 1, 0, 5)]})
         stage.clear()
         wrong: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = [
             ("take_off", ("ten",), {}),
@@ -235,6 +237,8 @@ async def test_fleet_methods_wrong_types_are_rejected_and_nothing_sent() -> None
             ("go_to", ({"north/1": place},), {"separation": "yes"}),
             ("plan_separation", ({"north/1": place},), {"by": "luck"}),
             ("plan_separation", ({"north/1": place},), {}),
+            ("plan_separation", ({"north/1": place},), {**corridors, "speed_m_s": float("inf")}),
+            ("plan_separation", ({"north/1": place},), {**corridors, "slack_s": -1}),
             ("barrier", (True,), {}),
             ("wait_at_altitude", (None,), {}),
             ("upload", ({"north/1": 5},), {}),
@@ -245,6 +249,8 @@ async def test_fleet_methods_wrong_types_are_rejected_and_nothing_sent() -> None
             ("form", ("line",), {"leader": "north/1"}),
             ("following", (line,), {"leader": "north/1", "rate_hz": 1000}),
             ("fly_show", ("show", place), {}),
+            ("fly_show", (show, place), {"start_in_s": float("inf")}),
+            ("fly_show", (show, place), {"lead_s": float("inf")}),
             ("send_corrections", ("text",), {}),
             ("reclaim", (1,), {}),
             ("reclaim", ("north/9",), {}),

@@ -347,9 +347,9 @@ class Shows(Travel):
             origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
                 altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
-            start_in_s: seconds from the arrival of the last member at its first point to the start.
+            start_in_s: seconds from the arrival of the last member at its first point to the start, 0 to 3600.
             lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
-                time (``lag_s`` in the report); None: 0.
+                time (``lag_s`` in the report), 0 to 10; None: 0.
             speed_m_s: ground speed to the first points in m/s; None: unchanged.
 
         Raises:
@@ -360,6 +360,8 @@ class Shows(Travel):
             ValueUnknownError: the position of a member is unknown.
         """
         check_range("rate_hz", rate_hz, 2, 50)
+        check_range("start_in_s", start_in_s, 0, 3600)
+        check_range("lead_s", lead_s or 0.0, 0, 10)
         local_origin, origin_amsl_m = self._local_origin(show, origin)
         self._check_show(show, local_origin, origin_amsl_m)
         names = tuple(show.tracks)

@@ -115,7 +115,7 @@ class Travel(SelectionBase):
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
             by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
                 ``"refuse"`` refuses crossing paths.
-            speed_m_s: ground speed of all members in m/s, for corridors.
+            speed_m_s: ground speed of all members in m/s, for corridors; above 0.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
                 would start later, because the event loop was blocked, does not start.
@@ -131,6 +131,8 @@ class Travel(SelectionBase):
         if by == "corridors":
             if speed_m_s is None:
                 raise InvalidArgument("by = 'corridors' needs speed_m_s to compute times")
+            check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
+            check_range("slack_s", slack_s, 0, 300)
             deconfliction = separate_by_time(routes, stationary, min_m, speed_m_s, slack_s=slack_s)
         else:
             max_m = math.inf if max_altitude_m is None else max_altitude_m

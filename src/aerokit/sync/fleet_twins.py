@@ -161,7 +161,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             min_distance_m: minimum distance between any two members in metres; None: that of the fleet.
             by: ``"layers"`` separates crossing paths by altitude, ``"corridors"`` by time, which needs ``speed_m_s``.
                 ``"refuse"`` refuses crossing paths.
-            speed_m_s: ground speed of all members in m/s, for corridors.
+            speed_m_s: ground speed of all members in m/s, for corridors; above 0.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
                 would start later, because the event loop was blocked, does not start.
@@ -217,9 +217,9 @@ class Selection(SelectionTwin["AsyncSelection"]):
             origin: the place from which the show's metres count. If it has no altitude above sea level, its relative
                 altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
-            start_in_s: seconds from the arrival of the last member at its first point to the start.
+            start_in_s: seconds from the arrival of the last member at its first point to the start, 0 to 3600.
             lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
-                time (``lag_s`` in the report); None: 0.
+                time (``lag_s`` in the report), 0 to 10; None: 0.
             speed_m_s: ground speed to the first points in m/s; None: unchanged.
 
         Raises:
