@@ -21,7 +21,7 @@ _WITH_POSITION = int(
 _RELATIVE = int(_DEAD_RECKONING | Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.PRED_POS_HORIZ_REL)
 _EXTERNAL_NAVIGATION = 6
 _POSITION_TIMEOUT_S, _AIDING_TIMEOUT_S = 7.0, 15.0
-_GPS_CHECK_INTERVAL_S = 0.1
+_CHECK_INTERVAL_S = 0.1
 
 
 class ArduPilotNavigation:
@@ -42,6 +42,7 @@ class ArduPilotNavigation:
         self.home: Ned | None = None
         self.home_is_locked: bool = False
         self._gps_lost_at = math.nan  # NaN while GPS is good
+        self._watches_gps = False  # True from the time at which the first fix is expected
 
     def start(self) -> None:
         """Schedule the events of the boot timeline."""
@@ -57,7 +58,7 @@ class ArduPilotNavigation:
         call_later(timeline.origin_set, self._set_origin_when_possible)
         call_later(timeline.healthy, self._become_healthy)
         call_later(timeline.position_good, self._use_gps_when_possible)
-        call_later(timeline.yaw_aligned, self._watch_external)
+        call_later(min(timeline.yaw_aligned, timeline.gps_fix), self._watch)
 
     @property
     def has_position(self) -> bool:
@@ -125,8 +126,13 @@ class ArduPilotNavigation:
         """True if EK3_SRC1_POSXY selects external navigation instead of GPS."""
         return self._vehicle.parameters.get("EK3_SRC1_POSXY", 0.0) == _EXTERNAL_NAVIGATION
 
-    def _watch_external(self) -> None:
-        self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_external)
+    def _watch(self) -> None:
+        self._vehicle.every(_CHECK_INTERVAL_S, self._check)
+
+    def _check(self) -> None:
+        self._check_external()
+        if self._watches_gps:
+            self._check_gps()
 
     def _check_external(self) -> None:
         """Update the estimator flags from external navigation. Positions are relative until the origin is set."""
@@ -173,7 +179,7 @@ class ArduPilotNavigation:
             self.fix_type = GpsFixType.RTK_FIXED
             if self._vehicle.timeline.uses_dcm_until_gps:
                 self._set_first_home()
-        self._vehicle.every(_GPS_CHECK_INTERVAL_S, self._check_gps)
+        self._watches_gps = True
 
     def _set_origin_when_possible(self) -> None:
         """Set the estimator's origin and home, or check again in a second if there is no fix yet."""
@@ -257,7 +263,8 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
     return nearest
 
 
-_PERIOD_S, _FAILURE_TIMEOUT_S, _LOW_SPACE_REPORT_INTERVAL_S = 1.0 / 3.0, 15.0, 10.0
+# The firmware updates the path at 3 Hz. Here, the update is due together with other timers.
+_PERIOD_S, _FAILURE_TIMEOUT_S, _LOW_SPACE_REPORT_INTERVAL_S = 0.3, 15.0, 10.0
 _CLEAN_UP_AFTER_POINTS = 50
 _LOW_SPACE_POINTS = 9
 # Multiples of SRTL_ACCURACY. Points that bend the path by less than the bend tolerance are removed. Segments that come
@@ -287,7 +294,7 @@ class SmartPath:
         return len(self._points)
 
     def start(self) -> None:
-        """Update the path three times a second from now on."""
+        """Update the path regularly from now on."""
         self._vehicle.every(_PERIOD_S, self.update)
 
     def reset(self) -> None:

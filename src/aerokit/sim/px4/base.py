@@ -39,7 +39,7 @@ from aerokit.sim.px4.storage import DEFAULT_LOGS, Px4Signing, Px4Storage, px4_pa
 from aerokit.sim.vehicle import AttachableComponent, sender_of
 
 # Shares of the boot time after which events happen.
-_HEARTBEAT_BOOT_SHARE, _WARNING_BOOT_SHARE = 0.15, 0.3
+_HEARTBEAT_BOOT_SHARE, _WARNING_BOOT_SHARE = 0.2, 0.3
 _REBOOT_SILENCE_S = 1.5
 _LAND_DETECTOR_S = 1.0
 _HOVER_THROTTLE = 0.5

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from aerokit.mavlink.frame import Frame
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.state.condition import StatusText
+    from aerokit.vehicle.state.field import StateField
 
 # A fallback message is ignored for this many seconds after a better message has reported the state.
 FALLBACK_DELAY_S = 2.0
@@ -223,7 +224,7 @@ class Telemetry(States):
         }
         if class_name in special_handlers:
             return special_handlers[class_name]
-        updates = [self._cell_update(self._cells[field.name], source) for field, source in SOURCES[class_name]]
+        updates = [self._cell_update(field, source) for field, source in SOURCES[class_name]]
 
         def update_all(message: Any, source: Source) -> None:
             for update in updates:
@@ -238,23 +239,27 @@ class Telemetry(States):
             return on_heartbeat
         return updates[0] if len(updates) == 1 else update_all
 
-    def _cell_update(self, cell: StateCell[Any], message_source: MessageSource[Any]) -> Handler:
-        """Return the function that updates one cell from one type of message.
+    def _cell_update(self, field: StateField[Any], message_source: MessageSource[Any]) -> Handler:
+        """Return the function that updates the cell of a state from one type of message.
 
         A decoder returns None if the message does not have the value. The cell then keeps its previous value.
         A fallback message updates the cell only if no better message has reported the value recently.
         """
-        decode, context = message_source.decode, self._context
+        cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
-        is_lazy = message_source.message in LAZY
+        # A frame that was kept undecoded may be older than a value from a message of another type.
+        may_be_older = message_source.message in LAZY and len(field.sources) > 1
 
         def update(message: Any, source: Source) -> None:
             value = decode(message)
-            # A frame that was kept undecoded may be older than a value from a message of another type.
-            is_other_type = is_lazy and cell.source is not None and cell.source.message != source.message
-            is_older = is_other_type and self._time_of_arrival() < cell._updated_at
-            if value is not None and not is_older:
-                cell.set(value, source)
+            if value is None:
+                return
+            if may_be_older:
+                latest = cell.source
+                is_other_type = latest is not None and latest.message != source.message
+                if is_other_type and self._time_of_arrival() < cell._updated_at:
+                    return
+            cell.set(value, source)
 
         def update_with_context(message: Any, source: Source) -> None:
             context.before = cell.latest
