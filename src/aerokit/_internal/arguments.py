@@ -69,7 +69,7 @@ _SECONDS: dict[str, Rule] = {
 def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
     """Class decorator: the class's own public methods raise InvalidArgument for the first invalid argument.
 
-    Inherited, static and class methods, and properties, are not checked. Every time must be above 0.
+    Inherited, static and class methods, and properties, are not checked. Time-outs and other durations must be above 0.
     """
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and inspect.isfunction(member):

@@ -175,7 +175,7 @@ def mode_numbers(params: Sequence[float]) -> list[int]:
 class Autopilot:
     """Description of an autopilot and vehicle type. The base class describes unknown autopilots.
 
-    An object is created from the first HEARTBEAT of one vehicle, and describes it. It has no state and does no IO.
+    Each object describes one vehicle, and is created from its first HEARTBEAT. It has no state and does no IO.
     """
 
     name = "unknown autopilot"
@@ -357,7 +357,7 @@ class Autopilot:
         return tuple(self.modes.find(name) for name in sorted(names))
 
     def _modes_of_do_set_mode(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
-        """Return the mode that a DO_SET_MODE with these parameters sets; nothing without a custom mode."""
+        """Return the mode that a DO_SET_MODE with these parameters sets; empty without the flag CUSTOM_MODE_ENABLED."""
         base_mode, custom_mode = mode_numbers((*params, 0.0, 0.0)[:2])  # Missing parameters are 0.
         return (self.mode(custom_mode, base_mode, extra),) if base_mode & CUSTOM_MODE_ENABLED else ()
 
@@ -366,7 +366,7 @@ class Autopilot:
         return None if self.arming_mode is None else self.modes.find(self.arming_mode)
 
     def learn_mode_name(self, custom_mode: int, name: str) -> str | None:
-        """Return the name to store for an entry of AVAILABLE_MODES; None if it is empty or the mode is known."""
+        """Return the name to store for a mode in AVAILABLE_MODES; None if the name is empty or the mode is known."""
         return name if name and custom_mode not in self.modes.numbers else None
 
     def _purpose_name(self, purpose: Purpose, is_vtol: bool) -> str | None:

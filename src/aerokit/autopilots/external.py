@@ -46,7 +46,7 @@ class ExternalRules(Snapshot):
     - ``has_vision_speed``: the autopilot reads VISION_SPEED_ESTIMATE; otherwise ODOMETRY without a pose is sent
     - ``flow_in_radians``: the autopilot reads OPTICAL_FLOW_RAD instead of OPTICAL_FLOW
     - ``target_is_local``: the landing target must be in the local frame instead of relative to the vehicle
-    - ``constant_position_at_rest``: the flag CONST_POS_MODE is also set while a vehicle with a position is at rest
+    - ``constant_position_at_rest``: the flag CONST_POS_MODE is set at rest even if the vehicle has a position
     - ``origin_is_final``: once the local frame has an origin, the autopilot refuses to change it
     """
 

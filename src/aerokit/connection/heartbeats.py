@@ -133,7 +133,7 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None  # None while heartbeats are sent
 
     def watch(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Pause the heartbeat while ``activity`` exceeds the idle limit of the settings, or else ``fed_within_s``."""
+        """Pause heartbeats while the program is idle longer than the settings allow (default: ``fed_within_s``)."""
         self.activity = activity
         if self._limit_s is None:
             self._limit_s = fed_within_s

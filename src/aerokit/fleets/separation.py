@@ -58,11 +58,10 @@ class Deconfliction(Snapshot):
     - ``"corridors"``: each vehicle starts after its delay in ``delays_s``;
     - ``"refused"``: the conflicts cannot be resolved.
 
-    ``conflicts`` has the conflicts of the direct paths, without separation. Heights are in metres above sea level.
-    In corridors, all vehicles fly at ``speed_m_s``, and a vehicle that would start more than ``slack_s`` seconds late
-    does not start. ``routes`` are the paths
-    that were compared, in metres from the target of the first one; ``stationary`` has the positions of the members that
-    do not move.
+    ``conflicts`` are those that the direct paths would have without layers or corridors. Heights are in metres above
+    sea level. In corridors, all vehicles fly at ``speed_m_s``, and a vehicle that would start more than ``slack_s``
+    seconds late does not start. ``routes`` are the paths that were compared; ``stationary`` has the positions of the
+    members that do not move. Both are in metres north and east of the first route's target, and above sea level.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]

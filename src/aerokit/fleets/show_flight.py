@@ -230,7 +230,9 @@ def _interpolate(samples: Sequence[tuple[float, LocalPoint]], at_s: float) -> Lo
 
 
 class TrackRecorder:
-    """Records a vehicle's positions (GLOBAL_POSITION_INT) in its ``with`` block, in seconds and metres of the show.
+    """Records a vehicle's track while the recorder's ``with`` block runs, from GLOBAL_POSITION_INT.
+
+    Each sample has the seconds since the start of the show, and metres north, east and up of the show's origin.
 
     Times are ``time_boot_ms``, converted by the clock offset that TIMESYNC has measured. If TIMESYNC turns out to use
     another clock of the vehicle, the times at which the messages arrived are used instead.

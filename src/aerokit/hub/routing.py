@@ -105,9 +105,9 @@ class Router(Generic[PortT]):
     - A message for one component or system goes to the ports at which its target was received. It is dropped if the
       target is unknown. A message for an unknown component of a known system goes to the ports of the system.
     - A vehicle that is received at several ports gets messages through the first port until that port is silent for 3.5
-      s, so that no command arrives twice. A message for a system goes to that port of its autopilot, and also to each
-      port at which only other components of the system were received. Ground stations that share ids all get the
-      messages for these ids.
+      s, so that no command arrives twice. A message for a system goes to the one port that is used for its autopilot,
+      and also to each port at which only other components of the system were received. Ground stations that share ids
+      all get the messages for these ids.
     - A frame never goes back to the port at which it arrived, and is forwarded once. Copies that arrive at other ports
       within two seconds are dropped. Later copies are dropped if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.

@@ -203,7 +203,7 @@ class ComponentParameters(Mapping[str, ParameterValue]):
         return checked
 
     def _store(self, name: str, value: ParameterValue) -> None:
-        """Store a checked value. If it has changed and there is a file, write the file, after a running write."""
+        """Store a checked value. If it has changed and there is a file, save it; a running save writes it again."""
         row = self._rows[name]
         if settings_equal(row.value, value):
             return

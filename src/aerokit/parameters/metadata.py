@@ -315,7 +315,7 @@ def _number(value: Any) -> int | float | None:
         number = parse_number(str(value).strip())
         float(number)
         return number
-    except (ValueError, OverflowError):  # OverflowError: a whole number of 400 digits, which no text can format
+    except (ValueError, OverflowError):  # OverflowError means that the number is too large for a float.
         return None
 
 

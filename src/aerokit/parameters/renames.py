@@ -85,9 +85,10 @@ class Renamed(Snapshot):
     rename: Rename
 
     def to_vehicle(self, value: float, type: ParameterType | None = None) -> int | float:  # noqa: A002
-        """Convert a value from the program's to the vehicle's units; rounded if the ``type`` is an integer one.
+        """Convert a value from the program's to the vehicle's units.
 
-        A value that the parameter cannot have, such as NaN or a fraction of a bit mask, is not converted.
+        A value that is multiplied or divided is also rounded if ``type`` is an integer type. A value that the parameter
+        cannot have, such as NaN or a fraction of a bit mask, is not converted.
         """
         converted = self._convert(value, self.requested)
         is_scaled = self._has_other_units and self.rename.divisor != 1 and math.isfinite(converted)

@@ -17,7 +17,7 @@ from aerokit.protocols.named_values import (
     PROBE,
     PROBE_INDEX,
     NamedReads,
-    UnexpectedAnswers,
+    RepeatedAnswers,
     ValueList,
 )
 
@@ -207,7 +207,7 @@ class SettingWrite(Transfer[Setting]):
         self._name = name
         self._value, self._type = value, type
         self._before = before
-        self._unexpected: UnexpectedAnswers[Setting] = UnexpectedAnswers(_is_same)
+        self._repeated_answers: RepeatedAnswers[Setting] = RepeatedAnswers(_is_same)
         self._stale_answers = StaleAnswerFilter(self.round_trip)
         self._is_writing = False
         self._sent_at = 0.0
@@ -263,9 +263,9 @@ class SettingWrite(Transfer[Setting]):
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
         """Process a value that differs from the requested one. Write or read again until the value is conclusive."""
-        self._unexpected.add(reported)
+        self._repeated_answers.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
-        if not self._unexpected.are_conclusive(is_unchanged=is_unchanged):
+        if not self._repeated_answers.are_conclusive(is_unchanged=is_unchanged):
             if is_unchanged:
                 self._write(now)
             else:

@@ -240,7 +240,10 @@ class FtpClient:
         self._session = first_sequence
 
     def next_sequence(self, replies: int = 1) -> int:
-        """Return the number of a new request. The next one is greater by ``replies``, as replies are numbered, too."""
+        """Return the sequence number of a new request.
+
+        Its ``replies`` take the numbers that follow. The next request has the number of the last reply.
+        """
         sequence = self._sequence % SEQUENCE_COUNT
         self._sequence = sequence + replies
         return sequence

@@ -304,7 +304,7 @@ class FtpDownload(FtpExchange[int]):
         return not was_sent_completely and len(self._reassembly.gaps) < MAX_GAPS
 
     def _request_ahead(self) -> None:
-        """Request each block of a window after the tail separately, because the server does not support bursts."""
+        """Request the next blocks one by one, because the server does not support bursts; none if the end is known."""
         if self._reassembly.end is None:
             for number in range(self._requests.window.size):
                 self._requests.request(self._reassembly.tail + number * DATA_SIZE)

@@ -269,8 +269,8 @@ class NamedReads(NamedRequests[ValueT]):
         return math.prod((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
 
 
-class UnexpectedAnswers(Generic[ValueT]):
-    """Collects consecutive equal answers to a write, until there are enough of them to end the write."""
+class RepeatedAnswers(Generic[ValueT]):
+    """Collects consecutive answers to a write that report the same value, until they suffice to end the write."""
 
     def __init__(self, is_same: Callable[[ValueT, ValueT], bool]) -> None:
         self._is_same = is_same

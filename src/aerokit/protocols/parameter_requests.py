@@ -17,7 +17,7 @@ from aerokit.parameters import Parameter, ParameterType
 from aerokit.parameters.encoding import parameter_of, set_message
 from aerokit.parameters.parameter import same_value
 from aerokit.protocols.exchange import StaleAnswerFilter
-from aerokit.protocols.named_values import BY_NAME, PROBE, PROBE_INDEX, NamedReads, NamedRequests, UnexpectedAnswers
+from aerokit.protocols.named_values import BY_NAME, PROBE, PROBE_INDEX, NamedReads, NamedRequests, RepeatedAnswers
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -223,7 +223,7 @@ class ParameterWrites(ParameterRequests):
         self._before = dict(before)
         self._recently_written = set(recent)
         self._to_set = set(self._requested)  # names whose next request is a PARAM_SET
-        self._unexpected: dict[str, UnexpectedAnswers[Parameter]] = {}
+        self._repeated_answers: dict[str, RepeatedAnswers[Parameter]] = {}
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
@@ -240,7 +240,7 @@ class ParameterWrites(ParameterRequests):
         write = set_message(
             self.target_system, self.target_component, name, requested.value, requested.type, self._bytewise
         )
-        answers = self._unexpected.get(name)
+        answers = self._repeated_answers.get(name)
         if answers is not None and len(answers) > 0:
             # The vehicle has answered an earlier write with another value, so it may ignore this write and send no
             # answer. The read makes the vehicle send the value in any case.
@@ -254,7 +254,7 @@ class ParameterWrites(ParameterRequests):
             return  # No request for the name is in flight, so the message may answer another station.
         requested = self._requested[name]
         reported = self._with_integer_type(parameter_of(message, self._bytewise), requested.type)
-        answers = self._unexpected.setdefault(name, UnexpectedAnswers(_is_same))
+        answers = self._repeated_answers.setdefault(name, RepeatedAnswers(_is_same))
         is_as_requested = same_value(reported.value, requested.value)
         if is_as_requested and name in self._recently_written:
             # The message may be the late answer to a write of this name by an earlier call, so the value is read once

@@ -171,7 +171,10 @@ class UdpListen(_UdpLink):
 
     @property
     def peers(self) -> tuple[Peer, ...]:
-        """Remembered peers. The first is the last one that sent or, if the receiver keeps peers, the last one added."""
+        """Remembered peers, newest first.
+
+        They are ordered by their last datagrams or, if the receiver keeps peers, by the time they were added.
+        """
         return tuple(reversed(self._peers))
 
     def write(self, data: bytes, peer: Peer = None) -> None:

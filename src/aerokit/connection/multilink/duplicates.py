@@ -270,7 +270,10 @@ def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: 
 
 
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:
-    """Return True if a frame that equals an accepted one may be new: heartbeats of separate streams can be equal."""
+    """Return True if a frame may be new, although it equals a frame that was accepted earlier.
+
+    Heartbeats of separate streams can be equal: True for one over the link in use if no other link has the same stream.
+    """
     used = choice.used
     if used is None or used.link != link or frame.message_id != m.Heartbeat.ID:
         return False

@@ -121,7 +121,7 @@ def _flags(camera: CameraDevice, stream: int) -> int:
 
 
 def _thermal_stream(camera: CameraDevice) -> int:
-    """Return the number of the last stream. If the camera has a thermal sensor, this stream is its."""
+    """Return the number of the last stream, which is the thermal one if the camera has a thermal sensor."""
     return len(camera.streams)
 
 

@@ -126,7 +126,7 @@ class Beacon(Snapshot):
 
 
 class Stamp(Snapshot):
-    """Attachment of a client's datagrams, with the number of the last beacon that the client received."""
+    """Zenoh attachment of each datagram from a client. Has the number of the last beacon that the client received."""
 
     epoch: int
     beacon: int

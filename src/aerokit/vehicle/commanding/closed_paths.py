@@ -196,7 +196,7 @@ class TurnCounter:
 
 
 class LobeCounter:
-    """Counts figure eights; each lobe in turn counts as half a figure."""
+    """Counts figure eights: each change to the other lobe counts as half a figure."""
 
     def __init__(self, major_m: float, axis_deg: float) -> None:
         # A vehicle is in a lobe if it is farther than this from the center along the axis.

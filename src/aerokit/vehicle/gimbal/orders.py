@@ -43,7 +43,10 @@ STANDARD_RULES = GimbalRules()
 
 
 class GimbalOrders:
-    """Orders to ``device``, or if None, to the present first gimbal. A new order ends the wait for the previous one."""
+    """Orders to ``device``; if it is None, each order goes to the gimbal that is the first at that time.
+
+    A new order ends the wait for the previous one.
+    """
 
     def __init__(self, context: VehicleContext, registry: GimbalRegistry, device: GimbalDevice | None) -> None:
         self.context: VehicleContext = context

@@ -429,7 +429,7 @@ class MissionControl(VehiclePlan["Mission"]):
         self._tracker.on_transfer_count(count)
 
     def _check_item(self, item: int) -> None:
-        """Raise InvalidArgument unless the mission has this item (0 to MAX_ITEM if their number is unknown)."""
+        """Raise InvalidArgument unless the mission has this item. If the count is unknown, allow 0 to MAX_ITEM."""
         count = self._tracker.count.latest
         last = MAX_ITEM if count is None else count - 1
         if count == 0:

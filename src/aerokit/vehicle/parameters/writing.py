@@ -65,7 +65,7 @@ def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParamete
 
 
 class NameResolver:
-    """Resolves the parameter names that the program uses to parameters of the vehicle."""
+    """Finds the vehicle's parameters by the names in the program, which may be older or newer than the vehicle's."""
 
     def __init__(self, access: ParameterAccess) -> None:
         self._access = access

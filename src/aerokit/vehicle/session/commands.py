@@ -260,14 +260,15 @@ class CommandSender:
         """Return the number of acks that the vehicle sends for this command; PX4 sends two for some commands."""
         return self._acks_per_command.get(command, 1)
 
-    def _expect_acks(self, key: _Key, count: int, earlier_acks: Sequence[float] = ()) -> None:
+    def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
         """Record acks that may still arrive, so that the next command with this key ignores them.
 
-        There are ``count`` new acks. ``earlier_acks`` were returned by :meth:`_pop_pending_acks`, and are put back.
+        ``count`` is the number of acks that the last command may still get; they are recorded with the current time.
+        ``earlier_records`` are the times recorded for earlier commands; :meth:`_pop_pending_acks` has returned them.
         """
-        new_acks = [self._connection.now()] * count
-        if earlier_acks or new_acks:
-            self._pending_acks.setdefault(key, []).extend([*earlier_acks, *new_acks])
+        new_records = [self._connection.now()] * count
+        if earlier_records or new_records:
+            self._pending_acks.setdefault(key, []).extend([*earlier_records, *new_records])
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
         """Remove all recorded acks with this key, and return those that are not considered lost."""

@@ -85,7 +85,7 @@ class _Stream:
 
     @property
     def is_optional(self) -> bool:
-        """True if all present requests are optional."""
+        """True if no caller requires the stream: all its requests are optional."""
         return not self.required
 
     @property
