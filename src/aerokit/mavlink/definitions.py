@@ -131,7 +131,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum, with the entries of one file. The enums that `merged_enums` returns have the entries of all files."""
+    """One enum, with its entries in one XML file or, if `merged_enums` created it, in all files."""
 
     name: str
     entries: tuple[EntryDefinition, ...]

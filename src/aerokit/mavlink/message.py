@@ -195,7 +195,7 @@ def _wire_code(field: Field) -> str:
 
 
 def decoder_of(message_type: type[MessageT]) -> Callable[[bytes, Frame | None], MessageT]:
-    """Return a function like `Message.decode_body` of the class: compiled if possible."""
+    """Return the compiled function that decodes this class; without one, the class's `Message.decode_body`."""
     layout = layout_of(message_type)
     decode: Callable[[bytes, Frame | None], MessageT] = message_type.decode_body if layout is None else layout.decode
     return decode

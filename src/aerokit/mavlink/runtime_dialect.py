@@ -127,7 +127,7 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
 
 
 def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
-    """Return the generated class if the wire formats are the same. It may have additional extension fields."""
+    """Return the generated class if the wire formats are the same; it may have more extensions than the definition."""
     row = standard.rows.get(definition.id)
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None

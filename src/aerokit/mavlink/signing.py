@@ -187,7 +187,7 @@ class Signing:
         """Last timestamp of each (system id, component id, link id). :meth:`for_link` shares it among links."""
 
     def for_link(self, link_id: int) -> Signing:
-        """Create signing for another link (0–255) with the same key. Replays across these links are detected."""
+        """Return a `Signing` for another link (0–255) with the same key. Each refuses replays of the other's frames."""
         signing = Signing(self.key, link_id=link_id, timestamp=self.timestamp, allow_unsigned=self.allow_unsigned)
         signing.streams = self.streams
         signing._timestamp_file = self._timestamp_file
@@ -217,7 +217,10 @@ class Signing:
         return self.check(frame, now) is None
 
     def check(self, frame: Frame, now: float = 0.0) -> Refusal | None:
-        """Like :meth:`accepts`, but return the reason for refusing a frame. ``now`` is in seconds since 1970, or 0."""
+        """Like :meth:`accepts`, but return the reason for refusing a frame; None if it is accepted.
+
+        ``now`` is in seconds since 1970; 0 without a clock.
+        """
         refusal = self._check_signature(frame, now)
         if refusal is None or self.may_be_unsigned(frame):
             return None
@@ -226,7 +229,7 @@ class Signing:
 
     @property
     def keep_error(self) -> OSError | None:
-        """Error of the last write of the ``keep`` file; None if it succeeded. The next write is half a minute later."""
+        """Error of the last write of the ``keep`` file; None if it succeeded. A retry follows after half a minute."""
         return None if self._timestamp_file is None else self._timestamp_file.error
 
     @property

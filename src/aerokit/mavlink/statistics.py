@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    Two senders with the same ids are detected by their sequence numbers: two streams advance independently. Lost
-    frames are then counted only in the stream with more frames; once it has been silent for 1.5 s, in the other one.
+    Two senders with the same ids are detected, because their sequence numbers form two streams. Frames then count as
+    lost only in the stream with more frames or, after that stream has been silent for 1.5 s, in the other one.
     """
 
     expected: int
@@ -144,12 +144,12 @@ class SourceStatistics(SourceFields):
         self._returns = self._skipped_over = 0
 
     def _shifted(self, advance: int) -> int:
-        """Return `_missing` with its bits shifted, so that they are relative to `expected` + ``advance``."""
+        """Return the value that `_missing` has if `_missing_base` is `expected` + ``advance``."""
         distance = self.expected - self._missing_base + advance
         return self._missing << distance & _WINDOW if distance < _HALF else 0
 
     def _consume_missing(self, behind: int) -> bool:
-        """No longer count the frame ``behind`` numbers before `expected` as lost. Return True if it was counted so."""
+        """Clear the bit of `_missing` for the frame ``behind`` numbers before `expected`. Return True if it was set."""
         self._missing, self._missing_base = self._shifted(0), self.expected
         bit = 1 << behind - 1
         was_missing = bool(self._missing & bit)

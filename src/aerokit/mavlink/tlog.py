@@ -89,7 +89,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
 
 
 def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
-    """Return the end of the record at ``begin``. None if no complete record begins there, or its time is too early."""
+    """Return the end of the record at ``begin``; None if it is incomplete, before ``min_time``, or no true record."""
     end = _frame_end(data, begin)
     if end is None or end > len(data) or _TIME.unpack_from(data, begin)[0] < min_time:
         return None
@@ -130,7 +130,7 @@ class TlogWriter:
         self._closed = False
 
     def write(self, raw: bytes, timestamp_s: float) -> None:
-        """Write one frame. ``timestamp_s`` is in seconds since 1970, stored with microseconds."""
+        """Write one frame. ``timestamp_s`` is in seconds since 1970; it is rounded to microseconds."""
         microseconds = timestamp_s * 1e6
         if not 0 <= microseconds < 1 << 64:  # NaN is refused, too
             raise InvalidArgument(f"timestamp_s = {timestamp_s!r} must be seconds since 1970")

@@ -179,7 +179,7 @@ class FlightTableWriter:
         self._log = log
 
     def write(self, record: LogRecord) -> None:
-        """Add a row if the record has a position."""
+        """Store the record's states as the newest of its vehicle, and add a row if one of them is the position."""
         if not record.states:
             return
         latest = self._latest.setdefault(record.system_id, {})

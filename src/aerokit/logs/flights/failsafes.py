@@ -39,7 +39,7 @@ CRASH_KINDS: frozenset[str] = frozenset(("crash", "thrust", "motor", "terminatio
 
 
 class Failsafe(Snapshot):
-    """A failsafe, or a problem to which no reaction is known."""
+    """A failsafe, or a warning: evidence of a problem without a reaction that is certainly the autopilot's."""
 
     time_s: float
     kind: str

@@ -33,7 +33,7 @@ _NEAR_HOME_HEIGHT_M = 3.0  # above this height, an armed vehicle that keeps its 
 
 
 class Fall(Snapshot):
-    """A fall or a hard landing: a descent that ended on the ground at more than 3 m/s; see docs/report.md."""
+    """A fall or a hard landing: a descent at 3 m/s or more, until the ground or the log's end; see docs/report.md."""
 
     time_s: float
     """Time of the impact, or of the last entry if the log ends before it."""
@@ -58,7 +58,7 @@ class Fall(Snapshot):
 def falls(flight: FlightLog) -> list[Fall]:
     """Return the falls and hard landings of a flight, the oldest first. The log must have heights and sink rates.
 
-    A descent counts if the vehicle sank 2 m or more at more than 3 m/s, was stopped within 0.6 s (or 1.5 intervals of
+    A descent counts if the vehicle sank 2 m or more at 3 m/s or more, was stopped within 0.6 s (or 1.5 intervals of
     the logged velocities), and one of these is true:
 
     - No height in the log shows that the vehicle left that height before it was disarmed.

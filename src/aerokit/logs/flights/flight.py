@@ -284,7 +284,7 @@ class FlightLog:
         return self.modes[index - 1].name if index else ""
 
     def item_label(self, item: Waypoint) -> str:
-        """Return the number of a mission item, counted from 0 without home; "home" for home, ArduPilot's item 0."""
+        """Return the number of a mission item; for ArduPilot, item 0 is "home", and item 1 gets the number 0."""
         if self.autopilot != "ArduPilot":
             return str(item.number)
         return str(item.number - 1) if item.number else "home"

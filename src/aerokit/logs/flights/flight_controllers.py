@@ -223,7 +223,7 @@ class _BinText(Snapshot):
 
 
 class _Mode:
-    """A flight mode from a ``.bin``, in the form of the state ``mode``."""
+    """Flight mode of a ``.bin``, as the value of the state ``mode``: only its name and number are known."""
 
     def __init__(self, name: str, number: int) -> None:
         self.name, self.custom_mode = str(name), int(number)

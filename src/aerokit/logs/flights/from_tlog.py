@@ -438,7 +438,7 @@ class _Reader:
 
 
 def _message_id_bytes(kind: type[Message]) -> bytes:
-    """Return a message's id as the bytes that a frame contains."""
+    """Return a message's id as the three bytes of a MAVLink 2 header."""
     return kind.ID.to_bytes(3, "little")
 
 

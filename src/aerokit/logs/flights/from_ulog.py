@@ -142,7 +142,7 @@ class _Topic:
         yield from zip(self.times, *(self.array(field).tolist() for field in fields), strict=True)
 
     def changes(self, field: str) -> Iterator[tuple[float, float]]:
-        """Yield the first value of a field, and each changed value, with their times."""
+        """Yield the time and the value of the first row, and of each row in which the value of the field changed."""
         previous = None
         for time_s, value in self.rows(field):
             if value != previous:

@@ -82,7 +82,7 @@ class LinkCounter:
         self._silences.append(Silence(begins_s, ends_s, is_recorded=other_messages > 0))
 
     def end(self, received: int, received_s: float, ends_s: float, other_messages: int) -> None:
-        """Count the frames up to ``received_s``. A silence from then until the end of the log counts as 100 % loss."""
+        """Count the last frames, up to ``received_s``. If the log ends `MIN_SILENCE_S` later or more, add a silence."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)

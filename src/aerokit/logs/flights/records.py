@@ -61,7 +61,7 @@ class LogRecord(NamedTuple):
 
 
 class LogReader:
-    """Reads the records of a log, once. ``notes`` lists the problems that were found so far."""
+    """Reads one log. Call `entries` only once. ``notes`` lists the problems found so far."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

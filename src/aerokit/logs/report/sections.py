@@ -165,7 +165,7 @@ def _actual_and_setpoint(
 
 
 def _air_speed_line(flight: FlightLog) -> dict[str, Any] | None:
-    """Return the line of air speeds; None if all are 0, which means that there is no sensor."""
+    """Return the line of air speeds; None if the log has none, or only zeros, as without a sensor."""
     has_speed = flight.air.has("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
     return line("air speed", flight.air, "air_speed_m_s", 2) if has_speed else None
 
@@ -347,7 +347,7 @@ def _mission(flight: FlightLog) -> Section | None:
 
 
 def _has_altitude(item: Waypoint) -> bool:
-    """Return True if an item has an altitude. Items without a position may have one (take-off) or not (RTL)."""
+    """Return True if an item has an altitude. In an item without a position, such as RTL, 0 means no altitude."""
     has_position = not math.isnan(item.latitude_deg)
     return math.isfinite(item.altitude_m) and (has_position or item.altitude_m != 0)
 

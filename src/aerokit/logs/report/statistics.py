@@ -247,7 +247,7 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
 
 
 def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _DescentValues]:
-    """Return the currents of the batteries in a descent by their names in the report, such as "battery 1 current"."""
+    """Return each battery's current during a descent. The keys are labels in the report: "battery 1 current"."""
     currents = {}
     for index, battery in sorted(flight.batteries.items()):
         current = _descent_values(battery, "current_a", begin_s, end_s)
@@ -324,7 +324,7 @@ def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
 
 
 def _attitude_errors(flight: FlightLog, name: str, begin_s: float, end_s: float) -> Iterator[float]:
-    """Yield the differences of an angle from its set-points in a time span, in degrees."""
+    """Yield set-point minus measured angle, in degrees, for each set-point in a time span."""
     times, values = flight.attitude_target.times, flight.attitude_target[name]
     for row in range(bisect_left(times, begin_s), bisect_right(times, end_s)):
         error = math.remainder(values[row] - flight.attitude.at(name, times[row]), 360)
