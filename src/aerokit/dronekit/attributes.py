@@ -99,7 +99,7 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce("location")
 
     def _announce(self, frame: str) -> None:
-        """Notify this object's listeners of ``frame``, then the vehicle's listeners of ``location.frame``."""
+        """Notify this object's listeners of e.g. ``local_frame``, then the vehicle's of ``location.local_frame``."""
         self._dk_listeners.announce(frame)
         self._core.listeners.announce(f"location.{frame}")
 

@@ -199,7 +199,7 @@ class BackgroundCalls:
             self._loop.call_soon(self._cancel, call)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function on the loop: at once if this is the loop's thread, otherwise after all earlier calls.
+        """Call a function on the loop: at once on the loop's thread, otherwise as soon as all earlier calls have begun.
 
         The function must neither block nor raise.
         """
@@ -209,7 +209,7 @@ class BackgroundCalls:
             self._loop.call_soon(_call_after_tasks, function, *args)
 
     def wait(self, timeout: float) -> None:
-        """Wait at most ``timeout`` seconds until all calls have ended."""
+        """Wait until all calls have ended, at most ``timeout`` seconds. On the loop's thread, return at once."""
         pending = self._pending.copy()
         if pending and not self._loop.is_current:
             concurrent.futures.wait(pending, timeout)
@@ -308,7 +308,7 @@ class OverrideRelease:
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:
-        """Send the release of all overridden channels, unless ``is_enabled`` is False (loop thread). Never raises."""
+        """Release all overridden channels, unless ``is_enabled`` is False (loop thread). A closed link is ignored."""
         for (system, component), channels in self._overridden.items():
             if self.is_enabled and channels:
                 values = [_release_value(channel, channel in channels) for channel in range(1, CHANNELS + 1)]

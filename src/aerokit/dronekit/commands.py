@@ -425,8 +425,9 @@ def _item_of(cmd: Command, index: int) -> MissionItem:
 
 
 def _wire_number(value: Any, command: int, frame: int) -> int | float:
-    """Convert x or y to the value for MISSION_ITEM_INT. Like ArduPilot, truncate values that are not coordinates."""
+    """Convert x or y for MISSION_ITEM_INT. Like ArduPilot, drop the fraction of parameters 5 and 6."""
     number = from_degrees(float(value), command, frame)
+    # Infinity and numbers that are much too large stay floats, which the check of the plan refuses.
     return int(number) if isinstance(number, float) and abs(number) < 1e9 else number
 
 

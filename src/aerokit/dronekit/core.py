@@ -140,7 +140,7 @@ class LatestMessage(Generic[MessageT]):
             handler(message)
 
     def _must_decode(self) -> bool:
-        """Return False if all handlers only announce attributes, and these have a value but no listeners."""
+        """Return True if a handler needs each message, or an announced attribute has listeners or no value yet."""
         names = self._announced_names
         if not names or not names <= self._ready_names:
             return True
@@ -383,5 +383,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    """Return the core of a vehicle, for parts that are constructed with the vehicle, as in DroneKit."""
+    """Return the core of a vehicle, for classes whose constructor gets the vehicle because that of DroneKit does."""
     return vehicle._dk

@@ -71,13 +71,13 @@ class FlightMethods(VehicleAttributes):
         name, order = self._dk_set_mode(mode)
 
         def is_done() -> bool:
-            return self._flightmode == name and not self._dk_is_report_old
+            return self._flightmode == name and not self._dk_is_heartbeat_old
 
         self._dk_wait_for_order(order, is_done, timeout, "failed to set flight mode")
 
     @property
-    def _dk_is_report_old(self) -> bool:
-        """True if the vehicle may have changed since the last HEARTBEAT."""
+    def _dk_is_heartbeat_old(self) -> bool:
+        """True if the last HEARTBEAT is so old that its mode and armed flag may be outdated."""
         aio = self._dk.aio_or_none
         return aio is not None and aio.heartbeat_age > MODE_MAX_AGE_S
 
@@ -87,15 +87,15 @@ class FlightMethods(VehicleAttributes):
     def armed(self) -> bool:
         """True if HEARTBEAT reports armed motors.
 
-        Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait, and sends nothing if the
-        vehicle already reports the value. A silent vehicle is disarmed in any case, because its last report may be
-        outdated. :meth:`arm` waits, and raises the reason if arming is refused.
+        Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait. It sends nothing if the
+        vehicle already reports the value, unless an opposite order is pending. An order to disarm is always sent to a
+        silent vehicle, because its last report may be outdated. :meth:`arm` waits, and raises the reason of a refusal.
         """
         return self._armed
 
     @armed.setter
     def armed(self, value: bool) -> None:
-        if not self._dk_reports_armed(bool(value)) or self._dk_is_changing_to(not value):
+        if not self._dk_reports_armed(bool(value)) or self._dk_is_changing_armed_to(not value):
             self._dk_set_armed(bool(value))
         else:
             self._dk.check_link()
@@ -105,7 +105,7 @@ class FlightMethods(VehicleAttributes):
 
         An old report of a disarmed vehicle does not count, because a pilot may have armed it since.
         """
-        return self._armed == value and (value or not self._dk_is_report_old)
+        return self._armed == value and (value or not self._dk_is_heartbeat_old)
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
         aio = self._dk.check_link()
@@ -113,15 +113,15 @@ class FlightMethods(VehicleAttributes):
         self._dk_arming = order
         return order
 
-    def _dk_is_changing_to(self, value: bool) -> bool:
-        """Return True while an order to change to ``value`` is pending."""
+    def _dk_is_changing_armed_to(self, value: bool) -> bool:
+        """Return True while an order to change ``armed`` to ``value`` is pending."""
         order = self._dk_arming
         return order is not None and order.kind == _armed_order_kind(value) and not order.done()
 
     def arm(self, wait: bool = True, timeout: float | None = None) -> None:
         """Arm the motors: **propellers may start to turn**. With ``wait``, wait until HEARTBEAT reports armed motors.
 
-        Raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle refuses; the text has its reasons.
+        Waiting raises TimeoutError after ``timeout`` seconds, or as soon as the vehicle refuses, with its reasons.
         """
         self._dk_change_armed(True, wait, timeout, "failed to arm vehicle")
 
@@ -131,7 +131,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
         """Arm or disarm, unless the vehicle already reports the value and no opposite order is pending."""
-        is_overruling = self._dk_is_changing_to(not value)
+        is_overruling = self._dk_is_changing_armed_to(not value)
         if self._dk_reports_armed(value) and not is_overruling:
             self._dk.check_link()
             return

@@ -121,7 +121,7 @@ async def _point_above_home(aio: AsyncVehicle, target: Position) -> None:
 
 
 def _checked(name: str, value: float) -> float:
-    """Check an angle. If it is above `MAX_ANGLE_DEG`, reduce it by whole turns to -180 to 180 degrees."""
+    """Return an angle, within ±180 degrees if it was beyond ±`MAX_ANGLE_DEG`. InvalidArgument if it is not finite."""
     try:
         number = float(value)
     except (TypeError, ValueError):

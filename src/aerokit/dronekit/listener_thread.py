@@ -82,7 +82,7 @@ class ListenerThread:
             pass
 
     def keep_alive(self, owner: object, *, has_listeners: bool) -> None:
-        """Keep an object alive while it has listeners, even if the program has dropped the vehicle."""
+        """Keep an object alive if it has listeners, even if the program drops the vehicle; otherwise let it go."""
         if has_listeners and not self.is_stopped:
             self._kept_alive[id(owner)] = owner
         else:
@@ -93,14 +93,14 @@ class ListenerThread:
         return threading.current_thread() is self._thread
 
     def stop(self) -> None:
-        """Make no further calls. Idempotent; does not block."""
+        """End the thread after its current call; queued calls are dropped. Idempotent; does not block."""
         with self._lock:
             self.is_stopped = True
         self._kept_alive.clear()
         self._calls.put((_nothing, ()))  # This wakes the thread, which then notices `is_stopped`.
 
     def join(self) -> None:
-        """Wait until the thread has ended, at most two seconds, because a callback may block."""
+        """Wait until the thread has ended, but not for more than two seconds: a callback may block it forever."""
         if self._thread is not None and not self.is_current:
             self._thread.join(JOIN_TIMEOUT_S)
 
@@ -131,7 +131,7 @@ class ListenerThread:
 
 
 class _Thread(threading.Thread):
-    """A thread that runs callbacks; its class distinguishes it from other threads."""
+    """The thread of a :class:`ListenerThread`. `_must_not_wait` recognises such threads by this class."""
 
 
 def _must_not_wait() -> bool:

@@ -200,7 +200,7 @@ class Master:
         return self.messages.next_match(names, matches, timeout if may_wait else 0.0)
 
     def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
-        """Return the next HEARTBEAT, or None after ``timeout`` seconds."""
+        """Return the next HEARTBEAT; see :meth:`recv_match` for ``blocking`` and ``timeout``."""
         return self.recv_match(type="HEARTBEAT", blocking=blocking, timeout=timeout)
 
     def field(self, type: str, field: str, default: Any = None) -> Any:  # noqa: A002 - pymavlink's word
@@ -208,7 +208,7 @@ class Master:
         return getattr(self.messages.get(type), field, default)
 
     def time_since(self, mtype: str) -> float:
-        """Return the age of the last message of a type in seconds; without one, the time since its first access."""
+        """Return the seconds since the last message of a type; before the first, since ``messages`` was first used."""
         return self.messages.age_s(mtype)
 
     def param(self, name: str, default: float | None = None) -> float | None:
@@ -277,7 +277,7 @@ class Inbox(Mapping[str, Any]):
         return None
 
     def age_s(self, name: str) -> float:
-        """Return the age of the last message of this type; without one, the time since the first access."""
+        """Return the seconds since the last message of this type; before the first, since this inbox was first used."""
         self._start()
         frame = self._latest.get(_id_of(name))
         if frame is None:

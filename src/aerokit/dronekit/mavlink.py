@@ -119,8 +119,8 @@ class MAVConnection(ClassicConnection):
     def reset(self) -> None:
         """Close the link and open it again."""
         link = self.connection.link
-        if isinstance(link, ReconnectingLink):
-            self.loop.call_soon(link.reopen)
+        assert isinstance(link, ReconnectingLink)  # `_open` opens every link with reconnect=True.
+        self.loop.call_soon(link.reopen)
 
     def stop_threads(self) -> None:
         self.close()

@@ -61,7 +61,7 @@ class Listeners:
             self._update_kept_owner()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Remove a listener; ValueError if the name has listeners, but not this one."""
+        """Remove a listener. Ignored if the name has no listeners; ValueError if it has only others."""
         with _registration_lock:
             present = self.by_name.get(name)
             if present is None:
@@ -105,7 +105,7 @@ class Listeners:
             self._thread.post_or_drop(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """Call :meth:`notify` with the owner's attribute of this name. Reads the attribute only if it has listeners."""
+        """Like :meth:`notify`, with the value of the owner's attribute, which is read only if it has listeners."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:
@@ -165,7 +165,7 @@ class HasObservers:
         self._dk_listeners.add(self._dk_normalized(attr_name), observer)
 
     def remove_attribute_listener(self, attr_name: str, observer: AttributeListener) -> None:
-        """Remove a listener; ValueError if the name has listeners, but not this one."""
+        """Remove a listener. Ignored if the name has no listeners; ValueError if it has only others."""
         self._dk_listeners.remove(self._dk_normalized(attr_name), observer)
 
     def on_attribute(self, name: str | list[str] | tuple[str, ...]) -> Callable[[ListenerT], ListenerT]:

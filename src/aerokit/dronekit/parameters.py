@@ -147,7 +147,7 @@ async def _download(
 
 
 async def _download_method(vehicle: AsyncVehicle) -> DownloadMethod:
-    """Return the method of the download. Waits briefly for AUTOPILOT_VERSION, which shows if a file is available."""
+    """Return "auto", or "list" if AUTOPILOT_VERSION does not arrive soon: "auto" needs it to know if MAVFTP exists."""
     version = vehicle.telemetry.version
     with anyio.move_on_after(VERSION_TIMEOUT_S):
         await version.wait_until(lambda _: True)
@@ -218,7 +218,7 @@ def convert_to_type(name: str, value: float, type: ParameterType) -> int | float
 
 
 def _attempt_s(aio: AsyncVehicle) -> float:
-    """Return how long an attempt to set a parameter takes on this link, in seconds."""
+    """Return the time to allow for one attempt to set a parameter, in seconds; slow links need more."""
     report = aio.link_quality.latest
     if report is None or report.round_trip_s is None:
         return MIN_ATTEMPT_S

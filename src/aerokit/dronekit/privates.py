@@ -17,8 +17,8 @@ HEARTBEAT_TIMEOUT_S = 5.0  # DroneKit reports a link time-out after this many se
 class OverridableProperty(Generic[T]):
     """A property that an instance attribute of the same name overrides.
 
-    Used for names that DroneKit 2.9 does not have: a program's subclass of Vehicle may assign its own attributes to
-    them.
+    Used for names to which a program's subclass of Vehicle may assign its own attributes: those that DroneKit 2.9 does
+    not have, and its private ones.
     """
 
     def __init__(self, getter: Callable[[Any], T]) -> None:
@@ -61,7 +61,7 @@ def _last_heartbeat_time(vehicle: Any) -> float:
 
 
 class VehiclePrivates:
-    """The private attributes of DroneKit's Vehicle, for reading. Assigning creates an instance attribute instead."""
+    """DroneKit's private attributes of a Vehicle, for programs that read them. A program may override each."""
 
     _pitch, _yaw, _roll, _pitchspeed, _yawspeed, _rollspeed = _message_fields(
         "_dk_attitude", "pitch", "yaw", "roll", "pitchspeed", "yawspeed", "rollspeed"
@@ -108,7 +108,7 @@ class VehiclePrivates:
 
 
 class LocationPrivates:
-    """The private attributes of DroneKit's Locations, for reading."""
+    """DroneKit's private attributes of Locations, for programs that read them."""
 
     _lat, _lon = attribute_path("global_relative_frame.lat"), attribute_path("global_relative_frame.lon")
     _alt, _relative_alt = attribute_path("global_frame.alt"), attribute_path("global_relative_frame.alt")
@@ -120,7 +120,7 @@ class LocationPrivates:
 
 
 class GimbalPrivates:
-    """The private attributes of DroneKit's Gimbal, for reading."""
+    """DroneKit's private attributes of a Gimbal, for programs that read them."""
 
     _pitch, _roll, _yaw = attribute_path("pitch"), attribute_path("roll"), attribute_path("yaw")
 

@@ -93,7 +93,7 @@ class _SubmoduleFinder(MetaPathFinder):
 
 
 class _SubmoduleLoader(Loader):
-    """Loader that returns the aerokit module for an alias, and keeps the spec of that module."""
+    """Loader that returns the aerokit module for an alias. The module keeps its own ``__spec__``."""
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         module = importlib.import_module(_own_name(spec.name) or spec.name)

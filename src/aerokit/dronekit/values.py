@@ -136,9 +136,9 @@ class Rangefinder(_Value):
 
 
 class Wind(_Value):
-    """Wind: the direction ``wind_direction`` from which it blows in degrees, and its speeds in m/s.
+    """Wind: ``wind_direction`` is where it comes from, in degrees; the speeds are in m/s.
 
-    ``wind_speed`` is horizontal, ``wind_speed_z`` vertical and positive upwards.
+    ``wind_speed_z`` is vertical; ArduPilot reports it positive downwards, and includes it in ``wind_speed``.
     """
 
     _text = "Wind: wind direction: {0.wind_direction}, wind speed: {0.wind_speed}, wind speed z: {0.wind_speed_z}"
@@ -150,7 +150,7 @@ class Wind(_Value):
 
 
 class _Named(_Value):
-    """Base class of a value that equals its name as a string and can be a dict key."""
+    """Base class of values that compare equal to their name, which is a string, and can be dict keys."""
 
     _name_attribute: str
 
@@ -164,7 +164,7 @@ class _Named(_Value):
 
 
 class VehicleMode(_Named):
-    """A flight mode, given by its ``name``: ``VehicleMode("GUIDED")``. It equals its name, and can be a dict key."""
+    """A flight mode, given by its ``name``: ``VehicleMode("GUIDED")``. Equals this string, and can be a dict key."""
 
     _text, _name_attribute = "VehicleMode:{0.name}", "name"
 
@@ -173,7 +173,7 @@ class VehicleMode(_Named):
 
 
 class SystemStatus(_Named):
-    """The vehicle's MAV_STATE. It equals the text of its ``state``, and can be a dict key.
+    """The vehicle's MAV_STATE, by its name ``state``. Equals this string, and can be a dict key.
 
     ``state`` is UNINIT, BOOT, CALIBRATING, STANDBY, ACTIVE, CRITICAL, EMERGENCY or POWEROFF.
     """
