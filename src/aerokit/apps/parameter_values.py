@@ -44,7 +44,7 @@ def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: s
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return why a value is not allowed, after the user's name and value if the metadata has another name; or None."""
+    """Return why a value is not allowed, or None. If the metadata has another name, the user's name comes first."""
     entry, convert = metadata_entry(metadata, name)
     problem = None if entry is None else entry.problem(convert(value))
     if problem is None or entry is None or entry.name == name:
