@@ -175,7 +175,7 @@ def own_flight_modes(vehicle: Vehicle) -> str:
 
 
 def arms_but_cannot_fly_text(vehicle: Vehicle) -> str:
-    """Return words to print before the reasons why a vehicle that can arm cannot fly autonomously."""
+    """Return text such as "arms in STABILIZE, but cannot take off by itself or fly GUIDED, AUTO, RTL"."""
     return f"arms in {vehicle.mode_name}, but cannot take off by itself or fly {own_flight_modes(vehicle)}"
 
 
@@ -223,7 +223,7 @@ async def run_arming_checks(vehicle: Vehicle) -> None:
 
 
 def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
-    """Return the failing sensors of a vehicle. None if it is armed, or if its arming checks pass."""
+    """Return the failing sensors of a connected, disarmed vehicle whose arming checks fail; otherwise None."""
     sensors = vehicle.sensors.latest
     is_disarmed = vehicle.armed.latest is False
     if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import io
+import json
 import os
 import subprocess
 import sys
@@ -114,6 +115,20 @@ def test_confirm_reads_redirected_input(
     with (tmp_path / "input").open(encoding="utf-8") as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
         assert asyncio.run(asyncio.wait_for(asking.confirm("fly?"), 10.0)) is is_confirmed
+
+
+@pytest.mark.parametrize(("command", "question"), [("logs erase", "erase all"), ("camera format", "format the")])
+def test_unanswered_question_is_declined_and_keeps_stdout_json(
+    command: str, question: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "input").touch()
+    with (tmp_path / "input").open() as stdin:
+        monkeypatch.setattr(stdin, "isatty", lambda: True)
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert main([*command.split(), "--json"]) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"type": "declined", "action": command}
+    assert err.startswith(question)
 
 
 # ---------------------------------------------------------------------------------- completion

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
-import sys
 from argparse import ArgumentTypeError
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import TYPE_CHECKING, Any
@@ -172,11 +171,6 @@ def add_action(
     action.set_defaults(run=run)
     add_json(action)
     return action
-
-
-def confirm_blocking(question: str) -> bool:
-    """Ask a yes/no question before a connection is opened. The answer is no if stdin is not a terminal."""
-    return sys.stdin.isatty() and input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
 def command_action(

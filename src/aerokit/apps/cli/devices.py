@@ -10,8 +10,9 @@ from urllib.parse import unquote
 import anyio
 
 from aerokit.apps.cli.arguments import directory, integer, number
-from aerokit.apps.cli.connecting import add_action, command_action, confirm_blocking, connected
+from aerokit.apps.cli.connecting import add_action, command_action, connected
 from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
+from aerokit.apps.cli.terminal import confirm, is_interactive
 from aerokit.errors import AerokitError
 from aerokit.position import Position
 
@@ -179,7 +180,7 @@ async def _streams(options: argparse.Namespace) -> int:
 
 
 async def _format(options: argparse.Namespace) -> int:
-    if not options.yes and not confirm_blocking("format the camera's storage?"):
+    if not (options.yes or (is_interactive() and await confirm("format the camera's storage?"))):
         emit(options, "declined", {"action": "camera format"}, "not confirmed; nothing was formatted")
         return FAILED
     async with _camera(options) as camera:

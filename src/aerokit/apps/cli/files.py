@@ -9,9 +9,9 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import directory
-from aerokit.apps.cli.connecting import add_action, command_action, confirm_blocking, connected
+from aerokit.apps.cli.connecting import add_action, command_action, connected
 from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
-from aerokit.apps.cli.terminal import progress_bar
+from aerokit.apps.cli.terminal import confirm, is_interactive, progress_bar
 from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ async def _get(options: argparse.Namespace) -> int:
 
 
 def _destination(options: argparse.Namespace) -> Path:
-    """Return the local file to write; in a directory, it gets the name that it has on the vehicle."""
+    """Return the local file to write. If ``to`` is missing or a directory, the file keeps its name on the vehicle."""
     name = PurePosixPath(options.path).name
     target = Path(options.to or name)
     return target / name if target.is_dir() else target
@@ -165,7 +165,7 @@ def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequenc
 
 
 async def _erase(options: argparse.Namespace) -> int:
-    if not options.yes and not confirm_blocking("erase all flight logs of the vehicle?"):
+    if not (options.yes or (is_interactive() and await confirm("erase all flight logs of the vehicle?"))):
         emit(options, "declined", {"action": "logs erase"}, "not confirmed; nothing was erased")
         return FAILED
     async with connected(options, changes=True) as vehicle:

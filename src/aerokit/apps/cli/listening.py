@@ -243,7 +243,7 @@ async def run_monitor(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _printing_kept_name(path: str | None) -> Iterator[None]:
-    """After the block, print the new name of a recording that was renamed. Textual hides the log message about it."""
+    """If the block renames the file ``path``, print its new name afterwards. Textual hides the log message about it."""
     if path is None or not os.path.isfile(path):
         yield
         return

@@ -29,7 +29,7 @@ _PX4_FILE = "FILE is parameters.json, which `make parameters_metadata` writes in
 
 
 def metadata_source(vehicle: Vehicle) -> str:
-    """Return a note that ranges were not checked, and where to get the file for ``--metadata``, which checks them."""
+    """Return a note which says that ranges were not checked, and where to get a file for ``--metadata``."""
     if vehicle.autopilot.name == "PX4":
         file = _PX4_FILE
     else:
@@ -112,7 +112,7 @@ def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> Non
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
-    """Return a note on when a new value takes effect, such as after a reboot; empty if nothing is known."""
+    """Return a note if a new value may take effect only after a reboot; "" for other and unknown parameters."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
     if metadata is None:

@@ -112,7 +112,7 @@ class SupervisedFlight(ABC):
 
     @abstractmethod
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        """Return the purposes whose flight modes show that this program still has control of the vehicle."""
+        """Return purposes, such as "mission". In their flight modes, this program has control of the vehicle."""
 
     def _check_disarmed(self) -> None:
         now = self._vehicle.describe_now()
@@ -275,7 +275,7 @@ class FlightReport:
         """True if status lines are printed when there is no other output. Set it to False during questions."""
 
     def print_line(self, text: str) -> None:
-        """Print a line with time and altitude. If printing fails, as after a closed pipe, the flight continues."""
+        """Print time, altitude and ``text``. `_emit` catches the errors of a closed pipe, so the flight continues."""
         here = self._vehicle.position
         position = None if max(self._vehicle.heartbeat_age, here.age) > SILENT_AFTER_S else here.latest
         altitude = None if position is None else position.altitude_relative_m
@@ -308,7 +308,7 @@ class FlightReport:
                 await asyncio.wait(tasks)  # asyncio itself logs the error of a task that has failed
 
     def record_impact(self) -> None:
-        """Record when the vehicle hit the ground, so that the summary can state how long it was armed until then."""
+        """Record for the summary how long the vehicle was armed until it hit the ground."""
         if self._impact_s is None and self._armed_at is not None:
             # The impact is detected only later, because the vehicle must first lie still for some time.
             impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at
@@ -401,7 +401,7 @@ class FlightReport:
                     self.print_line(f"  {'! ' if is_warning else ''}{event.text}")
 
     def _is_about_mode(self, text: str) -> bool:
-        """Return True for "Arm: AUTO mode not armable", after which `Vehicle.arm` arms in another mode."""
+        """Return True for a text like "Arm: AUTO mode not armable". `Vehicle.arm` then changes the mode by itself."""
         autopilot = self._vehicle.autopilot
         mode = self._vehicle.mode_name
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"

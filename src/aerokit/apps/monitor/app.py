@@ -96,7 +96,7 @@ class ConfirmScreen(ModalScreen[bool]):
 
 
 class MissingScreen(ModalScreen[None]):
-    """All reasons that prevent a flight of one vehicle, updated like the state. Any of its keys closes it."""
+    """Lists all reasons that prevent a flight of one vehicle, and updates them. M, Q, Escape and Enter close it."""
 
     BINDINGS: ClassVar[list[BindingType]] = [("m,escape,q,enter", "dismiss", "Close")]
     CSS: ClassVar[str] = """
@@ -148,7 +148,7 @@ class Panel(Widget):
 class Monitor(App[None]):
     """Terminal application that shows a :class:`~aerokit.apps.monitor.model.MonitorModel` and commands its vehicles.
 
-    A command goes to the vehicle that is named in the question before it.
+    Each command must be confirmed, and goes to the vehicle that the question names.
     """
 
     CSS_PATH: ClassVar[str | PurePath | list[str | PurePath] | None] = "monitor.tcss"

@@ -182,7 +182,10 @@ class VehicleText:
         return text.append_text(self.cell(quality, lambda report: _milliseconds(report.round_trip_s)))
 
     def all_missing(self) -> str:
-        """Return all reasons that prevent a flight as lines, or a sentence if there are none."""
+        """Return one line for each reason that prevents a flight, or "Nothing is missing.".
+
+        For a silent vehicle, a line about the silence comes first.
+        """
         reasons = "\n".join(map(printable, self._reasons())) or "Nothing is missing."
         silence = self.silence().plain
         return f"{silence}\n{reasons}" if silence else reasons

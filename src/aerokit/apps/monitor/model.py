@@ -35,7 +35,7 @@ SEVERITY_STYLES = (DANGER, DANGER, DANGER, "bold red", "bold magenta", "bold", "
 
 
 class _CountSample(NamedTuple):
-    """Numbers of messages received until a time, by system id and message id."""
+    """Counts of the messages received before the time ``at``, by system id and message id."""
 
     at: float
     counts: Counter[tuple[int, int]]

@@ -43,7 +43,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
-    """Return the publisher for an address, to be entered by ``async with``, which rejects unknown schemes."""
+    """Return a context manager that opens the publisher for an address. Entering it rejects unknown schemes."""
     scheme = address.partition(":")[0].strip().lower()
     return PUBLISHERS.get(scheme, zenoh_publisher)(address)
 

@@ -259,8 +259,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One HTTP method of one path.
 
-    ``name`` is the operationId. ``order`` is the type of the order that the operation gives. An operation without an
-    order may have a ``body_type``, which is the order type whose request body it accepts.
+    ``name`` is the operationId. ``order`` is the type of the order that the operation gives. ``body_type`` is the
+    type of an order that the operation does not give, but whose arguments it checks.
     """
 
     method: str

@@ -96,7 +96,7 @@ class FlightWatch:
     def crash(self) -> dict[str, Any] | None:
         """The crash: ``text``, such as "hit the ground at 11.6 m/s", and ``at_unix_s``, the time of the impact.
 
-        It is None if there was no crash, or if the vehicle has moved, taken off or was armed again since the crash.
+        It is None if there was no crash. It becomes None again when the vehicle flies or is armed again.
         """
         return self._crash
 

@@ -67,8 +67,8 @@ def _parse_unchanged(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[st
 class OrderType:
     """One type of order: its arguments, and the function that runs it.
 
-    ``is_safe`` marks an order that brings the vehicle to rest. These orders are sent even to a silent vehicle.
-    ``parse`` converts the arguments to two dicts: the arguments to record, and the arguments for ``run``.
+    ``is_safe`` is True for an order that stops, lands or disarms the vehicle. It is sent even to a silent vehicle.
+    ``parse`` takes the arguments of the request. It returns those to record, and those to pass to ``run``.
     """
 
     name: str
