@@ -95,7 +95,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
 class PartFile:
     """A download in progress: until :meth:`finish`, ``<destination><mark>.part`` holds the beginning of the file.
 
-    Because of ``mark``, a download continues only a partial file that has the same mark.
+    ``mark`` identifies the file that is downloaded, so that a partial file of another one is not continued.
     """
 
     def __init__(self, destination: str | os.PathLike[str], mark: str = "") -> None:

@@ -75,9 +75,12 @@ def printable(text: str) -> str:
 
 
 def format_value(value: object) -> str:
-    """Format an event's field for people: enum members by name, floats with three digits, or as integers from 1000."""
+    """Format an event's field for people: enum members by name, floats with three significant digits.
+
+    Floats with more than three digits before the point are formatted as integers.
+    """
     if isinstance(value, float):
-        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+        return f"{value:.0f}" if abs(value) >= 999.5 else f"{value:.3g}"  # 999.5 is rounded to 1000.
     name = getattr(value, "name", None)
     return name if isinstance(name, str) else str(value)
 

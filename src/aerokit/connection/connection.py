@@ -368,9 +368,10 @@ class Connection:
         return self._clock()
 
     def _slept_since(self, at: float) -> float:
-        """Return how many seconds the computer was suspended since this time, while the event loop's clock stood still.
+        """Return for how many seconds since ``at`` the computer was suspended and the event loop's clock stood still.
 
-        If it notices a new suspension, it publishes :class:`ComputerSlept`, whose subscribers correct all ages.
+        If this call is the first to notice a suspension, :class:`ComputerSlept` is published before it returns, and
+        subscribers of this event correct all ages.
         """
         return self._receiver.slept_since(at)
 

@@ -191,7 +191,7 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
 
 
 def _check_that_peers_apply(targets: Sequence[Link | LinkAddress]) -> None:
-    """Raise InvalidArgument, if ``peers`` is given, for a Link object or if no address would filter its senders."""
+    """Raise InvalidArgument if a target is a Link object, or if ``peers`` would apply to none of the addresses."""
     if any(isinstance(target, Link) for target in targets):
         raise InvalidArgument(PEERS_WITH_LINK_OBJECT)
     if not any(getattr(target, "kind", None) in FILTERING_KINDS for target in targets):

@@ -39,8 +39,8 @@ class RouteClaim:
     """Evidence on whether a component now sends from another peer of the link.
 
     The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
-    the component claims the route. Of its sequence numbers, only that of its first frame after the owner's last frame
-    counts until the owner sends again, because otherwise a peer could try many sequence numbers.
+    the component claims the route. Only the first frame after the owner's last frame is judged by its sequence number,
+    because a peer could otherwise try many numbers. When the owner sends again, the claim starts anew.
     """
 
     __slots__ = (
@@ -148,15 +148,14 @@ class Routes:
     """Routing table: maps each (system id, component id) to the peer that owns the route.
 
     The first peer that sends a HEARTBEAT under these ids owns the route; frames of other peers under the same ids are
-    dropped (``DuplicateSender``). Another peer takes over the route (``RouteChanged``)
+    dropped (``DuplicateSender``). Another peer continues the owner's stream if its sequence numbers and, where known,
+    its time since boot are those expected of the owner. It takes over the route (``RouteChanged``)
 
-    1. at once, if it is another port of the same host and continues the owner's stream: three frames continue the
-       sequence numbers and, where known, the time since boot, while the owner is silent for the time of three frames;
-    2. after 3.5 s without a heartbeat, not counting pauses of the event loop, or when a TCP client has disconnected: if
-       it is on the same host (a reboot or restart, with new numbers), or continues the stream as above from any host,
-       or signs with our key;
-    3. after the same silence or disconnection, from any host, if the system has no vehicle object or the program allows
-       it (``may_move``).
+    1. at once, if it is another port of the same host and has continued the stream with three frames, while the owner
+       sent nothing for the time of three frames;
+    2. once the owner is gone (3.5 s without a heartbeat, not counting pauses of the event loop, or a TCP client that
+       has disconnected), if one of these is true: it is on the same host, as after a reboot; it continues the stream;
+       it signs with our key; the system has no vehicle object; the program allows every host (``may_move``).
 
     Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.

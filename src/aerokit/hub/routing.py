@@ -302,9 +302,9 @@ class Router(Generic[PortT]):
         return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
-        """Return True if an equal frame arrived first at another port, recently and when this port already existed.
+        """Return True if a recent frame at another port was equal, and port ``number`` already existed at that time.
 
-        The cause is a loop, or chance.
+        Then either the frame has returned through a loop, or two frames are equal by chance.
         """
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S

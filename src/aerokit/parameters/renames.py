@@ -201,7 +201,7 @@ def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
 
 
 def _is_mask(value: float) -> bool:
-    """Return True if a value is a bit mask. Others would become the mask of other checks."""
+    """Return True if a value is an integer of 32 bits. Another value cannot be converted to the opposite mask."""
     return -(2**31) <= value < 2**31 and value == int(value)
 
 

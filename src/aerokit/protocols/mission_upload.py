@@ -227,7 +227,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _is_refusal_of_partial_upload(self) -> bool:
-        """True while an ERROR would refuse MISSION_WRITE_PARTIAL_LIST: no item has been requested since it was sent."""
+        """True while an ERROR would refuse a partial upload as such, because the vehicle has not requested an item."""
         return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:

@@ -119,7 +119,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._on_streamed_value(index, now)
         else:
             self._window.on_answer(index, now)
-        # Missing values are requested at `_quiet_at`. Near the end of the list, only streamed values postpone it.
+        # An answer to a request delays the stream, so it restarts the time-out, too. Near the end of the list it does
+        # not, so that the last missing values are requested early.
         if self._is_streaming and (is_streamed or not self._is_near_end):
             self._quiet_at = now + self._quiet_s()
         parameter = parameter_of(message, self._bytewise)
@@ -204,10 +205,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
         self._must_request_missing = True
 
     def _quiet_s(self) -> float:
-        """Return the seconds of silence after which the stream counts as stopped.
-
-        Except near the end, an answer to a request also ends the silence, because answers delay the stream.
-        """
+        """Return after how many seconds without a value the stream counts as stopped."""
         seconds = max(self.round_trip.timeout_s(), PAUSES * self._pause_s)
         if self._streamed_count < MIN_STREAMED:  # A single value may be the answer to our request by index.
             return max(seconds, MIN_START_TIMEOUT_S)
@@ -245,7 +243,10 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._finish(ParameterTable(self._in_order(parameters, names)))
 
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
-        """Return each parameter once with its latest value, by index. Those without index come last or are left out."""
+        """Return each parameter once, with its latest value and in the order of the indices.
+
+        Parameters without an index come last. They are left out if the list has changed during the download.
+        """
         indices: dict[str, int | None] = {}
         for index, parameter in enumerate(parameters):
             indices.setdefault(parameter.name, index)

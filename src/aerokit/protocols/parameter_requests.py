@@ -189,10 +189,10 @@ class ParameterWrites(ParameterRequests):
     """Set some parameters. The result has the value that each parameter has afterwards, as the vehicle reports it.
 
     An answer with the requested value and type completes a write. If no answer arrives, the value is read. PARAM_SET is
-    sent again only if the vehicle still reports the last known value, which is in ``before``, or if none is known. A
-    value that the vehicle keeps reporting meanwhile becomes the result. If the last known value is known, any other
-    value that is reported twice is the result as well: the vehicle rounded or clamped the value, or another station set
-    it. A later change by another station is therefore not undone.
+    sent again only if the vehicle may still have the value from before the write: it reports the value in ``before``,
+    or ``before`` lacks the name. If it reports such a value eight times in a row, that is the result. Any other value
+    is the result once it was reported twice in a row: the vehicle rounded or clamped the requested value, or another
+    station set it. A later change by another station is therefore not undone.
 
     ``recent`` has names that an earlier call has just written. Answers to the earlier write may still arrive, so the
     first matching answer is verified by another read.

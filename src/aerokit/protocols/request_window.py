@@ -31,7 +31,7 @@ OVERTAKEN = 3
 
 
 class _Request:
-    """Times and numbers of a request's first and latest transmission. Numbers count transmissions of all requests."""
+    """Times of a request's first and latest transmission, and their numbers among those of all requests."""
 
     __slots__ = ("attempts", "due_at", "first_at", "first_number", "last_number", "sent_at", "was_duplicated")
 

@@ -378,6 +378,11 @@ async def test_vehicles_behind_one_peer_are_not_heard_twice() -> None:
     assert events == []
 
 
+def test_event_text_rounds_float_below_1000_without_exponent() -> None:
+    assert _event_text(VehicleSilent(1.0, 1, 999.7)) == "VehicleSilent  silent for 1000 s"
+    assert _event_text(VehicleSilent(1.0, 1, 999.4)) == "VehicleSilent  silent for 999 s"
+
+
 async def test_event_text_uses_enum_names() -> None:
     landed = LandedStateChanged(1.0, 1, MavLandedState.ON_GROUND, MavLandedState.TAKEOFF)
     changed = ParameterChanged(1.0, 1, "WPNAV_SPEED", 1234.5, 0.1354)

@@ -101,7 +101,10 @@ class Candidate:
             self._doubt()
 
     def record_copy(self, now: float) -> None:
-        """Count a frame, with a time since boot, that also arrived over the link in use; MIN_COPIES prove this link."""
+        """Count a frame that arrived over this link and the link in use; this link is proven after MIN_COPIES frames.
+
+        Call this only for frames with a time since boot: others may be equal although they come from two vehicles.
+        """
         self.shared_at = now
         self._copies += 1
         if self._copies >= MIN_COPIES and not self.is_other_hardware:
@@ -227,7 +230,7 @@ class LinkChoice:
         return candidate
 
     def start_with(self, candidate: Candidate) -> None:
-        """Require proof of other links from now on: the autopilot's first heartbeat arrived over this link.
+        """Register that the autopilot's first heartbeat arrived over this link; other links need proof from now on.
 
         If this link is not in use, forget all others, so that it is chosen.
         """

@@ -311,7 +311,7 @@ class SessionFtpServer(Generic[FilesT]):
         return None
 
     def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
-        """Send the next `self.burst` blocks, or none while the link is congested; repeat until the burst has ended."""
+        """Send up to `self.burst` blocks, none while the link is congested; then schedule a call for the rest."""
         max_blocks = 0 if self._is_congested() else self.burst
         for number in range(max_blocks):
             if session.next_block is None:

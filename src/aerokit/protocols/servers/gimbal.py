@@ -102,7 +102,7 @@ class GimbalMount:
         raise NotImplementedError
 
     def follow(self, system_id: int) -> None:
-        """Keep pointing at another vehicle, from the first position on that is received from it."""
+        """Keep pointing at another vehicle. This begins when its first position is received."""
         raise NotImplementedError
 
     def update_followed(self, system_id: int, place: Place) -> None:

@@ -46,7 +46,7 @@ class ParameterLists:
         return len(self._lists)
 
     def restart(self) -> None:
-        """Stop sending all lists, because the component has rebooted."""
+        """Called after the component has rebooted: drop the lists that are being sent."""
         self._lists.clear()
 
     def start_list(self, channel: Channel) -> None:

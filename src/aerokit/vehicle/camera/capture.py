@@ -75,7 +75,7 @@ class Capture(Snapshot):
 
 
 def capture_of(message: Any, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
-    """Decode a message that reports a picture, when it arrives: CAMERA_TRIGGER gets the vehicle's present position."""
+    """Decode a message about a picture. Call this at once: CAMERA_TRIGGER is combined with the present position."""
     if message.NAME == "CAMERA_TRIGGER":
         return from_trigger(message, camera, received_at, telemetry)
     return (from_feedback if message.NAME == "CAMERA_FEEDBACK" else from_image)(message, camera, received_at)

@@ -225,7 +225,7 @@ class Order:
         return mode.custom_mode in self._own_modes
 
     def expect(self, modes: Collection[Mode]) -> None:
-        """Count these modes as the order's own: if another order of the program leads to them, that is no takeover."""
+        """Count these modes as the order's own, because the program itself will order one of them."""
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:

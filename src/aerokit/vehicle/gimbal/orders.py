@@ -68,7 +68,7 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        """The device with the attitude. For the first gimbal: the placeholder (MOUNT_STATUS) until a gimbal reports."""
+        """The device that has the gimbal's attitude. Until a gimbal reports, ``vehicle.gimbal`` has a placeholder."""
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 

@@ -50,13 +50,12 @@ class MissionEndDetector:
     """Detects the end of a mission.
 
     Usually, a mission has ended when the vehicle reports completion. A mission whose last item is a landing, or a
-    return with a landing, ends only on the ground, because PX4 reports completion when the return starts; here,
-    disarming in the mode of the last item also counts as the end. A return without a landing ends at home. If the
-    vehicle reports no mission state, the mission has ended when the last item is reached. If the items are unknown, the
-    mode after the completion shows whether the vehicle lands.
+    return with a landing, ends only on the ground, because PX4 reports completion when the return starts. Such a
+    mission also ends, without a report, when the vehicle disarms in the mode of the last item. A return without a
+    landing ends at home. If the vehicle reports no mission state, the mission has ended when the last item is reached.
+    If the items are unknown, the mode after the completion shows whether the vehicle lands.
 
-    After a failsafe in the last item, a vehicle may land elsewhere, in another mode than that of the item: then the
-    mission has failed.
+    If a failsafe during the last item changes the mode, e.g. to land elsewhere, the mission has failed.
     """
 
     def __init__(
@@ -184,7 +183,10 @@ class MissionEndDetector:
 
     @property
     def _is_landing(self) -> bool:
-        """True if the vehicle is at the end of a mission that ends by landing or return, and is in the mode for it."""
+        """True if the last item is a landing or a return, and the vehicle executes it in the mode for it.
+
+        If the items are unknown, `_ends_by_landing_or_return` decides from the completion and the mode.
+        """
         current, last = self._tracker.current.latest, self._tracker.last_item
         is_at_end = (current is not None and current == last) or not self._are_items_known
         return is_at_end and self._ends_by_landing_or_return and self._is_in_landing_mode

@@ -208,9 +208,9 @@ class MessageRates:
         return stream
 
     async def _request_all_due(self) -> None:
-        """Request the due streams one at a time; without support for the command, request their groups together.
+        """Request the due streams by MAV_CMD_SET_MESSAGE_INTERVAL, one at a time; after failures, a stream comes last.
 
-        Streams whose last request was not answered come last.
+        If the vehicle does not support this command, request the groups of the streams instead, all at once.
         """
         while not self._uses_groups and (stream := self._most_urgent()) is not None:
             await self._request_by_command(stream)
