@@ -72,7 +72,7 @@ class RecordedModeCommands:
         self._flight.modes = changes
 
     def _command_age_s(self, change: ModeChange, mode: str) -> float:
-        """Return the recording's seconds from the last command for this mode to the change; infinity without one."""
+        """Return the recorded seconds from the last command for this mode to the change; infinity without a command."""
         times = self._command_times.get(mode, [])
         index = bisect_right(times, change.time_s)
         return change.time_s - times[index - 1] if index else math.inf
