@@ -206,7 +206,7 @@ class VehicleAttributes(VehicleCore):
 
     @OverridableProperty
     def wind(self) -> Wind:
-        """Direction from which the wind blows, in degrees, and its speed in m/s (ArduPilot's WIND)."""
+        """Direction in degrees from which the wind blows, horizontal and vertical speed in m/s (ArduPilot's WIND)."""
         return Wind(*self._dk_wind.values("direction", "speed", "speed_z"))
 
     @property

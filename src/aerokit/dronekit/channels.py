@@ -72,9 +72,9 @@ def _unsupported(name: str) -> Any:
 class Channels(_ChannelDict):
     """RC input of the autopilot, overrides included: microseconds by number (``'1'`` or 1). Read only.
 
-    The values come from RC_CHANNELS and RC_CHANNELS_RAW. Each message changes all values at once. A channel is None if
-    it does not exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW of port 1, which has
-    channels 9 to 16. Setting :attr:`count` changes the number. :attr:`overrides` changes channels.
+    The values come from RC_CHANNELS and RC_CHANNELS_RAW. All values of a message are stored at once. A channel is None
+    if it does not exist or was not received. There are eight channels, or 16 after an RC_CHANNELS_RAW of port 1, which
+    has channels 9 to 16. Setting :attr:`count` changes the number. :attr:`overrides` changes channels.
     """
 
     def __init__(self, vehicle: VehicleCore, count: int) -> None:

@@ -76,7 +76,7 @@ class ClassicConnection:
     def send(self, message: Message, *, to: int | None = None) -> None:
         """Send a message without blocking, from any thread. Messages are sent in the order of the calls.
 
-        ``to`` is the id of the system whose peers get the message; None: that of the message's ``target_system``.
+        With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``.
         Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
         """
         message.encode()  # Raises for an invalid field here. On the loop, the error would only be logged.

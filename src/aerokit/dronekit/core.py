@@ -75,7 +75,10 @@ class Readiness:
         return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
-        """Wait for a change if one of these attributes is missing, at most ``max_wait_s`` and at most 0.2 s."""
+        """Wait until an attribute gets a value or fails, at most ``max_wait_s`` and at most 0.2 s.
+
+        Returns at once if none of these attributes is missing, or if one of the missing ones has failed.
+        """
         with self._changed:
             missing = names - self.names
             if missing and self.failure_of(missing) is None:

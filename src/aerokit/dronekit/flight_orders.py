@@ -335,7 +335,7 @@ class Maintenance(VehicleCore):
         self._dk.command("reboot", shutdown, 1, attempt_timeout=REBOOT_TIMEOUT_S)
 
     def send_capabilities_request(self, vehicle: Any, name: str, m: Any) -> None:
-        """Request AUTOPILOT_VERSION once. Can be used as a message listener, whose arguments it ignores."""
+        """Send one request for AUTOPILOT_VERSION. The arguments are ignored; they are those of a message listener."""
         self._dk.check_link()
         self._dk.send(command_long(self._dk.target_system, 0, MavCmd.REQUEST_AUTOPILOT_CAPABILITIES, (1,)))
 

@@ -244,7 +244,7 @@ class Master:
         self._connection.send(from_pymavlink(message, target), to=target or None)
 
     def _autopilot(self) -> tuple[int, Heartbeat | None]:
-        """Return the component id and the last HEARTBEAT of the vehicle's autopilot."""
+        """Return the component id and the last HEARTBEAT of the vehicle's autopilot; 0 and None before its first."""
         for (system_id, component_id), heartbeat in self._connection.connection.heartbeats.copy().items():
             if system_id == self.target_system and is_autopilot(heartbeat):
                 return component_id, heartbeat

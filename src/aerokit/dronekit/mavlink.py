@@ -104,7 +104,10 @@ class MAVConnection(ClassicConnection):
         return fn
 
     def pipe(self, target: MAVConnection) -> MAVConnection:
-        """Forward all messages received on this connection to ``target``, and vice versa; return ``target``."""
+        """Forward all messages received on this connection to ``target``, and vice versa; return ``target``.
+
+        ``target`` gets the ``target_system`` of this connection.
+        """
         target.target_system = self.target_system
         self.loop.call_soon(self.connection.observe_frames, lambda frame, peer: target.write_frame(frame))
         target.loop.call_soon(target.connection.observe_frames, lambda frame, peer: self.write_frame(frame))
@@ -113,7 +116,7 @@ class MAVConnection(ClassicConnection):
     # ---------------------------------------------------------------------------- life cycle
 
     def start(self) -> None:
-        """Raise if the connection has ended. Reception starts when the connection is created."""
+        """Raise if the connection has ended. Otherwise do nothing, because a new connection already receives."""
         self.connection.raise_if_ended()
 
     def reset(self) -> None:
@@ -135,7 +138,7 @@ class MAVConnection(ClassicConnection):
 
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
-        """Discard received bytes if False, so that programs can test a silent link."""
+        """Discard received bytes if False: tests of programs use this to simulate a silent link."""
         # The link calls `bytes_received` with received bytes. An instance attribute of this name hides the method.
         if value:
             vars(self.connection).pop("bytes_received", None)

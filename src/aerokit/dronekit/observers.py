@@ -173,9 +173,10 @@ class HasObservers:
         return listener_decorator(self.add_attribute_listener, name)
 
     def notify_attribute_listeners(self, attr_name: str, value: Any, cache: bool = False) -> None:
-        """Call the listeners of an attribute, and wait for them. With ``cache``, only if the value has changed.
+        """Call the listeners of an attribute; with ``cache``, only if the value has changed.
 
-        Message listeners of your program can use it to announce your own attributes.
+        Waits for the listeners, at most two seconds. Your program can announce its own attributes with this method,
+        also from a listener.
         """
         self._dk_listeners.notify(self._dk_normalized(attr_name), value, cache, waits=True)
 

@@ -363,7 +363,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
     @property
     def _is_settled(self) -> bool:
-        """True if all parameters are known: the list was received, and has the length that the vehicle reports."""
+        """True if the download is complete, and has at least as many parameters as the vehicle reports."""
         return self._download.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:

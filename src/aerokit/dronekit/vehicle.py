@@ -67,10 +67,11 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     """A vehicle: its attributes and their listeners, orders, parameters and missions.
 
     :func:`connect` creates it. ``connect(…, vehicle_class=MyVehicle)`` creates a ``MyVehicle``, a subclass of this
-    class. Its constructor gets one argument, which it must pass to the constructor of this class; it may add listeners
-    and attributes. The vehicle can be used from any thread. Callbacks run
-    in order on a separate thread, and may use the vehicle, too. The vehicle is a context manager; :meth:`close`
-    closes the connection.
+    class. The constructor of ``MyVehicle`` gets one argument and must pass it to the constructor of this class. The
+    constructor may add listeners and attributes.
+
+    The vehicle can be used from any thread. Listeners run one after the other on a separate thread, and may use the
+    vehicle, too. The vehicle is a context manager; :meth:`close` closes the connection.
     """
 
     def __init__(self, handler: MAVConnection) -> None:
@@ -89,7 +90,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 
     @property
     def channels(self) -> Channels:
-        """RC channels by number. Its attribute ``overrides`` overrides channels."""
+        """RC channels by number. Set ``vehicle.channels.overrides`` to override them."""
         return self._channels
 
     @property

@@ -401,8 +401,8 @@ class Connection(ConnectionTwin):
         goes to every peer. With several links, a message for a vehicle is not sent at all if the link in use leads to
         another vehicle with the same id (:class:`DuplicateSender` reports this) and no other link works.
 
-        ``to`` is the id of the system whose peers get the message; None: the message's ``target_system``. The message
-        itself is not changed.
+        With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``. The
+        message itself is not changed.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.

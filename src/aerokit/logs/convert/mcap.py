@@ -19,7 +19,7 @@ _POSE_STATES = frozenset(("position", "attitude"))
 
 
 class McapWriter:
-    """Writes a log as ``.mcap``, with a message for each record and for each state that it changes."""
+    """Writes a log as ``.mcap``, with a message for each record, and one for each state that the record changes."""
 
     def __init__(self, path: Path, log: LogReader) -> None:
         self._log = log
@@ -108,7 +108,7 @@ class McapWriter:
         self.written += 1
 
     def _register(self, topic: Topic) -> int:
-        """Register a channel for a topic, and its schema unless it is registered; return the id of the channel."""
+        """Register a channel for a topic; return the channel's id. A schema of several topics is registered once."""
         data = topics.encoded(topic.schema)
         schema = self._schemas.get(data)
         if schema is None:

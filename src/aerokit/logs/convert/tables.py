@@ -93,7 +93,7 @@ class CsvTable:
             self._flush()
 
     def add_numbers(self, unix_s: float, numbers: Sequence[float]) -> None:
-        """Add a row of ints and floats. The result is that of :meth:`add`, in half of its time."""
+        """Add a row of ints and floats. Writes the same line as :meth:`add`, but twice as fast."""
         line = self._number_format % (_iso_time(unix_s), *numbers)
         if "nan" in line:  # A number is NaN, which becomes an empty cell.
             self.add(unix_s, numbers)

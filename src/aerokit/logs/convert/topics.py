@@ -180,7 +180,7 @@ def state_fields(value: object) -> dict[str, Any]:
 
 
 def raw_fields(message: Message) -> dict[str, Any]:
-    """Return the fields of a MAVLink message, in raw units; keys and passwords are omitted."""
+    """Return the fields of a MAVLink message in raw units, except fields with secrets, such as passwords."""
     return {name: _plain(getattr(message, name)) for name in field_names(message) if name not in SECRET_FIELDS}
 
 

@@ -404,7 +404,7 @@ def _max_before(columns: TimeSeries, name: str, time_s: float) -> float | None:
 
 
 def _limit_parameters(flight: FlightLog, kind: str, time_s: float) -> list[str]:
-    values = ((name, flight.parameter_at(name, time_s)) for name in configured_by(flight, kind))
+    values = ((name, flight.parameter_at(name, time_s)) for name in failsafe_parameters(flight, kind))
     known = [_parameter_text(flight, name, value) for name, value in values if not math.isnan(value)]
     return [f"parameters: {', '.join(known)}"] if known else []
 
@@ -415,12 +415,12 @@ def _parameter_text(flight: FlightLog, name: str, value: float) -> str:
 
 
 def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
-    names = configured_by(flight, kind)
+    names = failsafe_parameters(flight, kind)
     return [f"parameters to look at, which the log does not contain: {', '.join(names)}"] if names else []
 
 
-def configured_by(flight: FlightLog, kind: str) -> list[str]:
-    """Return the names of the parameters for this kind of failsafe, for every autopilot if the flight's is unknown."""
+def failsafe_parameters(flight: FlightLog, kind: str) -> list[str]:
+    """Return names of parameters for this kind of failsafe. If the autopilot is unknown, those of every autopilot."""
     names = _LIMIT_PARAMETERS.get(kind, ())
     if flight.autopilot == "PX4":
         return [name for name in names if name.startswith(_PX4_PREFIXES)]

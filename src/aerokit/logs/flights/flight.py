@@ -47,7 +47,7 @@ class TimeSeries:
         return f"<TimeSeries {', '.join(self.names)}: {len(self)} rows>"
 
     def add(self, time_s: float, *values: float) -> None:
-        """Add a row with one value for each column. A time before that of the previous row is replaced by it."""
+        """Add a row with one value for each column. If the time is before the last row, the last row's time is used."""
         times = self.times
         if times and time_s < times[-1]:
             time_s = times[-1]

@@ -14,7 +14,7 @@ from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import clean_text
 from aerokit.logs.flights.from_ulog import utc_at_boot
-from aerokit.logs.flights.records import LogReader, LogRecord, TableColumn, unit_suffix
+from aerokit.logs.flights.records import LogReader, LogRecord, TableColumn, name_with_unit
 from aerokit.position import Position
 from aerokit.vehicle.state.condition import StatusText
 from aerokit.vehicle.state.equipment import Battery
@@ -78,7 +78,7 @@ class _RowReader(LogReader):
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         """Return the columns of a table from its first record, with units if the log has them."""
         return [
-            TableColumn(unit_suffix(name, self._unit(entry.table, name)), name, _column_kind(value))
+            TableColumn(name_with_unit(name, self._unit(entry.table, name)), name, _column_kind(value))
             for name, value in entry.fields.items()
         ]
 
@@ -122,7 +122,7 @@ def _optional_state(name: str, value: object) -> States:
 
 
 class BinReader(_RowReader):
-    """Reads a ``.bin`` of ArduPilot with pymavlink. The log does not contain the system id, so 1 is used."""
+    """Reads a ``.bin`` of ArduPilot with pymavlink. Its rows do not contain a system id, so 1 is used."""
 
     _reader: Any = None
 
@@ -149,7 +149,7 @@ class BinReader(_RowReader):
             if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
                 self._note_time(message._timestamp)
                 states = _ardupilot_states(table, fields, reader)
-                # A .bin contains no system and component id, so both are 1.
+                # The rows of a .bin contain no system and component id, so both are 1.
                 yield LogRecord(
                     message._timestamp, system_id=1, component_id=1, table=table, fields=fields, states=states
                 )

@@ -43,7 +43,7 @@ _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the row
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight with the content of the file ``flight.path``. ``system_id`` is ignored: a .bin does not have it.
+    """Fill a flight with the content of the file ``flight.path``. ``system_id`` is ignored: the rows have none.
 
     Raises:
         FileFormatError: the file is not an ArduPilot log, or was written before 2015.

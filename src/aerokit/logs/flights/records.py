@@ -78,8 +78,8 @@ class LogReader:
         raise NotImplementedError
 
 
-def unit_suffix(name: str, unit: str) -> str:
-    """Append the unit to a name, unless the name ends with it: ``alt`` in mm becomes ``alt_mm``."""
+def name_with_unit(name: str, unit: str) -> str:
+    """Return a name with its unit appended, unless the name ends with it: ``alt`` in mm becomes ``alt_mm``."""
     suffix = _UNITS.get(unit, unit).replace("/", "_").replace("*", "").replace("^", "")
     suffix = "".join(character for character in suffix if character.isalnum() or character == "_")
     has_suffix = name.lower().endswith(f"_{suffix.lower()}")
@@ -152,7 +152,7 @@ class TlogReader(LogReader):
         assert entry.message is not None
         columns = []
         for field in entry.message.FIELDS:
-            name = unit_suffix(field.name, field.units)
+            name = name_with_unit(field.name, field.units)
             kind = _COLUMN_KINDS.get(field.type, "int")
             if field.is_text or (field.array_length and field.type in ("uint8_t", "char")):
                 columns.append(TableColumn(name, field.name, "str"))

@@ -31,7 +31,7 @@ def length(metres: float) -> str:
 
 
 def number(value: float) -> str:
-    """Format a number with about three digits."""
+    """Format a number, with one decimal below 100: ``5.7``, ``310``."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 

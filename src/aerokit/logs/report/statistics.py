@@ -8,7 +8,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
-from aerokit.logs.flights.failsafes import configured_by, failsafes
+from aerokit.logs.flights.failsafes import failsafe_parameters, failsafes
 from aerokit.logs.flights.falls import falls
 from aerokit.logs.flights.flight import TangentPlane, battery_name
 from aerokit.logs.report.formatting import clock, length, number, span
@@ -258,7 +258,7 @@ def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _Des
 
 
 class _DescentValues(Snapshot):
-    """Lowest, median and highest value in a descent, and the median of the seconds before it (NaN if unknown)."""
+    """Minimum, median and maximum of a measurement in a descent; ``before`` is its median just before, or NaN."""
 
     minimum: float
     median: float
@@ -277,7 +277,7 @@ class _DescentValues(Snapshot):
 
 
 def _descent_values(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _DescentValues | None:
-    """Return range and median of the known values in a time span, and the median just before it; None without any."""
+    """Summarize the known values of a column in a time span. Return None if the span has none."""
     values = series.between(name, begin_s, end_s)
     if not values:
         return None
@@ -375,7 +375,7 @@ def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
 
 
 def _until_impact(flight: FlightLog, armed_s: float) -> str:
-    """Return a note on the armed time until a fall's impact; empty unless the vehicle was armed for 1 s after it."""
+    """Return a note with the armed time before an impact; empty if the vehicle was armed less than 1 s after it."""
     impact_s = next((fall.time_s for fall in falls(flight) if fall.has_impact and not fall.is_hard_landing), math.inf)
     armed_before_s = sum(max(min(end, impact_s) - begin, 0.0) for begin, end in flight.armed)
     return f" ({span(armed_before_s)} until the impact)" if armed_s - armed_before_s >= 1.0 else ""
@@ -431,7 +431,7 @@ def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
     """
     unknown: list[str] = []
     for kind in dict.fromkeys(kinds):
-        names = configured_by(flight, kind)
+        names = failsafe_parameters(flight, kind)
         if not any(name in flight.parameters for name in names):
             unknown += [name for name in names if "ACT" in name or "ENABL" in name] or names
     return unknown
