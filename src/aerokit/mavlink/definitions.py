@@ -120,7 +120,7 @@ class MessageDefinition:
 
 @dataclass(frozen=True)
 class EntryDefinition:
-    """One entry of an enum. MAV_CMD entries have ``params``: (index, label, units, description)."""
+    """One entry of an enum. In MAV_CMD, ``params`` has (index, label, units, description) of each parameter."""
 
     name: str
     value: int

@@ -46,7 +46,7 @@ DefinedT = TypeVar("DefinedT", EnumDefinition, MessageDefinition)
 
 
 def read_additions() -> list[DialectDefinition]:
-    """Read the XML files in the folder ``additions``."""
+    """Read the three XML files in the folder ``additions``."""
     return [read_xml(UNION_FOLDER / f"{stem}.xml") for stem in ("minimal", "common", "development")]
 
 

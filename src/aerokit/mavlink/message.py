@@ -143,7 +143,7 @@ class Field:
 
 
 class _Fields:
-    """Descriptor of ``Message.FIELDS``, which are created on first access, because most programs do not need them."""
+    """Descriptor that creates ``Message.FIELDS`` on first access, because most programs do not need them."""
 
     def __get__(self, instance: object, owner: type[Message]) -> tuple[Field, ...]:
         fields = tuple(Field(*row) for row in owner._FIELDS)
@@ -296,7 +296,7 @@ def pack_text(value: str, size: int) -> bytes:
 
 
 def pack_bytes(value: bytes, size: int) -> bytes:
-    """Return the value as bytes. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
+    """Return the value unchanged. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
     if len(value) > size:
         raise ValueError(value)
     return value

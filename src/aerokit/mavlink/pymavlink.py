@@ -188,7 +188,7 @@ def _text(value: Any) -> Any:
 
 
 class _RawText(str):
-    """Bytes that are not UTF-8, in a field of type str. They are sent unchanged."""
+    """A text that was received as bytes that are not UTF-8. `encode` returns these bytes, to send them unchanged."""
 
     _data: bytes
 

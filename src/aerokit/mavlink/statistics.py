@@ -119,7 +119,7 @@ class SourceStatistics(SourceFields):
         return self._on_repeated(sequence, now)
 
     def skip(self, count: int) -> None:
-        """Advance by ``count`` numbers that are neither received nor lost, for messages that cannot be verified."""
+        """Advance `expected` by ``count`` frames, without counting them as received or as lost."""
         self.expected += count
         self._unreceived += count
 

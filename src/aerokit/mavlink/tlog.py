@@ -99,7 +99,7 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if a true record begins inside this one. A true record is followed directly by the next record."""
+    """Return True if a true record begins between ``begin`` and ``end``: it ends after ``end``, before another one."""
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:

@@ -155,7 +155,8 @@ _RELEASE_TYPES = {"dev": 0, "alpha": 64, "beta": 128, "rc": 192, "": 255, "offic
 class SimulatedAutopilot(SimulatedVehicle):
     """A vehicle with a firmware version, files, a clock and commands.
 
-    - ``version``: such as "4.7.0-dev" or "1.16.0"; ``unix_time_at_boot``: GPS time at simulated second 0
+    - ``version``: such as "4.7.0-dev" or "1.16.0"
+    - ``unix_time_at_boot``: GPS time at simulated second 0, in seconds since 1970; continues through a reboot
     - ``unsupported_commands``: MAV_CMDs that this firmware does not support
     - ``signing_key``: key that was set up earlier; None sends unsigned frames until SETUP_SIGNING
     """

@@ -139,14 +139,14 @@ class SimulatorServer:
         self._end(error)
 
     def _end(self, error: BaseException | None) -> None:
-        """Stop. If a vehicle has failed, raise its exception instead of the cancellation that the failure caused."""
+        """Stop. If a vehicle has failed, raise `failure`, unless ``error``, which has ended the block, is `failure`."""
         self._stop()
         owner = self._owner
         self._owner = None
         if self._cancels_owner and owner is not None and owner is asyncio.current_task():
             _uncancel(owner)
         if self.failure is not None and self.failure is not error:
-            raise self.failure  # Its context is the exception that has ended the block.
+            raise self.failure  # Its context is `error`.
 
     def wake(self) -> None:
         """Run all events that are due. Call this method after a change of a fault or of a value of a vehicle.

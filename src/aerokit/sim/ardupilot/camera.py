@@ -155,7 +155,7 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED
 
     def zoom(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_ZOOM by rate or in percent. No message reports the zoom."""
+        """Accept MAV_CMD_SET_CAMERA_ZOOM by rate or in percent. No zoom is stored, because no message reports it."""
         is_supported = self.is_fitted and command.param1 in (1.0, 2.0)
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 

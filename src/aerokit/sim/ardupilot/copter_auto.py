@@ -133,7 +133,7 @@ class _ClimbLeg:
 
 
 class _ReturnLeg(CopterRtl):
-    """Return to home and landing. Complete when the motors idle on the ground."""
+    """Flight back and landing, as in the mode RTL. Complete when the motors idle on the ground."""
 
     @property
     def is_complete(self) -> bool:

@@ -304,9 +304,9 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 
 
 class CopterFence(ArduPilotFence[CopterHost]):
-    """Fence with the values of FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL (3, 5), BRAKE (4).
+    """Executes FENCE_ACTION: only report (0), RTL (1), LAND (2), SMART_RTL, else RTL (3), BRAKE (4), SMART_RTL (5).
 
-    If the mode is refused, or the copter is more than 100 m outside the fence, the copter lands instead.
+    Except with 0, the copter lands if these modes are refused or if it is more than 100 m outside the fence.
     """
 
     PERIOD_S: ClassVar[float] = 0.1

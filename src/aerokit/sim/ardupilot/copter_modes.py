@@ -35,7 +35,7 @@ class AutoYaw:
     def apply_default(self, *, returning: bool = False) -> None:
         """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
 
-        Called at every new guided target, which ends a commanded heading or region of interest.
+        This ends a commanded heading or region of interest, so it is called at every new guided target.
         """
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
         if behaviour == _YAW_AHEAD or (behaviour == _YAW_AHEAD_EXCEPT_RTL and not returning):
@@ -145,7 +145,7 @@ class CopterHost(ArduPilotVehicle):
         return self.parameters[name] / 100.0
 
     def fly_to(self, target: Ned, speed: float) -> float:
-        """Fly towards a target with the default climb and sink rates, and return its distance in metres."""
+        """Fly towards a target with the default climb and sink rates. Return the distance to the target in metres."""
         self.motors.spool_up_requested = True
         climb, descent = self.speed_limit("WPNAV_SPEED_UP"), self.speed_limit("WPNAV_SPEED_DN")
         self.motion.seek_position(*target, speed=speed, climb=climb, descent=descent)

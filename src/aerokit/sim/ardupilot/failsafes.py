@@ -70,7 +70,7 @@ class BatteryFailsafe:
         return None
 
     def _level_if_below(self, level: int) -> int:
-        """Return ``level`` if the charge is below its limit, or the voltage longer than BATT_LOW_TIMER; else 0."""
+        """Return ``level`` if the charge is low, or the voltage has been low for more than BATT_LOW_TIMER s; else 0."""
         is_voltage_low, is_charge_low = self._low_quantities(level)
         voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
         timeout = self._vehicle.parameters["BATT_LOW_TIMER"]  # 0 ignores a low voltage.
@@ -172,10 +172,10 @@ class ArmingCheck(IntFlag):
 
 
 class ArduPilotArming(Generic[HostT]):
-    """Arms and disarms. Runs the arming checks once a second and reports failures every 30 s while disarmed.
+    """Arms and disarms. While disarmed, runs the arming checks once a second and reports the failures every 30 s.
 
-    `common_reasons` contains the checks of all firmwares. A new failure of these checks is reported at once. A subclass
-    adds its own checks in `own_reasons` and `final_reasons`.
+    `common_reasons` has the checks that all firmwares share. When these begin to fail, a report follows within 5 s. A
+    subclass adds its own checks in `own_reasons` and `final_reasons`.
     """
 
     ARMED_TEXT: ClassVar[str] = "Throttle armed"

@@ -58,7 +58,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     @property
     def open_sessions(self) -> int:
-        """Number of open sessions: 1 while an open file blocks other sessions, otherwise 0."""
+        """Number of open files; 0 from 3 s after the last reply, because the open file then blocks no other session."""
         return 0 if self._is_idle() else super().open_sessions
 
     def _is_idle(self) -> bool:
@@ -221,9 +221,9 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._work()
 
     def _entries(self, path: str) -> list[Entry]:
-        """Return the entries of a folder. Outside mounts, they include `.` and `..`, as Linux lists them.
+        """Return the entries of a folder.
 
-        The root also contains the listed mounts.
+        They include `.` and `..`, except in a mount, and in the root also the mounts that ``is_listed`` selects.
         """
         entries = super()._entries(path)
         if self.files.mounted(path) is not None:

@@ -66,7 +66,7 @@ class ArduPilotMissionServer(MissionServer):
         self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """Return the items that a download sends, for a mission with home first. An unknown type has no items."""
+        """Return the items that a download sends. A mission begins with home. An unknown type has no items."""
         items = self._lists.get(mission_type)
         return [] if items is None else items.items()
 

@@ -90,9 +90,9 @@ _DRIVES_ITSELF = frozenset(
 class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     """ArduRover's failsafes.
 
-    FS_TIMEOUT seconds after the loss of the radio or the ground station, the rover executes FS_ACTION, even while
-    disarmed, but not in RTL and HOLD. The firmware treats both links as one failsafe. If the radio check is enabled,
-    the firmware also reports a lost ground station as "Radio Failsafe".
+    FS_TIMEOUT seconds after the loss of the radio or the ground station, the rover executes FS_ACTION, armed or not.
+    In RTL, it does nothing; in HOLD, only with bit 0 of FS_OPTIONS. As in the firmware, both links have one failsafe.
+    While the radio check is enabled, the text is "Radio Failsafe" even if only the ground station is lost.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (

@@ -59,7 +59,7 @@ class ArduPilotVehicle(ArduPilotHost):
     - ``unsupported_commands``: MAV_CMDs to answer UNSUPPORTED, such as SET_MESSAGE_INTERVAL for an old firmware;
       ``stream_groups``: False ignores REQUEST_DATA_STREAM
     - ``components``: further components: `SimulatedCamera`, `SimulatedGimbal`, or `ExtraComponent`
-    - ``unix_time_at_boot``: GPS time at simulated second 0
+    - ``unix_time_at_boot``: GPS time at simulated second 0, in seconds since 1970; continues through a reboot
     - ``signing_key``: see `ArduPilotSigning`
     """
 
@@ -201,7 +201,7 @@ class ArduPilotVehicle(ArduPilotHost):
         return True
 
     def reset_controllers(self) -> None:
-        """Create the controllers of this kind of vehicle. Called at power-on, after the modes were created."""
+        """Reset what only this kind of vehicle has. Called at power-on, after the modes were created."""
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
         """Return severity and text for a mode number that does not exist."""
@@ -236,9 +236,9 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Return True for a message to all systems or to this one, but not to one of its other components.
+        """Return True for a message to this system or to all systems, unless it is for one of `components`.
 
-        As in the firmware (MAVLink_routing.cpp), messages to components that do not exist are included.
+        As in the firmware (MAVLink_routing.cpp), a message for a component that does not exist is included.
         """
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and all(component != present.component_id for present in self.components)

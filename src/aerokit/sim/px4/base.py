@@ -353,7 +353,7 @@ class Px4Vehicle(Px4Host):
 
     @property
     def has_power(self) -> bool:
-        """True while the motors run."""
+        """True while armed, unless the motors have failed or the flight was terminated."""
         return self.is_armed and not self.faults.motor_failed and not self.arming.is_terminated
 
     def _is_moving(self) -> bool:

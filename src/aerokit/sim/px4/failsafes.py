@@ -291,7 +291,7 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), Action.NONE)
 
     def _position_action(self) -> FailsafeAction:
-        """Return LAND, which descends without a position, if a mode that needs a position had none for 5 s."""
+        """Return LAND, which needs no position, if the intended mode needs one and there was none for 5 s."""
         px4 = self._px4
         if px4.has_position:
             self._position_at = px4.now

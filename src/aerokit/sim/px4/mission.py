@@ -404,7 +404,7 @@ class Px4Mission:
         px4.call_later(0.0, self._hold)
 
     def _hold(self) -> None:
-        """Change to HOLD after the mission, unless the mode was changed in the meantime."""
+        """Change to HOLD if the mission is still finished, and the vehicle still flies in the mode MISSION."""
         if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
             self._px4.change_mode(HOLD)
 

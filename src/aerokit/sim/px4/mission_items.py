@@ -136,7 +136,7 @@ def _rounded(value: float) -> int:
 
 
 def _heading(degrees: float) -> float:
-    """Return a heading in degrees as it is after PX4 stored it in radians and read it again, from 0 to 360."""
+    """Return a heading in degrees, from 0 to 360, with the rounding errors of PX4, which stores it in radians."""
     if not math.isfinite(degrees):
         return math.nan
     radians = float32(degrees * _RADIANS_PER_DEGREE)
