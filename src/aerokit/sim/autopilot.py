@@ -63,7 +63,7 @@ class VehicleSigning:
         channel.sign_with(signing)
 
     def is_for(self, link_id: int) -> bool:
-        """Return True if this port signs and checks frames."""
+        """Return True if the port with this link id signs and checks frames while a key is set."""
         return True
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:

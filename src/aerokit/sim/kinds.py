@@ -47,7 +47,7 @@ def kind_class(name: str) -> type[SimulatedVehicle]:
 
 
 def simulated(name: str, **options: Any) -> SimulatedVehicle:
-    """Create a vehicle of this kind. Its class gets the ``options``, such as ``system_id``, ``home`` and ``seed``.
+    """Create a vehicle of the kind ``name``. Its class gets the ``options``, such as ``system_id`` and ``home``.
 
     Raises InvalidArgument for an unknown kind, TypeError for an unknown option.
     """

@@ -38,7 +38,7 @@ class MissionStore(Protocol):
         ...
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store ``items`` from index ``start`` on in one step, as the upload of a file does.
+        """Store all ``items`` at once, as the upload of a file does. ``start`` is the index of the first one.
 
         ``clear`` deletes the old items first. Return the MAV_MISSION_RESULT.
         """

@@ -178,7 +178,7 @@ def _row(fields: list[str]) -> SimParameter:
 
 
 def _switch_of(line: str) -> str | None:
-    """Return the name of the parameter that enables the parameter in this line; None without one."""
+    """Return the last column of a line if it names the enabling parameter (`SimParameter.switch`); otherwise None."""
     if line.count(",") < 4 or line.endswith("," + _VOLATILE):
         return None
     return line.rpartition(",")[2]

@@ -400,7 +400,7 @@ class UnderwaterMotion(Motion):
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
         """Integrate, and keep the submarine between the surface and the bottom."""
         super()._integrate(north, east, down, dt)
-        surface_down = self.ground_down
+        surface_down = self.ground_down  # where a submarine starts
         if self.down < surface_down:
             self.down = surface_down
             self.velocity_down = max(0.0, self.velocity_down)

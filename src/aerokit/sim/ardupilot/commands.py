@@ -396,7 +396,7 @@ class GimbalCommands:
         gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
     def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        """Handle GIMBAL_MANAGER_SET_PITCHYAW, which contains angles or rates."""
+        """Handle GIMBAL_MANAGER_SET_PITCHYAW. A message with both angles and rates is ignored."""
         gimbal = self._gimbal(message.gimbal_device_id)
         values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
         has_angles_and_rates = not any(map(math.isnan, values))

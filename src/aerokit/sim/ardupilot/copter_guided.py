@@ -31,8 +31,8 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    As in ArduCopter, a change of the submode resets the speed limits to WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN.
-    A speed that DO_CHANGE_SPEED has set is therefore valid until the kind of target changes.
+    As in ArduCopter, the change to another kind of position, velocity or acceleration target resets the speed limits to
+    WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN. A speed that DO_CHANGE_SPEED has set is valid until this change.
     """
 
     number: int = CopterMode.GUIDED

@@ -135,7 +135,7 @@ class CopterHost(ArduPilotVehicle):
         self.yaw.set_region_of_interest(place)
 
     @property
-    def ground_or_home_down(self) -> float:
+    def home_or_ground_down(self) -> float:
         """Down coordinate of home, or of the ground while home is not set."""
         _, _, home_down = self.navigation.home or (0.0, 0.0, self.motion.ground_down)
         return home_down
@@ -189,7 +189,7 @@ class CopterTakeOff:
     def __init__(self, copter: CopterHost, altitude_m: float) -> None:
         self._copter = copter
         motion = copter.motion
-        self.target: Ned = (motion.north, motion.east, copter.ground_or_home_down - altitude_m)
+        self.target: Ned = (motion.north, motion.east, copter.home_or_ground_down - altitude_m)
         self.is_complete: bool = False
 
     def update(self, climb_m_s: float) -> None:

@@ -209,7 +209,7 @@ class MissionRun:
             self._complete()
 
     def stop(self) -> None:
-        """Stop the mission because the mode has changed, and keep the progress."""
+        """Set the state to NOT_STARTED after a mode change, but keep the progress for `start_or_resume`."""
         if self.is_running:
             self._state = MissionState.NOT_STARTED
 

@@ -322,7 +322,7 @@ class SmartPath:
         return path[::-1]
 
     def restore(self, way_back: Sequence[Ned]) -> None:
-        """Record those points again that `take_way_back` returned and that the vehicle has not reached."""
+        """Replace the recorded points by ``way_back``, the part of `take_way_back` that the vehicle has not flown."""
         self._points[:] = list(way_back)[::-1]
         self._cleaned_count = len(self._points)
 

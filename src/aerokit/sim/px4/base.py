@@ -240,7 +240,7 @@ class Px4Vehicle(Px4Host):
         self.reboot(math.inf)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Queue a status text, to be sent after the answer to the command. It gets an id and usually a final tab."""
+        """Queue a status text, and the event with its content if there is one. Both follow the answer to a command."""
         self.call_later(0.0, partial(self.events.send_for, text))
         text = on_the_wire(text)
         text_id = self._next_text_id

@@ -45,7 +45,7 @@ _TRANSITION_DURATION_S = 4.0
 _NO_TRANSITION = frozenset({modes.TAKEOFF, modes.LAND, modes.RTL, modes.ORBIT})
 _UNKNOWN_PROGRESS = 255
 _STORAGE_ACTIONS = range(5)
-_MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000
+_MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000  # param 5 of ACTUATOR_TEST
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
@@ -72,7 +72,7 @@ _FAILURES = {
 
 
 def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Acknowledge a failure of the motors or the battery, as SIH does, but without an effect."""
+    """Handle INJECT_FAILURE. The answers are those of SIH, but the failures have no effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
     unit, failure_type = to_int(command.param1), to_int(command.param2)
@@ -87,7 +87,7 @@ def _refuse_high_latency(px4: Px4Vehicle) -> int:
 
 
 def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Accept a test of a motor, a servo or (numbers from 1000 on) an output function, without a visible effect."""
+    """Handle ACTUATOR_TEST, without a visible effect. No answer is sent for an unknown function (param 5)."""
     if px4.is_armed:
         return MavResult.DENIED
     function = to_int(command.x)
@@ -96,7 +96,7 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 
 def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Accept known storage actions, without a visible effect. Unknown actions are not answered."""
+    """Handle PREFLIGHT_STORAGE, without a visible effect. While disarmed, unknown actions are not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
     return MavResult.ACCEPTED if to_int(command.param1) in _STORAGE_ACTIONS else None

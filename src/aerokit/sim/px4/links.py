@@ -102,7 +102,7 @@ _MAX_QUEUED, _MAX_AGE_S = 8, 5.0
 
 
 class Px4TextLinks:
-    """Sends status texts (streams/STATUSTEXT.hpp). On a link without a ground station, texts are queued for 5 s."""
+    """Sends status texts (streams/STATUSTEXT.hpp). On each link, texts wait up to 5 s for a ground station."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4

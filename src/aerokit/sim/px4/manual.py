@@ -115,7 +115,7 @@ class Px4ManualFlight:
         self._turn_rate_rad_s = px4.motion.limits.turn_rate_rad_s
 
     def enter(self) -> None:
-        """Reset the held position and height."""
+        """Forget the held position and height, and restore the turn rate limit that `update` changes."""
         self._place = self._down = None
         self._px4.motion.limits.turn_rate_rad_s = self._turn_rate_rad_s
 

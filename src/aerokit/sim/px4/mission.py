@@ -215,7 +215,7 @@ class Px4Mission:
             self._px4.send_text(MavSeverity.CRITICAL, warning_text)
 
     def forget_reached(self) -> None:
-        """Forget which item was reached last."""
+        """Forget which item was reached last, and stop the repetition of MISSION_ITEM_REACHED."""
         self.reached = -1
         self._repeats_left = 0
 

@@ -181,7 +181,7 @@ class Px4MissionServer(MissionServer):
         self._px4.call_at(due, lambda: self._check(upload))
 
     def _is_watched(self, upload: ListUpload) -> bool:
-        """Return True if this is still the transfer of its link."""
+        """Return True until the transfer has ended or another transfer of its link has replaced it."""
         link = self._link(upload.channel)
         return link is upload and link.state is not TransferState.IDLE
 

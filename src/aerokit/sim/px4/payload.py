@@ -59,7 +59,7 @@ class Px4Gimbal:
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:
-        """Center the gimbal and release control of it. Called at power-on."""
+        """Called at power-on. Check if a gimbal is fitted, center it, and release control of it."""
         parameters = self._px4.parameters
         self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
         self.rest()
@@ -223,7 +223,7 @@ def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    """Handle DO_MOUNT_CONTROL. Unknown modes are accepted, but have no effect."""
+    """Handle DO_MOUNT_CONTROL. Modes other than these three are accepted, but have no effect."""
     mode = to_int(command.z)
     if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
         gimbal.rest()

@@ -136,7 +136,7 @@ class Px4PlaneFlight(Px4Flight):
             self.circle()
 
     def _follow_sticks(self) -> None:
-        """Control bank, climb and airspeed by the sticks, in every manual mode. A stick pushed forward descends."""
+        """Set bank, climb and airspeed from the sticks, alike in all manual modes. A stick pushed forward descends."""
         sticks, parameters = self._plane.sticks, self._plane.parameters
         climbs = sticks.pitch < 0
         climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if climbs else "FW_T_SINK_MAX"]
@@ -144,7 +144,7 @@ class Px4PlaneFlight(Px4Flight):
         throttle = (sticks.throttle + 1.0) / 2  # from 0 to 1
         speed = min_speed + throttle * (max_speed - min_speed)
         self._motion.bank_and_climb(speed, math.radians(parameters["FW_R_LIM"]) * sticks.roll, climb)
-        self.stay_here()  # After a loss of the sticks, the plane circles the place of the last call.
+        self.stay_here()  # If stick input is lost, the plane circles here.
 
     def go(self) -> None:
         self.circle()
