@@ -91,7 +91,7 @@ class LogServer:
         return bool(self._outgoing)
 
     def restart(self) -> None:
-        """Abort the running transfer."""
+        """Abort the running transfer, so that another can start."""
         self._transfer_number += 1
         self._outgoing.clear()
 

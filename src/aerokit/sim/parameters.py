@@ -118,7 +118,7 @@ class SimParameters:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters in a list, in the vehicle's order. The position of a name is its ``param_index``."""
+        """Names of the listed (not hidden) parameters, in order. The position of a name is its ``param_index``."""
         if self._names is None:
             hidden = {name for name, switch in self._switches.items() if not self[switch]}
             self._names = tuple(name for name in self._rows if name not in hidden)
@@ -239,7 +239,7 @@ class ParameterPackMount(Mount):
         return len(self._parameters) * _GUESSED_ROW_SIZE
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        """Open the file for writing, or for reading, where the path may end in ``?start=&count=&withdefaults=``."""
+        """Open the file. When it is read, the options ``?start=&count=&withdefaults=`` at the end of the path apply."""
         if writing:
             _query(path)
             return _Writer(self._parameters, self._apply)

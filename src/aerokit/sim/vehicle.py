@@ -39,7 +39,7 @@ def _whole_ticks(seconds: float) -> int:
 
 
 class MessageHost(ServerHost, Protocol):
-    """Interface of a vehicle or component that its protocol servers use."""
+    """A vehicle or component as its protocol servers see it."""
 
     faults: Faults
 

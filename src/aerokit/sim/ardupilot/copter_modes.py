@@ -69,7 +69,7 @@ class AutoYaw:
         return self._control == self._look_at_roi
 
     def turn(self, rate: float) -> None:
-        """Turn continuously, in radians per second."""
+        """Turn continuously at ``rate`` radians per second."""
         self._rate = rate
         self._control = self._turn
 
@@ -121,7 +121,7 @@ class AutoYaw:
 
 
 class CopterHost(ArduPilotVehicle):
-    """Interface of a copter that its modes and failsafes use."""
+    """A copter as its modes and failsafes see it."""
 
     def reset_controllers(self) -> None:
         self.yaw: AutoYaw = AutoYaw(self)

@@ -114,7 +114,7 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def battery_is_low(self) -> bool:
-        """True after the battery was low or critical while the vehicle was armed."""
+        """True after the battery of the armed vehicle was low or critical once, even if it has recovered."""
         return self.battery.level > 0
 
     @property

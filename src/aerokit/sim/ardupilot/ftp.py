@@ -135,7 +135,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.refuse(MavFtpErr.FAIL)
 
     def _path(self, request: FtpPacket) -> str:
-        """Return the path in the request, whose size must be that of the path, with or without the final NUL."""
+        """Return the path in the request. Its length, with or without the final NUL, must be the request's ``size``."""
         length = len(request.data.partition(b"\0")[0])
         if request.size == 0 or request.size - length not in (0, 1):
             raise Refused(MavFtpErr.INVALIDDATASIZE)

@@ -161,7 +161,7 @@ class ArduPilotGimbal:
             self.mode = mode
 
     def point(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn to these angles in degrees. The limits of the gimbal apply."""
+        """Turn to these angles in degrees. They are limited here, except a yaw from north, which `angles` limits."""
         if not from_north:
             yaw = self._limited("YAW", yaw - 360.0 if yaw > 180.0 else yaw)
         self._target = MountTarget(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
@@ -180,7 +180,7 @@ class ArduPilotGimbal:
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def look_at(self, place: Ned | None) -> None:
-        """Point at a place. None returns to the default mode."""
+        """Point at a place. None returns to the default mode, unless another mode was selected meanwhile."""
         self._region = place
         if place is not None:
             self.set_mode(MavMountMode.GPS_POINT)

@@ -313,7 +313,7 @@ _ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 
 
 class ArduPilotHost(SimulatedAutopilot):
-    """Interface of a simulated ArduPilot for its parts. `ArduPilotVehicle` implements it."""
+    """A simulated ArduPilot as its parts see it. `ArduPilotVehicle` implements this interface."""
 
     KIND: ClassVar[Kind]
     """The kind of firmware, which selects the parameter table."""

@@ -396,7 +396,7 @@ def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
 
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
-    """Execute DO_SET_HOME of a mission: set home to the position of the item or of the vehicle (param 1 is 1)."""
+    """Execute DO_SET_HOME with the item's position, or the vehicle's if param 1 is 1 or the item has no position."""
     point: Ned | None = vehicle.motion.place
     if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)

@@ -79,7 +79,7 @@ class ArduPilotNavigation:
 
     @property
     def position(self) -> GlobalPoint | None:
-        """Estimated global position; None before the first GPS fix."""
+        """Estimated global position; None while there is neither a GPS fix nor an origin of the estimator."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX and self.origin is None:
             return None
         return self.frame.to_global(*self._vehicle.motion.place)

@@ -104,7 +104,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
 class SimulatedPlane(PlaneHost):
     """ArduPlane, as far as a client can observe it. `FixedWing` is the motion model.
 
-    Takes the arguments of `ArduPilotVehicle`. The plane starts on a runway along its heading. Not simulated: lifting
+    Takes the arguments of `ArduPilotVehicle`. The plane starts on a runway, facing along it. Not simulated: lifting
     rotors, parachutes.
     """
 

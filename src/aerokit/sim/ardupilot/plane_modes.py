@@ -13,7 +13,7 @@ from aerokit.sim.vehicle_motion import FixedWing
 
 
 class PlaneHost(ArduPilotVehicle):
-    """Interface of a plane that its modes and failsafes use."""
+    """A plane as its modes and failsafes see it."""
 
     def make_motion(self, wind: SimulatedWind | None) -> Motion:
         self.wing: FixedWing = FixedWing(self.rng, wind=wind)
@@ -56,7 +56,7 @@ class PlaneHost(ArduPilotVehicle):
         return self.parameters["AIRSPEED_MIN"] <= airspeed <= self.parameters["AIRSPEED_MAX"]
 
     def lift_off(self) -> None:
-        """Set ``is_landed`` to False at the start of a take-off roll."""
+        """Begin a take-off, if the plane is landed. ``is_landed`` is False from the start of the roll."""
         if self.is_landed:
             self._read_limits()
             self.is_landed: bool = False

@@ -25,7 +25,7 @@ _NEEDS_LOCATION = 1
 
 
 class RoverArming(ArduPilotArming[RoverHost]):
-    """ArduRover's arming checks. Only modes that use a position require one, unless ARMING_NEED_LOC is set."""
+    """ArduRover's arming checks. A position is needed only in modes that use one, or if ARMING_NEED_LOC is set."""
 
     def ahrs_reasons(self) -> Sequence[str]:
         return ()  # `position_reasons` includes these checks, because ArduRover runs them after the GPS checks.

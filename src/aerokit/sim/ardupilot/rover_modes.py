@@ -19,7 +19,7 @@ _FULL_STEERING_RAD_S = math.radians(90.0)
 
 
 class RoverHost(RoverSubVehicle):
-    """Interface of a rover that its modes and failsafes use."""
+    """A rover as its modes and failsafes see it."""
 
     motion: GroundMotion  # pyright: ignore[reportIncompatibleVariableOverride]
 

@@ -20,7 +20,7 @@ _FULL_STICK_TURN_RAD_S = math.radians(90.0)
 
 
 class SubHost(RoverSubVehicle):
-    """Interface of a submarine that its modes and failsafes use."""
+    """A submarine as its modes and failsafes see it."""
 
     display_names: cycle[str]
     """Names of `DISPLAY_VALUES` in the order in which they are sent."""

@@ -85,7 +85,7 @@ class SimulatedComponent:
         self._streams: MessageStreams = MessageStreams(self)
 
     def commands(self) -> dict[int, CommandHandler]:
-        """Return the handlers of the component's commands by MAV_CMD, without the message requests."""
+        """Return the handlers of the component's commands by MAV_CMD. `join` adds those of the message requests."""
         return {}
 
     def builders(self) -> dict[int, Builder]:
@@ -164,7 +164,7 @@ class SimulatedComponent:
             self.vehicle.send(message, channel, (self.system_id, self.component_id))
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT of at most 50 characters."""
+        """Send a STATUSTEXT with the first 50 characters of the text."""
         self.send(Statustext(severity, text[:50], id=0, chunk_seq=0))
 
     def call_later(self, delay: float, action: Callable[[], None]) -> None:

@@ -22,7 +22,7 @@ _HORIZONTAL, _GPS_POSITION = 1, 1
 
 
 class Px4External:
-    """The newest measurement of each kind. Only external vision (EKF2_EV_CTRL) and landing targets have effects."""
+    """Keeps the newest measurement of each type. Only vision (EKF2_EV_CTRL) and landing targets have effects."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4

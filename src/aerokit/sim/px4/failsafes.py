@@ -131,7 +131,7 @@ _INTERVAL_S = 0.2
 
 
 class FailsafeAction(IntEnum):
-    """Failsafe actions by severity."""
+    """Failsafe actions, from the mildest to the most severe."""
 
     NONE = 0
     WARN = 1

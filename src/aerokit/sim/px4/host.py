@@ -121,7 +121,7 @@ class Px4ExternalInterface(Protocol):
 
 
 class Px4Host(SimulatedAutopilot):
-    """Interface of a simulated PX4 for its modules. `Px4Vehicle` implements it."""
+    """A simulated PX4 as its modules see it. `Px4Vehicle` implements this interface."""
 
     VEHICLE_TYPE: ClassVar[int]
 

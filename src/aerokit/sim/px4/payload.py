@@ -205,7 +205,7 @@ def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _id_in_control(requested: int, present: int, own: int, sender: int) -> int:
-    """Return the id in control after a request for an id: −2 is the own id, −3 releases control, −1 changes nothing."""
+    """Return the new id in control. -2 selects ``own``, -3 releases control if ``sender`` has it, -1 keeps it."""
     if requested == _SELF:
         return own
     if requested == _RELEASE:

@@ -332,7 +332,7 @@ _AMPERES_AT_FULL = 20.0
 class SimulatedPx4Plane(SimulatedPx4):
     """PX4 plane (MAV_TYPE 1, airframe 10041). `FixedWing` is the motion model. See `SimulatedPx4` for the arguments.
 
-    The plane takes off from a runway along its heading. Where a multicopter hovers, it circles at NAV_LOITER_RAD. RTL
+    The plane takes off straight ahead, from a runway. Where a multicopter hovers, it circles at NAV_LOITER_RAD. RTL
     ends in a circle above home, without a landing (RTL_LAND_DELAY is -1). LAND descends in circles, whereas a mission
     ends with a straight glide path, and must contain a landing (MIS_TKO_LAND_REQ). OFFBOARD circles a position. Sticks
     control bank, climb and speed in every manual mode. The plane is not disarmed automatically before take-off.
