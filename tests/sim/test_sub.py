@@ -15,6 +15,7 @@ from aerokit.mavlink.enums import MavModeFlag, MavState, SubMode
 from aerokit.missions import Mission
 from aerokit.missions.navigation import waypoint
 from aerokit.sim import SimulatedSub, simulated_link
+from aerokit.sim.ardupilot.host import RC_THROTTLE
 from aerokit.sim.ardupilot.telemetry import heartbeat
 from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
@@ -128,6 +129,17 @@ async def test_surface_mode_ends_in_alt_hold() -> None:
         assert sub.mode.number == SubMode.ALT_HOLD
         assert sub.motion.down < 0.3
         assert sub.is_armed
+
+
+async def test_disarmed_sub_draws_no_current() -> None:
+    async with connected() as (sub, vehicle):
+        await vehicle.arm()
+        sub.rc.override({RC_THROTTLE: 1900})
+        await anyio.sleep(0.5)
+        assert sub.battery.current_a > 0.0
+        await vehicle.disarm()
+        await anyio.sleep(1.0)
+        assert sub.battery.current_a == 0.0
 
 
 @pytest.mark.exhaustive

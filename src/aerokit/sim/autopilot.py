@@ -195,7 +195,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         raise NotImplementedError
 
     def on_speedup(self, speedup: float) -> None:
-        """Multiply the timeouts that are no parameters; see `aerokit.sim.kinds.scale_timeouts`."""
+        """Called by `aerokit.sim.kinds.scale_timeouts`: multiply the timeouts that no parameter sets."""
 
     def open_channel(self, *, version: int = 2) -> Channel:
         """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""

@@ -123,11 +123,11 @@ class Faults:
         return self.loss_incoming > 0.0 and rng.random() < self.loss_incoming
 
     def repeat_ack(self, command: int, count: int = 2, *, times: int | None = None) -> None:
-        """Execute a MAV_CMD and acknowledge it ``count`` times."""
+        """Execute the next ``times`` commands of this MAV_CMD (None: all), and acknowledge each ``count`` times."""
         self.commands[command] = CommandFault(times, acks=count)
 
     def delay_ack(self, command: int, seconds: float, *, times: int | None = None) -> None:
-        """Execute a MAV_CMD at once and acknowledge it ``seconds`` later."""
+        """Acknowledge the next ``times`` commands of this MAV_CMD (None: all) ``seconds`` after their execution."""
         self.commands[command] = CommandFault(times, delay_s=seconds)
 
     def report_progress(

@@ -52,9 +52,9 @@ _ROUNDING_OFFSET = 0.01
 class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
-    Without ``errors``, a request with an unknown name, or with NaN or infinity as value, is not answered. This is the
-    behaviour of the development version of 4.7. With ``errors``, as in the released version, the answer is PARAM_ERROR,
-    and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
+    With ``errors``, as in the released version of 4.7, a request with an unknown name or a value of NaN or infinity is
+    answered by PARAM_ERROR, and PARAM_SET is confirmed on the sender's port in addition to the broadcast. Without
+    ``errors``, as in the development version of 4.7, such a request has no answer, and PARAM_SET only the broadcast.
 
     One read request is served each millisecond. Up to 20 requests wait in a queue, and further requests are lost.
     The banner texts are sent before a list.

@@ -56,7 +56,7 @@ class SimParameter:
 class SimParameters:
     """Parameters by name, in the vehicle's order. They survive a reboot.
 
-    A value is stored as the vehicle stores it: rounded to a 32-bit float, or to an integer within the type's range.
+    A value is stored in the type of the parameter: as a 32-bit float, or truncated to an integer within the range.
     """
 
     def __init__(self, rows: Iterable[SimParameter]) -> None:
@@ -188,7 +188,7 @@ def _switch_of(line: str) -> str | None:
 def _lines_and_switches(
     text: str, used: frozenset[str], count: int | None
 ) -> tuple[dict[str, SimParameter | str], dict[str, str]]:
-    """Return the selected lines and their switches, both by parameter name."""
+    """Select lines of a table. Return them, and their switches (see `SimParameter`), both by parameter name."""
     selected = text.split() if count is None else _select_lines(text.split(), used, count)
     lines: dict[str, SimParameter | str] = {line.partition(",")[0]: line for line in selected}
     switches = {name: _switch_of(str(line)) for name, line in lines.items()}

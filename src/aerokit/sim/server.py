@@ -34,8 +34,9 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. If the loop was blocked, the server catches up with the missed time if ``speedup`` is 1. At other speeds it
-    skips all but half a simulated second, so that vehicles do not detect a link loss while the client could not send.
+    second. If the loop was blocked, the server simulates the missed time afterwards: all of it if ``speedup`` is 1, at
+    other speeds at most half a simulated second, so that vehicles do not detect a link loss while the client could not
+    send.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
@@ -233,7 +234,7 @@ class SimulatorServer:
 
     def _flush(self) -> None:
         """Write the datagrams of all vehicles to their links."""
-        # On the real clock, the frames of all vehicles share datagrams, so that fewer are sent. On virtual time, each
+        # On the real clock, the frames of many vehicles share datagrams, so that fewer are sent. On virtual time, each
         # vehicle sends its own datagrams.
         is_real_time = self._remove_source is None
         for port in self._ports:
@@ -295,7 +296,7 @@ class _Port:
                 channel.reader = self.reader
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
-        """Return the datagrams to send. With ``together``, the frames of many vehicles are joined, as by a router."""
+        """Return the datagrams to send. With ``together``, more than ten vehicles share them, as behind a router."""
         active = [channel for channel in self.channels if channel.has_output]
         if not active:
             return []

@@ -281,7 +281,7 @@ class SimulatedVehicle:
         self.call_at(start, repeat)
 
     def set_ticking(self, ticking: bool) -> None:
-        """Start or stop calling ``tick`` at 50 Hz, and in steady flight at 8 Hz or more."""
+        """Start or stop the calls of `tick`. Their rate is 50 Hz, and in steady flight at least 8 Hz."""
         is_ticking = self._first_tick_at != math.inf
         if ticking == is_ticking:
             return
@@ -296,7 +296,7 @@ class SimulatedVehicle:
         self._next_tick_at = round(next_tick * NS_PER_S) / NS_PER_S if next_tick < math.inf else math.inf
 
     def _tick_until(self, now: float) -> None:
-        """Advance to ``now`` by a single tick that stands for all ticks since the last one."""
+        """Execute all ticks that are due at ``now`` in one call of `tick`, and schedule the next tick."""
         if now < self._first_tick_at:
             return
         ticks = _whole_ticks(now - self._first_tick_at) - self._ticks_done

@@ -206,7 +206,8 @@ _Accelerometers = PreflightCalibrationAccelerometer
 class Calibrations:
     """Sensor calibrations. Those of ``compasses`` and ``accelerometers`` require that the vehicle is turned by hand.
 
-    PREFLIGHT_CALIBRATION is acknowledged at the end of the calibration, or when the first position is requested.
+    PREFLIGHT_CALIBRATION is acknowledged at the end of the calibration. For the full calibration of the accelerometers,
+    it is acknowledged when the first pose is requested.
     """
 
     def __init__(self, vehicle: ArduPilotHost) -> None:

@@ -22,7 +22,7 @@ _TARGET_TIMEOUT_S = 2.0
 
 
 class ArduPilotExternal:
-    """The newest measurement of each kind. Only external navigation (VISO_TYPE) and landing targets have effects."""
+    """The latest measurement of each message type. Only poses (with VISO_TYPE) and landing targets have effects."""
 
     def __init__(self, vehicle: ArduPilotHost) -> None:
         self._vehicle = vehicle
@@ -46,7 +46,7 @@ class ArduPilotExternal:
 
     @property
     def navigation_age_s(self) -> float:
-        """Seconds since the last pose; infinity before the first pose."""
+        """Seconds since the last message of external navigation; infinity before the first one."""
         return self._vehicle.now - self._navigation_at
 
     def velocity_to_target(self) -> tuple[float, float]:

@@ -19,7 +19,7 @@ Point = tuple[float, float]
 
 
 class FenceZones:
-    """Inclusion and exclusion zones of an uploaded fence, in metres north and east of the world frame."""
+    """Inclusion and exclusion zones of an uploaded fence. A `Point` is (north, east) in the world frame, in metres."""
 
     def __init__(self, items: Sequence[MissionItem], frame: LocalFrame) -> None:
         self._inclusions: list[PolygonZone | CircleZone] = []

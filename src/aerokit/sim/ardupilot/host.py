@@ -165,7 +165,7 @@ class ArduPilotMotors:
 
     @property
     def current_a(self) -> float:
-        """Current in amperes of motors and electronics."""
+        """Current in amperes of motors and electronics; 0 while disarmed."""
         electronics_a = _ELECTRONICS_A if self.is_armed else 0.0
         return electronics_a + self.throttle * _AMPERES_AT_FULL
 

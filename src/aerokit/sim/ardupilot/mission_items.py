@@ -92,7 +92,7 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the MAV_FRAME of a downloaded item that was uploaded with ``frame``; None if it is refused."""
+    """Return the MAV_FRAME that a download reports after an upload with ``frame``. None: ``frame`` is refused."""
     return _DOWNLOADED_FRAMES.get(frame)
 
 

@@ -253,7 +253,7 @@ class ArduPilotMissionServer(MissionServer):
         self._acknowledge(client, kind, result, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
-        """Set the current item. Answer MISSION_CURRENT with the requested index, even if another item runs then."""
+        """Set the current item. Answer MISSION_CURRENT with the requested index, even if the mission skips it."""
         if self._vehicle.mission.set_current(request.seq):
             self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 

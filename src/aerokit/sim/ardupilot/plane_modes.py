@@ -179,7 +179,7 @@ _NAVIGATES = MavModeFlag.GUIDED_ENABLED | MavModeFlag.STABILIZE_ENABLED
 
 
 class PlaneModeBase(ArduPilotMode):
-    """Base of ArduPlane's modes. All of them can be entered without a position."""
+    """Base of ArduPlane's modes. All of them can be entered while the vehicle does not know its position."""
 
     vehicle: PlaneHost
     needs_position = False

@@ -168,7 +168,7 @@ class RoverSubVehicle(ArduPilotVehicle):
         return {**common_commands(self), Cmd.DO_CHANGE_SPEED: self._change_speed}
 
     def _change_speed(self, command: ReceivedCommand) -> int:
-        """Handle DO_CHANGE_SPEED, which sets a speed limit of the present mode."""
+        """Handle DO_CHANGE_SPEED, which sets the speed at which the present mode moves to a place."""
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
             return MavResult.DENIED
         is_horizontal = command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)

@@ -230,7 +230,7 @@ class SubMotors(ArduPilotMotors):
 
     @property
     def current_a(self) -> float:
-        follows_stick = self.vehicle.mode.has_manual_throttle
+        follows_stick = self.is_armed and self.vehicle.mode.has_manual_throttle
         thrust = abs(2.0 * self.throttle - 1.0) if follows_stick else self.throttle
         return float(thrust**2.7) * _AMPERES_AT_FULL
 
@@ -250,8 +250,7 @@ class SimulatedSub(SubHost):
 
     Takes the arguments of `ArduPilotVehicle`. ``home`` is at the surface, so altitudes above home are negative. The
     vehicle has 1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the
-    sticks), GUIDED, AUTO and SURFACE. A mode that needs no position can be armed without a position. Take-off is
-    UNSUPPORTED.
+    sticks), GUIDED, AUTO and SURFACE. By default, the vehicle can be armed without a position. Take-off is UNSUPPORTED.
 
     Not simulated: currents, and CIRCLE, SURFTRAK and MOTORDETECT, which behave like ALT_HOLD. A reboot moves the
     vehicle to the surface.

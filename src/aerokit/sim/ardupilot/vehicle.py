@@ -285,7 +285,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a text; after the boot, queue it, because the firmware sends the reason of a refusal last."""
+        """Send a text: during the boot at once, later after the answer to the present command, like the firmware."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:

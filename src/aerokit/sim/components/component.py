@@ -93,7 +93,7 @@ class SimulatedComponent:
         return {}
 
     def listen(self) -> None:
-        """Register handlers of other messages with `on`."""
+        """Called when the component joins a vehicle: register handlers of messages other than commands with `on`."""
 
     def start(self) -> None:
         """Called at power-on: reset, and start the default streams."""

@@ -213,7 +213,7 @@ class Px4StreamRates:
         return MavResult.ACCEPTED
 
     def on_requested(self, channel: Channel, message_id: int) -> None:
-        """Record a request of a single message. MESSAGE_INTERVAL then reports the message as sent on change."""
+        """Called for REQUEST_MESSAGE. A message that is off is then reported as sent on change in MESSAGE_INTERVAL."""
         intervals_us = self._intervals_us.get(channel, {})
         if intervals_us.get(message_id) == _OFF:
             intervals_us[message_id] = _ON_CHANGE

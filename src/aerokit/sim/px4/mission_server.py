@@ -42,7 +42,7 @@ class TransferState(Enum):
 
 @dataclass(eq=False)
 class _Link(ListUpload):
-    """State of the latest upload or download of a link, which the firmware also uses after the end of the transfer."""
+    """Latest upload or download of a link. The firmware also uses these values after the end of the transfer."""
 
     state: TransferState = TransferState.IDLE
     opaque_id: int = 0  # checksum of the items received so far
