@@ -3281,8 +3281,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def start_video(self, *, status_hz: float = 1.0, timeout: float = 5.0) -> None:
         """Start recording (MAV_CMD_VIDEO_START_CAPTURE); returns when the camera reports that it records.
 
-        If the camera does not report its status, like a camera attached to the autopilot, the call returns when the
-        camera has accepted the command. If you cancel the call, the camera may go on to record;
+        If the camera does not report its status, the call returns when the camera has accepted the command. This
+        applies to all cameras attached to the autopilot. If you cancel the call, the camera may still start to record;
         the block of :meth:`video` stops it in any case.
 
         Args:

@@ -170,7 +170,7 @@ class CaptureLog:
         self.record(message, capture_of(message, self._link.number or 0, self._link.now(), self._link.telemetry))
 
     def record(self, message: Message, capture: Capture) -> None:
-        """Store the capture that a message reports; `capture_of` has decoded it when the message arrived."""
+        """Store ``capture``, which is the result of `capture_of` for ``message``."""
         if isinstance(message, m.CameraImageCaptured):
             self._has_images = True
             self._add(message, capture)

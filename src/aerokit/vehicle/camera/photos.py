@@ -415,7 +415,11 @@ class PhotoInterval:
             self._next_index = following_index
 
     async def _check_silence(self, silent_checks: int) -> None:
-        """Request missed captures, or raise the error if the camera has ended the series or reports nothing more."""
+        """Request the next capture if the camera's status shows that its report was lost.
+
+        Otherwise, raise OperationRejected if the camera has ended the series, or OperationTimeout if this is the last
+        of ``MAX_SILENT_CHECKS`` checks since a capture arrived.
+        """
         status = await self._shutter.request_status(2.0 * CHECK_INTERVAL_S)
         self._collect()
         is_ahead = status is not None and self._next_index is not None and status.image_count > self._next_index

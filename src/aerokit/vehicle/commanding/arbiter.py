@@ -130,8 +130,8 @@ class CommandArbiter:
     ) -> Order:
         """Create a steering order, which may make the vehicle enter ``modes``.
 
-        It supersedes the previous steering order, and the posted orders about ``subjects``: orders for which the
-        program does not wait. With ``ends_flight``, a failsafe does not end the order.
+        It supersedes the previous steering order, and all orders about ``subjects`` that were created by :meth:`post`.
+        With ``ends_flight``, a failsafe does not end the new order.
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
@@ -372,7 +372,7 @@ class CommandArbiter:
     def _create_order(
         self, modes: Collection[Mode], ending_topics: Sequence[Topic], ends_flight: bool = False
     ) -> Order:
-        """Create an order that also accepts the modes that earlier orders may still lead to."""
+        """Create an order that does not end if an earlier order still changes the mode."""
         newest, present_mode = self.newest, self._telemetry.mode.latest
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at

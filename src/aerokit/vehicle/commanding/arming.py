@@ -384,7 +384,8 @@ class ArmingActions(VehicleBase):
     async def _await_reboot(self, reboots_before: int) -> None:
         """Poll the time since boot until it shows a reboot.
 
-        The polls are frequent at first, because a fast simulation soon exceeds its uptime from before the reboot.
+        The polls are frequent at first: a fast simulation soon has a longer uptime than before the reboot, and
+        the reboot can then no longer be recognised.
         """
         started = self.connection.now()
         next_request_at = started

@@ -392,9 +392,9 @@ class ArmCleanup:
         """Return True if this order, and not a pilot, has armed the vehicle. Called when HEARTBEAT has reported armed.
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
-        acknowledgement, the order armed it if a HEARTBEAT within `ARM_HEARTBEAT_DELAY_S` reports armed and the order
-        has not ended. ``mode`` is the mode in which the order was abandoned, because an abandoned order does not notice
-        a change of the mode.
+        acknowledgement, the order armed it if HEARTBEAT reported armed at most `ARM_HEARTBEAT_DELAY_S` after the order
+        was given, and the order has not ended. ``mode`` is the mode in which the order was abandoned. An abandoned
+        order does not notice a change of the mode, so it also counts as ended if the vehicle is no longer in ``mode``.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)

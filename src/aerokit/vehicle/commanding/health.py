@@ -74,7 +74,10 @@ class Health:
         return in_order([*missing, *self._outdated_states()], [*texts, *self._health_problems(), *unexplained])
 
     def _recent_texts(self) -> list[str]:
-        """Return the vehicle's texts about its failing checks, since it was last requested to run them."""
+        """Return why checks fail, from recent status texts; empty if they pass or the vehicle is armed.
+
+        Texts from before the last request to run the checks, or from before the link was restored, are ignored.
+        """
         if not self._checks_fail() or self._telemetry.is_armed:
             return []
         now = self._session.connection.now()

@@ -144,8 +144,8 @@ class SimpleOrder(Snapshot):
     ) -> None:
         """Send the command and wait for a status text that reports its effect.
 
-        ``is_done(text, seconds_since_ack)`` is called for each text so far, again and again. The seconds are from the
-        acknowledgement until now, not until the text arrived. Only for orders without ``effect``.
+        ``is_done(text, seconds_since_ack)`` is called repeatedly with every text received so far. It may thus accept an
+        old text once enough time has passed since the acknowledgement. The order must have no ``effect``.
 
         Raises as :meth:`send`; also OperationRejected if ``is_refusal(text)``.
         """

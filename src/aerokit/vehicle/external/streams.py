@@ -235,7 +235,7 @@ class MeasurementStream(Generic[MeasurementT]):
         self._timesync_answers.close()
 
     async def _check_support(self) -> dict[str, float]:
-        """Return the parameters that select these measurements. Raise an error if the vehicle does not use them."""
+        """Return the parameters that decide whether the vehicle uses these measurements; raise if it ignores them."""
         firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
         measurement = self._kind.replace("_", " ")
         if rule is None:

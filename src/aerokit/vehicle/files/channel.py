@@ -103,7 +103,7 @@ class FileChannel:
         offset: int = 0,
         data: bytes | None = None,
     ) -> FtpMessage:
-        """Send a request with a single reply, within an operation; ``data`` defaults to the path."""
+        """Send a request with a single reply; only in an :meth:`operation` block. ``data`` defaults to the path."""
         request = FtpRequest(
             self.client,
             opcode,
@@ -123,7 +123,10 @@ class FileChannel:
         *,
         idle_timeout_s: float,
     ) -> T:
-        """Open a file, use it and close it, within an operation. If the vehicle closes the file early, start again."""
+        """Open a file, await ``use(file)`` and close the file; only in an :meth:`operation` block.
+
+        If the vehicle itself closes the file, open it again and call ``use`` again.
+        """
         for attempt in range(1, MAX_OPEN_ATTEMPTS + 1):
             file = await self._open(opcode, path, idle_timeout_s)
             try:
@@ -245,7 +248,7 @@ class LogChannel:
     async def list(
         self, idle_timeout_s: float, only_id: int | None, *, max_unanswered: int | None
     ) -> tuple[LogEntry, ...]:
-        """Request all entries of the log list, or the entry of one log, within an operation."""
+        """Request all entries of the log list, or the entry of one log; only in an :meth:`operation` block."""
         transfers = self._transfers
         exchange = LogList(
             transfers.system_id,
@@ -305,9 +308,9 @@ class LogChannel:
                     raise
 
     def _end(self) -> None:
-        """Send LOG_REQUEST_END. The next operation waits until a background task has received the confirmation.
+        """Send LOG_REQUEST_END, and repeat it in a background task until it is confirmed or the task gives up.
 
-        It also continues when this task has given up.
+        The next operation waits until this task has ended.
         """
         transfers = self._transfers
         # LOG_REQUEST_END is sent at once. The background task sends it only to repeat it.

@@ -439,7 +439,7 @@ async def _have_numbers_wrapped(files: Files, directory: str, highest: int, idle
     """Return True if ArduPilot has begun to number its files from 1 again.
 
     The file with the lowest number is then not the oldest. LASTLOG.TXT contains the number of the newest log.
-    ``highest`` is the highest number of a file.
+    ``highest`` is the highest number among the log files in ``directory``.
     """
     try:
         text = await files.read(f"{directory}/LASTLOG.TXT", idle_timeout_s=idle_timeout_s)

@@ -78,7 +78,7 @@ class ReleaseCommand:
     def send_soon(self, *, was_just_sent: bool = False) -> None:
         """Send the command without waiting, e.g. when a block exits by an error or cancellation.
 
-        If it ``was_just_sent``, send it only to repeat it.
+        With ``was_just_sent``, the caller has already sent the command: it is sent again only if no ack arrives.
         """
         if not self._session.is_open or not self._is_still_due():
             return
@@ -87,9 +87,9 @@ class ReleaseCommand:
             self._send()
 
         async def send_until_acknowledged() -> None:
-            """Wait for the acknowledgement, and send the command once more if the target was silent.
+            """If the vehicle is silent, send the command at its next HEARTBEAT. Then wait for the acknowledgement.
 
-            If the vehicle is silent now, the command is first sent at the vehicle's next HEARTBEAT.
+            If none arrives because the gimbal manager is silent, send the command again at its next HEARTBEAT.
             """
             with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
                 if not can_send_now:
@@ -115,7 +115,7 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
-        """Wait for the acknowledgement of the command that was just sent; retry it while it is still due."""
+        """Wait for the ack of the command that was just sent. Each retry first checks `_is_still_due`."""
         with self._orders.context.arbiter.auxiliary_order() as order:
             await self._orders.context.sender.send_long(
                 order,

@@ -148,7 +148,7 @@ class GimbalRegistry:
         return device
 
     def _on_device(self, message: GimbalDeviceAttitudeStatus) -> None:
-        """Set the attitude of the gimbal, and of the placeholder if this is the first gimbal that reports one."""
+        """Set the attitude of the gimbal, and also that of `placeholder` if the gimbal is `first_reporting`."""
         device = self._device_of(message, message.gimbal_device_id)
         if device is None:
             return

@@ -145,10 +145,10 @@ class PlanContext:
             self._current = frame
 
     def _on_ack(self, ack: MissionAck) -> None:
-        """Forget a plan when the vehicle accepts one of another station. This is received only on a shared link.
+        """Forget a plan when the vehicle confirms that another station has replaced or cleared it.
 
-        Another station may have the same ids as this program (255 and 190 by default), so an answer outside of a
-        transfer is not for this program either.
+        Such a MISSION_ACK arrives only on a shared link. The other station may use the same ids as this program (255
+        and 190 by default), so a MISSION_ACK to these ids counts too, unless this program is transferring a plan.
         """
         frame, connection = ack.received_frame, self.session.connection
         is_from_autopilot = frame is not None and self.session.telemetry.accepts(frame)
@@ -256,10 +256,10 @@ class MissionTracker:
         self._on_state(reported.state)
 
     def _detect_second_approach(self, before: int | None, current: int | None) -> None:
-        """Record whether the vehicle again flies to the item that it reached last.
+        """Detect that the item that was reached last is current once more, so the vehicle flies to it again.
 
-        PX4 may report an item as reached just before the item becomes the current one. A second approach therefore only
-        counts some time after the item was reached, or if the vehicle comes from a later item.
+        PX4 may report an item as reached just before it reports the item as current, and this is no second approach.
+        The change to this item therefore counts only some time after it was reached, or if a later item was current.
         """
         if current is None or current != self.reached:
             return

@@ -59,9 +59,9 @@ class MissionStallDetector:
         self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:
-        """Return a clause about a standstill that is a fault.
+        """Return the part of an error text that describes the fall or the stall; None if there is neither.
 
-        None if the vehicle moves, may stand still here, is paused or is disarmed.
+        A vehicle has not stalled if it may stand still at its current item, or is paused or disarmed.
         """
         progress, current = self._tracker.progress.latest, self._tracker.current.latest
         is_paused = self._is_paused() or (progress is not None and progress.state == MissionState.PAUSED)

@@ -26,7 +26,7 @@ TIMESTAMP_TICKS_PER_S = 100_000
 
 
 async def set_up_signing(session: VehicleSession, signing: Signing | None, timeout: float) -> None:
-    """Send the key, or None to remove it, until the vehicle has accepted; the body of `Vehicle.setup_signing`."""
+    """Send SETUP_SIGNING until the vehicle signs with the key, or no longer signs; see `Vehicle.setup_signing`."""
     _check_vehicle(session)
     connection, started = session.connection, session.connection.now()
     with connection._gate.key_handover(signing, session.system_id, session.component_id) as has_accepted:

@@ -108,8 +108,8 @@ class Transfers:
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
 
-        The text of a time-out includes a description of the link. :class:`OperationTimeout` is also raised after
-        ``timeout`` seconds. Cancellation ends the exchange at once.
+        Cancellation ends the exchange at once. :class:`OperationTimeout` is raised after ``timeout`` seconds, or when
+        the exchange itself times out; the error text describes the link.
         """
         if self.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
@@ -154,7 +154,7 @@ class Transfers:
     def command_in_background(self, command: int, *params: float, was_just_sent: bool = False) -> None:
         """Send a command without waiting for its ack. The command is optional, so a failure is ignored.
 
-        If it ``was_just_sent``, send it only to repeat it.
+        With ``was_just_sent``, the caller has already sent the command: it is sent again only if no ack arrives.
         """
         send = self._send_command
 

@@ -233,7 +233,7 @@ class VehicleWatch:
         return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
-        """Restart the detection with the first time after the reboot, and report the reboot."""
+        """Report a reboot. The next one is detected relative to ``milliseconds``, the present time of ``clock``."""
         now = self._connection.now()
         # The times from before the reboot are discarded. Compared with them, later messages would show the same reboot
         # again.

@@ -90,7 +90,10 @@ class StatusTextAssembler:
                 self._failsafes.append(text)
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
-        """Add a chunk to its text. Yield the text if it is complete, and before it a text whose end was lost."""
+        """Add a chunk to its text, and yield the text if this completes it.
+
+        If the chunk shows that the end of the previous text with this id was lost, yield that text first, truncated.
+        """
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
