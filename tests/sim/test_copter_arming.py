@@ -82,6 +82,31 @@ def test_raised_throttle_prevents_arming_in_stick_modes() -> None:
     assert client.command(ARM, 1) == MavResult.ACCEPTED
 
 
+def test_raised_throttle_is_ignored_without_radio_check() -> None:
+    copter, client = ready_copter()
+    copter.parameters["ARMING_CHECK"] = 8.0
+    copter.rc[2] = 1700
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+
+
+def test_lost_gps_is_ignored_without_gps_check() -> None:
+    copter, client = ready_copter()
+    copter.parameters["ARMING_CHECK"] = 64.0
+    set_mode(client, CopterMode.GUIDED)
+    copter.faults.gps_lost = True
+    client.run(1.0)
+    assert copter.arming.gps_reasons() == ("GPS 1: Bad fix",)
+    assert client.command(ARM, 1) == MavResult.ACCEPTED
+
+
+def test_mode_must_be_armable_even_without_checks() -> None:
+    copter, client = ready_copter()
+    copter.parameters["ARMING_CHECK"] = 0.0
+    set_mode(client, CopterMode.RTL)
+    assert client.command(ARM, 1) == MavResult.FAILED
+    assert client.texts[-1] == "Arm: RTL mode not armable"
+
+
 def test_prearm_failures_are_reported_periodically_and_on_request() -> None:
     copter, client = ready_copter()
     assert client.command(MavCmd.RUN_PREARM_CHECKS) == MavResult.ACCEPTED

@@ -26,9 +26,9 @@ _BLOCK = 90
 
 @dataclass(frozen=True)
 class SimulatedLog:
-    """A log file of a simulated vehicle, which does not describe a flight.
+    """A log file of a simulated vehicle. Its content does not describe a flight.
 
-    The content is `SAMPLE_LOG`, followed by pseudo-random bytes that depend on ``seed``, or on size and time.
+    The content is `SAMPLE_LOG`, then pseudo-random bytes that depend on ``seed`` or, if that is None, on size and time.
     """
 
     size: int

@@ -84,7 +84,7 @@ class FixedWing(Motion):
         self.bank_and_climb(airspeed, bank, climb)
 
     def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
-        """Fly towards a point and over it."""
+        """Fly towards a point, without slowing down or circling there."""
         course = math.atan2(east - self.east, north - self.north)
         self.head(course, airspeed, self.climb_to(down))
 

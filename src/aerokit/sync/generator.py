@@ -39,7 +39,7 @@ WIDTH = 120  # the line length of `ruff format`; the output has its style
 
 
 def outer_name(annotation: ast.expr | None) -> str:
-    """Return the name in an annotation, without its subscript."""
+    """Return the name of a type without its subscript: ``list`` for ``list[int]``. Empty if it is not a plain name."""
     while isinstance(annotation, ast.Subscript):
         annotation = annotation.value
     return annotation.id if isinstance(annotation, ast.Name) else ""

@@ -97,7 +97,7 @@ class LoopThread:
         return self._run(True, True, function, *args, **kwargs)
 
     def run_exit(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Like :meth:`run`, for the exit of a block: if Ctrl-C comes before it begins, it begins and is cancelled."""
+        """Like :meth:`run`, for the exit of a block: the function starts even after Ctrl-C, which then cancels it."""
         return self._run(False, True, function, *args, **kwargs)
 
     def _run(
@@ -319,7 +319,7 @@ class _AsyncContext(AbstractAsyncContextManager[T]):
 
 
 class _Calls:
-    """Calls of other threads that run on the loop. Does not refer to the LoopThread."""
+    """Runs the calls of other threads on the loop. Has no reference to the LoopThread."""
 
     def __init__(self) -> None:
         self.context = contextvars.Context()

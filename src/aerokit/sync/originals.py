@@ -20,7 +20,7 @@ class Twin:
     """A twin class to generate.
 
     Attributes:
-        path: the asynchronous class.
+        path: dotted path of the asynchronous class, with its module.
         base: the hand-written base class in ``blocks.py``.
         inherits: a generated twin that it inherits from; its members are not generated again.
         only: generate only these members.
@@ -154,7 +154,7 @@ def tree(module: str) -> ast.Module:
 
 @cache
 def imports_of(module: str) -> dict[str, tuple[str, str]]:
-    """Return the imports of a module: maps each imported name to the module and its name in that module."""
+    """Map each name that a module imports to (module, name there), or to (module, "") after a plain ``import``."""
     imports: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from aerokit.mavlink.enums import CopterMode, FenceMitigate, MavSeverity
 from aerokit.sim.ardupilot.copter_modes import CopterHost
-from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes
+from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
 from aerokit.sim.ardupilot.host import RC_THROTTLE, ArduPilotMode, ConditionTimer
 
@@ -25,10 +25,9 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return ()  # `position_reasons` includes these checks, because ArduCopter runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
-        """Return the failures of the checks of GPS and of the estimator, and of the mandatory checks."""
-        if self.vehicle.mode.needs_position and (reasons := self.gps_reasons()):
-            return reasons
-        return super().ahrs_reasons() or self.mandatory_reasons()
+        """Return the failures of the first group that has any: GPS (if needed), the estimator, the mandatory checks."""
+        gps_reasons = super().position_reasons() if self.vehicle.mode.needs_position else ()
+        return gps_reasons or super().ahrs_reasons() or self.mandatory_reasons()
 
     def own_reasons(self) -> list[str]:
         reasons = []
@@ -59,9 +58,8 @@ class CopterArming(ArduPilotArming[CopterHost]):
             return [f"{mode.name} mode not armable"]
         # In modes without manual throttle, the stick sets a climb rate, and its center holds the altitude.
         max_throttle = _STICK_LOW if mode.has_manual_throttle else _STICK_CENTER + _DEADZONE
-        if not mode.arms_with_raised_throttle and self.vehicle.rc[RC_THROTTLE] > max_throttle:
-            return ["Throttle too high"]
-        return []
+        is_throttle_checked = self.is_checked(ArmingCheck.RC) and not mode.arms_with_raised_throttle
+        return ["Throttle too high"] if is_throttle_checked and self.vehicle.rc[RC_THROTTLE] > max_throttle else []
 
 
 _NONE, _LAND, _RTL, _SMART_RTL, _SMART_RTL_OR_LAND, _TERMINATE, _AUTO, _BRAKE = range(8)

@@ -60,7 +60,7 @@ class AutoYaw:
             self._rate = math.copysign(rate or motion.limits.turn_rate_rad_s, direction)
 
     def turn_to_last_heading(self, tolerance: float) -> bool:
-        """Turn to the last heading of `turn_to` again. Return True within ``tolerance`` radians of that heading."""
+        """Turn to the heading that `turn_to` set last. Return True once within ``tolerance`` radians of it."""
         self._control = self._go_to_heading
         return abs(wrap_pi(self._heading - self._copter.motion.yaw)) <= tolerance
 

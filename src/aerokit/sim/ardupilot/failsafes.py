@@ -316,7 +316,7 @@ class ArduPilotArming(Generic[HostT]):
         """Arm and return True. If checks fail, report the failures and return False."""
         vehicle = self.vehicle
         reasons = self.mandatory_reasons() if force else self.reasons()
-        if not reasons and not force and not self.checks_nothing:
+        if not reasons and not force:
             reasons = self.final_reasons()
         if not vehicle.is_initialised:  # This text replaces the reasons of the checks.
             reasons = ["System not initialised"]

@@ -363,7 +363,7 @@ class ArduPilotFence(Generic[HostT]):
         self.caused_mode = False
 
     def beyond_m(self, kinds: int) -> float:
-        """Return the metres by which the vehicle exceeds the most exceeded limit of these kinds."""
+        """Return the distance in metres beyond the limit. Of several ``kinds``, the largest distance counts."""
         beyond = self._beyond(self.vehicle.motion.place)
         return max(beyond[kind] for kind in _NAMES if kinds & kind)
 

@@ -97,7 +97,10 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Do nothing. The firmware closes an idle session only when another client needs the session."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        """Answer a request, or refuse it while another session has an open file. An idle session is closed first."""
+        """Answer a request. First close another session that is idle; refuse the request if that session is in use.
+
+        A request to close sessions is not refused.
+        """
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
         if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():

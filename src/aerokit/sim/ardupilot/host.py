@@ -57,7 +57,10 @@ class ArduPilotMode:
         self.vehicle = vehicle
 
     def enter(self, *, force: bool) -> bool:
-        """Start the mode, or return False to refuse the mode. ``force`` is True while the vehicle is disarmed."""
+        """Send the entry texts and start the mode. Return False to refuse it.
+
+        With ``force``, as while disarmed, subclasses may accept a mode that cannot run yet.
+        """
         for text in self.entry_texts:
             self.vehicle.send_text(self.entry_severity, text)
         return self.is_available

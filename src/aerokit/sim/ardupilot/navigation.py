@@ -420,7 +420,7 @@ def _dot(first: Ned, second: Ned) -> float:
 
 
 def _along(start: Ned, line: Ned, share: float) -> Ned:
-    """Return the point on a line after this share of the line, 0 to 1."""
+    """Return ``start`` plus this share (0 to 1) of the vector ``line``."""
     start_north, start_east, start_down = start
     north, east, down = line
     return (start_north + share * north, start_east + share * east, start_down + share * down)

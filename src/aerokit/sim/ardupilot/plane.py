@@ -33,7 +33,7 @@ _MIN_ANGLE_DEG, _MIN_AIRSPEED_M_S = 3.0, 5
 
 
 class PlaneArming(ArduPilotArming[PlaneHost]):
-    """ArduPlane's arming checks. Every mode needs GPS, limits must be plausible, and the mode must be armable."""
+    """ArduPlane's arming checks: GPS in every mode; plausible angle limits, airspeed and time-outs; an armable mode."""
 
     def own_reasons(self) -> list[str]:
         """Return the texts of the checks that fail."""

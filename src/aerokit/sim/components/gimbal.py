@@ -182,7 +182,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self.followed = system_id
 
     def update_followed(self, system_id: int, place: Place) -> None:
-        """Update the position of the followed vehicle."""
+        """Turn to the new position of a vehicle if it is the followed vehicle."""
         if system_id == self.followed:
             self._start_angles = self.angles()
             self._start_at = self.now

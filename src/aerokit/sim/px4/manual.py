@@ -184,7 +184,7 @@ class Px4ManualFlight:
 
     @property
     def _thrust(self) -> float:
-        """Thrust divided by the thrust of hovering: 1 with a centered stick, least (MPC_MANTHR_MIN) with the lowest."""
+        """Thrust divided by the hover thrust. The stick sets a thrust from MPC_MANTHR_MIN to 1; its center hovers."""
         parameters, throttle = self._px4.parameters, self._px4.sticks.throttle
         hover, min_thrust = parameters["MPC_THR_HOVER"], parameters["MPC_MANTHR_MIN"]
         thrust_range = 1.0 - hover if throttle > 0 else hover - min_thrust

@@ -65,7 +65,7 @@ def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> M
 
 
 def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
-    """Return the stored item with the frame for a MISSION_ITEM_INT (``as_int``) or a MISSION_ITEM."""
+    """Return an item as downloaded: as stored, except for global frames, which become _INT frames with ``as_int``."""
     return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
 
 
@@ -86,7 +86,7 @@ def checksum(items: Sequence[MissionItem], previous: int = 0) -> int:
 
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
-    """Return a fence item as stored: with position, size and altitude, but without the altitude frame."""
+    """Return a fence item as stored: param 1, z and, in a global frame, x and y. Every global frame becomes GLOBAL."""
     if item.frame == Frame.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}

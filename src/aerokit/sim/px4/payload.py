@@ -43,7 +43,7 @@ _NEUTRAL: Angles = (0.0, 0.0, 0.0)
 
 
 class Px4Gimbal:
-    """Set-point and control of the gimbal."""
+    """The gimbal: its set-point, and which component is in control."""
 
     def __init__(self, px4: Px4Host) -> None:
         self._px4 = px4
@@ -235,7 +235,7 @@ def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _set_roi(gimbal: Px4Gimbal, command: ReceivedCommand | None) -> int:
-    """Point at the position of a command (AMSL in every frame), or reset the gimbal if ``command`` is None."""
+    """Point at the position of a command, whose altitude counts as AMSL in every frame. None resets the gimbal."""
     if command is None:
         gimbal.rest()
     elif math.isfinite(command.z):

@@ -58,7 +58,7 @@ class SimulatedPx4(Px4Vehicle):
         return None if builder is None else builder(self)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Refuse unsupported frames, a NaN sent as integer and an INT32_MAX sent as float (mavlink_receiver.cpp)."""
+        """Refuse x and y of INT32_MAX (COMMAND_LONG) or NaN bits (COMMAND_INT) and, unless 1.16, unsupported frames."""
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
