@@ -445,6 +445,26 @@ def test_new_peer_is_stalled_if_others_filled_system() -> None:
     run_virtual(main())
 
 
+def test_drain_ends_stall_that_began_before_second_stall() -> None:
+    async def main() -> None:
+        inner, far = memory_link_pair()
+        radio = FaultyLink(inner)
+        await far.open(Recorder())
+        async with aerokit.open_connection(radio) as connection:
+            changes: list[aerokit.events.Event] = []
+            connection.bus.attach_event(aerokit.events.LinkStalled, changes.append)
+            connection.bus.attach_event(aerokit.events.LinkDrained, changes.append)
+            radio.stall()
+            await asyncio.sleep(3.0)
+            radio.stall()
+            radio.drain()
+            await asyncio.sleep(0.1)
+            assert [type(event) for event in changes] == [aerokit.events.LinkStalled, aerokit.events.LinkDrained]
+        far.close()
+
+    run_virtual(main())
+
+
 # ------------------------------------------------------------------------------------- a whole program
 
 

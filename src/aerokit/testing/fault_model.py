@@ -18,7 +18,7 @@ _MAX_SECONDS = 3600.0
 class FaultModel(Snapshot):
     """Faults of one direction of a radio link. By default, there are no faults.
 
-    A share is the probability (0 to 1) that a frame has the fault. All faults and all frames are independent.
+    A share is the probability (0 to 1) that a frame has the fault, drawn separately for each frame and each fault.
 
     Raises InvalidArgument for a value out of range.
     """
@@ -71,9 +71,9 @@ class Air:
 class FaultyPath:
     """Applies faults to one direction of a link. Equal models, seeds, frames and times produce equal results.
 
-    ``frames`` and ``bytes`` count everything that was sent. ``lost`` counts the lost frames, including those during
-    outages, ``overflowed`` the frames that did not fit into the queue. ``duplicated``, ``reordered`` and ``corrupted``
-    count the frames with these faults.
+    ``frames`` and ``bytes`` count everything that was sent. ``overflowed`` counts the frames that did not fit into the
+    queue of `FaultModel.queue_bytes`, ``lost`` the other frames that did not arrive, including those during outages.
+    ``duplicated``, ``reordered`` and ``corrupted`` count the arriving frames with these faults.
     """
 
     frames: int
@@ -104,7 +104,7 @@ class FaultyPath:
         self._started_at = now
 
     def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
-        """Return the frames of a write or datagram that arrive, as pairs (time, bytes), in the order of sending."""
+        """Carry a write or datagram. Return what arrives as (arrival time, bytes), in the order of sending."""
         if self._started_at is None:
             self.start(now)
         arrivals: list[tuple[float, bytes]] = []

@@ -49,7 +49,7 @@ class FaultInjector:
 
     @property
     def all(self) -> Faults:
-        """All faults of the vehicle, such as refused commands; see `aerokit.sim.Faults`."""
+        """The vehicle's `aerokit.sim.Faults`, to set faults that have no method here, such as refused commands."""
         faults: Faults = self._vehicle.faults
         return faults
 
@@ -77,7 +77,7 @@ class FaultInjector:
         self._set("silent", True, after_s, for_s)
 
     def hang(self, for_s: float | None = None, *, after_s: float = 0.0) -> None:
-        """Freeze the autopilot, by default until :meth:`end`. It then does not receive, move or send."""
+        """Freeze the autopilot, by default until :meth:`end`. A frozen autopilot does not receive, move or send."""
         self._set("frozen", True, after_s, for_s)
 
     def fail_prearm(self, reason: str, *, after_s: float = 0.0, for_s: float | None = None) -> None:

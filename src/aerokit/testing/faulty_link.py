@@ -39,10 +39,11 @@ LIMIT = 256 * 1024
 
 
 class StalledQueue:
-    """Simulates a stalled TCP connection. The operating system accepts ``system_bytes``, and further bytes are queued.
+    """Simulates a TCP connection that is stalled until `drain`.
 
-    ``carry(data, peer)`` sends bytes. ``on_drop`` is called with the number of dropped writes, and ``on_stall`` with
-    True or False when the connection stalls or continues.
+    The simulated operating system accepts the first ``system_bytes``. Further bytes wait in an `Outbox` per peer.
+    ``carry(data, peer)`` sends bytes. ``on_drop`` is called with the number of writes that an outbox drops.
+    When an outbox stalls or drains, ``on_stall`` is called with True if any outbox is now stalled, otherwise False.
     """
 
     def __init__(
@@ -176,7 +177,7 @@ class FaultyLink(Link):
 
     @property
     def dropped_writes(self) -> int:  # type: ignore[override]
-        """Number of writes that the wrapped link dropped, that did not fit into a queue, or that expired in a stall.
+        """Number of writes that the wrapped link or a stall dropped, and of frames that overflowed `outgoing`.
 
         Frames that were lost in transit do not count.
         """
@@ -209,6 +210,7 @@ class FaultyLink(Link):
         """Resume sending after :meth:`stall`."""
         if self._stalled_queue is not None:
             self._stalled_queue.drain()
+            self._on_stalled(False)  # The queue does not report the end of a stall that began before a second `stall`.
 
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`."""
@@ -292,11 +294,11 @@ class FaultyLink(Link):
 
     def _on_stalled(self, is_stalled: bool) -> None:
         """Report to the receiver that the link stalls or is drained."""
-        now = asyncio.get_running_loop().time()
         stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
             return
+        now = asyncio.get_running_loop().time()
         if stalled_at is None:
             self._stalled_at = now
             self._incoming_path.link_stalled(self.unsent_bytes)
@@ -405,7 +407,7 @@ class _DeliveryQueue:
         self._timer = None
 
     def _schedule(self) -> None:
-        """Set the timer to the due time of the first action."""
+        """Ensure that the timer fires no later than the first action is due."""
         due, _, _ = self._waiting[0]
         if self._timer is not None:
             if self._timer_at <= due:

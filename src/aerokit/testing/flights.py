@@ -77,7 +77,7 @@ class Flight:
         return self._fleet.link
 
     def run(self, main: Callable[[Flight], Awaitable[T]]) -> T:
-        """Open the flight, run ``main(flight)`` on virtual time and close the flight, in a test without ``async``."""
+        """Open the flight, run ``main(flight)`` on virtual time and close the flight. For tests without ``async``."""
 
         async def fly() -> T:
             async with self._fleet.open():
@@ -130,12 +130,12 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def min_distance_m(self) -> float:
-        """Minimum distance of any two vehicles in space, in metres. It is infinite for fewer than two vehicles."""
+        """Minimum 3D distance between two vehicles during the flight, in metres. Infinite for a single vehicle."""
         closest_m, _, _ = self._closest_approach()
         return closest_m
 
     def assert_stayed_apart(self, distance_m: float) -> None:
-        """Assert that the distance of any two vehicles in space was never below ``distance_m``."""
+        """Assert that the 3D distance between any two vehicles was never below ``distance_m``."""
         __tracebackhide__ = True
         closest_m, time_s, names = self._closest_approach()
         text = f"{names} came nearer than {distance_m:g} m: {closest_m:.1f} m at {time_s:.1f} s"
@@ -146,7 +146,7 @@ class SimulatedFleet(Sequence[Flight]):
         save_picture([flight.track for flight in self], path)
 
     def _closest_approach(self) -> tuple[float, float, str]:
-        """Return the minimum distance of any two vehicles in metres, its time, and the names of these vehicles."""
+        """Return the minimum 3D distance between two vehicles in metres, its time, and the names of these vehicles."""
         closest = (math.inf, 0.0, "")
         for first, second in combinations(self, 2):
             distance_m, time_s = min_distance_m(first.track, second.track)
@@ -165,7 +165,7 @@ class SimulatedFleet(Sequence[Flight]):
         return self._link
 
     def run(self, main: Callable[[SimulatedFleet], Awaitable[T]]) -> T:
-        """Open the fleet, run ``main(fleet)`` on virtual time and close the fleet, in a test without ``async``."""
+        """Open the fleet, run ``main(fleet)`` on virtual time and close the fleet. For tests without ``async``."""
 
         async def fly() -> T:
             async with self.open():

@@ -60,7 +60,7 @@ class Interruption:
             raise
 
     def _send_signal(self) -> bool:
-        """Send SIGINT to the main thread; return False if it was already interrupted, or has left its block."""
+        """Interrupt the main thread if it is in the `allowed` block and not interrupted yet. Return True if sent."""
         with self._lock:
             is_needed = self._is_allowed and not self._is_delivered
             if is_needed:
@@ -89,7 +89,7 @@ def _is_sigint_available() -> bool:
 
 
 def _is_in_context_code(frame: FrameType | None) -> bool:
-    """Return True if the frame enters or leaves a context manager."""
+    """Return True if the frame may be entering or leaving a block, because it is in contextlib or `_CONTEXT_FILES`."""
     name = "" if frame is None else frame.f_code.co_filename
     return name == contextlib.__file__ or (name.endswith(_CONTEXT_FILES) and "aerokit" in name)
 

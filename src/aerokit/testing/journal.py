@@ -15,7 +15,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 @dataclass(frozen=True)
 class SentText:
-    """A complete status text of the vehicle, which may have been lost in transit."""
+    """A status text that the vehicle sent, joined if it was sent in chunks. It may have been lost in transit."""
 
     time_s: float
     """Simulated seconds."""
@@ -94,7 +94,7 @@ class Journal:
         return [message for message in messages if isinstance(message, CommandLong | CommandInt)]
 
     def _command_counts(self) -> list[str]:
-        """Return each received command as text with its count, in the order of the first receptions."""
+        """Return the names of the received commands, with counts above 1, in the order of the first receptions."""
         counts = Counter(_name(message.command) for message in self._received_commands())
         return [name if count == 1 else f"{name}, {count} times" for name, count in counts.items()]
 

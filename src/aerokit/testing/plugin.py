@@ -162,7 +162,10 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the kinds and options of the test's marker ``simulated``."""
+    """Return the kinds and options of the test's marker ``simulated``, by default a copter.
+
+    The option ``record`` is added: by default, it is True if ``--flight-pictures`` is given.
+    """
     marker = request.node.get_closest_marker(_MARKER)
     options = {} if marker is None else dict(marker.kwargs)
     options.setdefault("record", request.config.getoption(_PICTURES_OPTION) is not None)
@@ -171,14 +174,14 @@ def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[st
 
 
 def _flight_fixtures(item: pytest.Item) -> list[Any]:
-    """Return the flight fixtures of a test, ignoring fixtures of the project with the same names."""
+    """Return the values of ``flight``, ``fleet`` and ``served_flight`` in a test, if their classes are aerokit's."""
     fixture_values = getattr(item, "funcargs", None) or {}
     named = [fixture_values[name] for name in ("flight", "fleet", "served_flight") if name in fixture_values]
     return [value for value in named if _is_of_this_package(value)]
 
 
 def _reported_flights(item: pytest.Item) -> list[Any]:
-    """Return the values of the flight fixtures, and flights that fixtures of the project have returned."""
+    """Return the flights and fleets among all fixture values of a test, beginning with this plugin's fixtures."""
     fixture_values = getattr(item, "funcargs", None) or {}
     flights: list[Any] = []
     for value in (*_flight_fixtures(item), *fixture_values.values()):

@@ -99,7 +99,7 @@ class RecordedParameters(ParameterProtocolServer):
         self.send(name, self.names.index(name), None)
 
     def _refuse(self, request: m.ParamRequestRead | m.ParamSet, index: int, channel: Channel) -> None:
-        """Answer with PARAM_ERROR, if the recorded vehicle does so. Otherwise there is no answer."""
+        """Answer with PARAM_ERROR if the recorded vehicle ever sent PARAM_ERROR. Otherwise, do not answer."""
         if self._vehicle.recording.has_parameter_errors:
             self.send_error(sender_of(request), request.param_id, index, MavParamError.DOES_NOT_EXIST, channel)
 
@@ -205,12 +205,13 @@ _MESSAGE_REQUESTS = (MavCmd.SET_MESSAGE_INTERVAL, MavCmd.REQUEST_MESSAGE)
 class RecordedVehicle(SimulatedVehicle):
     """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
-    - Commands: a command gets the acknowledgements that were recorded for the same params, with the recorded delay. If
-      there are none, it gets those for other params. The last acknowledgement repeats. Commands that were not recorded
-      are UNSUPPORTED. REQUEST_MESSAGE sends the latest recorded message.
+    - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
+      other params, with the recorded delays. If it was recorded several times, each repetition gets the next recorded
+      answer, and further ones get the last. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the
+      message as played last, or else as first recorded.
     - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
-      recording can be set. A request for an unknown name gets PARAM_ERROR if the recorded vehicle sent that message,
-      otherwise no answer.
+      recording can be set. A request for another parameter gets PARAM_ERROR if the recorded vehicle ever sent
+      PARAM_ERROR, otherwise no answer.
     - Missions: the vehicle has the recorded missions. An upload or a clearing gets the recorded result or, if there is
       none, UNSUPPORTED.
     - File operations are refused, the list of logs is empty, and rates cannot be changed. TIMESYNC and PING are
@@ -276,7 +277,7 @@ class RecordedVehicle(SimulatedVehicle):
         self._schedule_next()
 
     def start_channel(self, channel: Channel) -> None:
-        """Do nothing: all ports receive the recording."""
+        """Do nothing: the recorded streams are sent on every channel."""
 
     def build(self, message_id: int) -> Message | None:
         """Return None: only recorded messages are streamed."""

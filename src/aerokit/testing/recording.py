@@ -57,7 +57,7 @@ class RecordedPlan:
 
 
 class RecordedFlight:
-    """Content of a recording about one vehicle.
+    """The part of a recording that concerns one vehicle.
 
     Times are in seconds since the first message of the vehicle. Long gaps in the recording are shortened.
 
@@ -119,7 +119,7 @@ class RecordedFlight:
         self._discard_unanswered()
 
     def _discard_unanswered(self) -> None:
-        """Discard the recorded commands that were not acknowledged."""
+        """Remove from `answers` the commands that were not acknowledged."""
         acknowledged = {
             command: [answer for answer in answers if answer.acks] for command, answers in self.answers.items()
         }

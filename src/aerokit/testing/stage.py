@@ -86,7 +86,7 @@ _UTC_AT_START = 1_790_000_000.0
 
 
 class FlightRecording:
-    """Records the traffic of a server as a .tlog in memory, which needs some kilobytes per simulated second."""
+    """Records the traffic of a server in memory, as a .tlog that grows by some kilobytes per simulated second."""
 
     def __init__(self) -> None:
         self._file = BytesIO()

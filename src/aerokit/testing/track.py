@@ -35,7 +35,9 @@ _ON_GROUND_M = 0.3
 
 
 class Track(Sequence[TrackPoint]):
-    """The true points of a flight, from the oldest to the newest. The track grows while the vehicle runs.
+    """Real states of a vehicle, from the oldest to the newest. The track grows while the vehicle runs.
+
+    The states are those of the simulation, without the errors of the vehicle's sensors and estimator.
 
     Assertions raise AssertionError. All of them fail on an empty track.
     """
@@ -146,7 +148,7 @@ class Track(Sequence[TrackPoint]):
     def nearest_m(self, place: Position) -> float:
         """Return the minimum distance to a position, in metres.
 
-        The distance is in space if the position has an ``altitude_relative_m``, otherwise along the ground.
+        The distance is in 3D if the position has an ``altitude_relative_m``, otherwise along the ground.
         """
         distance_m, _ = self._nearest(place)
         return distance_m
@@ -169,7 +171,7 @@ class Track(Sequence[TrackPoint]):
     def assert_passed(self, place: Position, *, within_m: float = 2.0) -> None:
         """Assert that the vehicle came within ``within_m`` metres of a position.
 
-        The distance is in space if the position has an ``altitude_relative_m``, otherwise along the ground.
+        The distance is in 3D if the position has an ``altitude_relative_m``, otherwise along the ground.
         """
         __tracebackhide__ = True
         distance, point = self._nearest(place)
@@ -334,7 +336,7 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
 
 
 def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
-    """Return the minimum distance between two vehicles in space, in metres, and the time of the minimum.
+    """Return the minimum 3D distance between two vehicles, in metres, and the time of the minimum.
 
     Return (infinity, 0) if the two vehicles never ran at the same time.
     """

@@ -11,7 +11,7 @@ from aerokit.position import Position
 
 @dataclass(frozen=True)
 class TrackPoint:
-    """True state of a vehicle at one time."""
+    """Real state of a vehicle at one time, without the errors of its sensors and estimator."""
 
     time_s: float
     """Simulated seconds."""
