@@ -176,8 +176,8 @@ class Connection:
         """Write one complete frame of another sender unchanged, for programs that forward frames. Never blocks.
 
         The frame goes to the peers that :meth:`send` would choose for the same message. A signature is kept. A frame
-        for all or for an unknown target goes to every peer, also to the peer it came from: forward only frames of
-        another connection, or they return to their sender.
+        for all or for an unknown target goes to every peer. Forward only frames that another connection has
+        received, because a frame received by this connection could be sent back to its sender.
 
         Raises:
             InvalidArgument: ``data`` is not exactly one MAVLink frame; nothing was sent.
@@ -392,11 +392,11 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Return why signatures block communication with a component, for error texts; "" if they do not.
+        """Return how signatures may block communication with a component, for error texts; "" if nothing suggests it.
 
-        With a key, the reason is that this program has refused frames, of any sender. Without a key, it is that the
-        last heartbeat of the component is signed. ``component_id`` 0 means all components of the system. Without a
-        ``system_id``, only the reason with a key is given.
+        If this program has a signing key, the text counts the frames that it has refused, from all senders. Otherwise,
+        the text says so if the last heartbeat of the component was signed, which requires ``system_id``.
+        ``component_id`` 0 means all components of the system.
         """
         return self._gate.describe(
             heartbeat

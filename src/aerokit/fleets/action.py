@@ -235,7 +235,7 @@ class FleetAction:
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
-        """Ask the policy about a failure, send its orders, and cancel the running actions of the ordered members."""
+        """Ask the policy about a failure, send its orders, and cancel the running actions of members with an order."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]

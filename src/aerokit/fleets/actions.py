@@ -42,8 +42,8 @@ class Actions(SelectionBase):
             **options: keyword arguments of the method.
 
         Raises:
-            InvalidArgument: there is no such action, or there are arguments for a function. Nothing was sent. If the
-                method refuses an argument, each member fails instead.
+            InvalidArgument: there is no such method, or arguments were given although ``action`` is a function. Nothing
+                was sent. If the method refuses an argument, each member fails instead.
         """
         if isinstance(action, str):
             name = action

@@ -67,9 +67,9 @@ async def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, all of whose vehicles become members, and vehicle objects. A
-            mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
-        count: total number of vehicles to wait for; None: wait for one on each network, and 2.5 seconds for more.
+        *sources: vehicle objects, which become members, and addresses, links or open connections, whose vehicles become
+            members. A mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        count: total number of vehicles to wait for; None: wait until each network has one, then 2.5 seconds for others.
         system_ids: system ids to use, for all networks or mapped by network name; None: all that are found.
         groups: maps groups to names or patterns of members (``"north/*"``). Other members have the group ``""``.
         roles: maps roles to names or patterns of members.

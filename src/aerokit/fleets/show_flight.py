@@ -168,7 +168,7 @@ class ShowReport(Snapshot):
 def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> TrackDeviation:
     """Compare a path with measured positions: ``samples`` has (seconds since the start of the show, position).
 
-    The lag is the delay of the path with which it fits the samples best (least squares along the track).
+    The lag is the time by which the path must be delayed to fit the samples best (least squares along the track).
     """
     errors: list[float] = []
     # A lag causes an error vector of lag × velocity. The lag that fits best is sum(error · velocity) / sum(velocity²).

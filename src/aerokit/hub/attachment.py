@@ -130,8 +130,8 @@ class Attachment:
     def bytes_received(self, data: bytes, peer: Peer) -> None:
         """Process received bytes, or collect them until the burst ends.
 
-        Datagrams that a peer sends in one burst are joined and processed together. A datagram that does not begin with
-        a frame is processed alone, because only data that consists of whole frames is forwarded as it is.
+        Datagrams that a peer sends in one burst are joined and processed together. One that does not begin with a frame
+        is not joined, because the joined data is forwarded unchanged only if it consists of whole frames.
         """
         if self._burst:
             if peer == self._burst_peer and data[:1] in _MAGICS:

@@ -124,7 +124,7 @@ class SourceStatistics(SourceFields):
         self._unreceived += count
 
     def _on_gap(self, ahead: int, now: float) -> None:
-        """Process a frame after ``ahead`` missing frames, which count as lost until they arrive late."""
+        """Process a frame after ``ahead`` missing frames. Count these as lost; one that arrives late is subtracted."""
         self.lost += ahead
         if ahead > _MAX_GAP:  # The frame may belong to another stream.
             self._begin_stream(now)
@@ -192,10 +192,10 @@ class SourceStatistics(SourceFields):
         self._missing = self._skipped_over = 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        """Process a frame that continues the other stream. Return a result of :meth:`out_of_order`.
+        """Process a frame that continues the other stream. Return what :meth:`out_of_order` is to return for it.
 
-        The other stream becomes the sender's at once if the current stream has timed out, and after `_MIN_RETURNS`
-        frames if it has more frames than the current stream.
+        The other stream replaces the current stream at once if the current stream has timed out, or after
+        `_MIN_RETURNS` frames if the other stream has more frames than the current stream.
         """
         current_count = self.received - self._stream_start
         is_other_longer = self._other_count > current_count

@@ -370,8 +370,9 @@ def loiter_unlimited(
     radius_m: float = 0.0,
     yaw_deg: float | None = None,
 ) -> MissionItem:
-    """Stay at a place indefinitely. Planes circle with ``radius_m`` (0: their parameter, negative: counter-clockwise).
+    """Stay at a place indefinitely. Planes circle with ``radius_m``; a negative radius means counter-clockwise.
 
+    With 0, planes use the radius in their parameters.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_UNLIM
     """
     return place_item(
@@ -423,8 +424,8 @@ def loiter_time(
 ) -> MissionItem:
     """Stay at a place for 0 to 65,535 seconds. ArduPilot stores whole seconds, and only the sign of the radius.
 
-    ``leave_tangentially`` makes a plane fly to the next item from the point at which it leaves its circle. Otherwise it
-    joins the line from the center of the circle. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
+    With ``leave_tangentially``, a plane flies straight from its circle to the next item. Without it, a plane joins the
+    line from the circle's center to the next item. https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_LOITER_TIME
     """
     return place_item(
         MavCmd.NAV_LOITER_TIME,

@@ -47,7 +47,7 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
 
 
 def _reset_items(pattern: JsonValue) -> list[MissionItem]:
-    """Create the items before an approach that reset speed, photos and video."""
+    """Create the items that set the speed and stop photos and video, which come before the approach."""
     items = []
     if _flag(pattern, "useDoChangeSpeed"):
         speed = pattern["finalApproachSpeed"].number(0)

@@ -217,10 +217,12 @@ def pack_items(
 ) -> bytes:
     """Encode items (with the vehicle's numbering) as a packed plan.
 
-    A whole plan has ``first`` 0 and no options. ArduPilot accepts :data:`NO_CLEAR` only for missions: items from index
-    ``first`` on are replaced or appended, all others are kept. Jump targets must then be below the number of items in
-    the file (ArduPilot 4.7). ArduPilot processes a file when it is closed. Without :data:`NO_CLEAR` it first
-    clears the old mission; if it then refuses an item, the new mission consists of the items before that item.
+    ArduPilot processes a file when it is closed. A whole plan has ``first`` 0 and no options: ArduPilot first clears
+    the old mission. If it then refuses an item, the new mission consists of the items before that item.
+
+    With the option :data:`NO_CLEAR`, which ArduPilot accepts only for missions, the file replaces or appends items from
+    index ``first`` on, and all other items are kept. In such a file, jump targets must be below the number of items in
+    the file (ArduPilot 4.7).
     """
     if len(items) + first > MAX_ITEMS:
         raise InvalidArgument(f"{len(items) + first} items are too many: at most {MAX_ITEMS} are possible")

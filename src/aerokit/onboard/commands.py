@@ -247,7 +247,7 @@ class ComponentCommands:
 
         # `cancel` is called after this method has returned, when `returned` and `running` below are set.
         def cancel() -> bool:
-            """Cancel the handler, because the sender of the command or the end of the component requires it."""
+            """Cancel the handler: its command was cancelled, or the component is closing. False if it cannot be."""
             nonlocal is_cancelled
             if task in self._tasks_in_threads:
                 return False  # The command cannot be cancelled. Its sender gets the result.

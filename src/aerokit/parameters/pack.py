@@ -135,10 +135,10 @@ def pack_for_download(
 ) -> bytes:
     """Encode ``@PARAM/param.pck`` for these parameters, without validating their values.
 
-    ``block_size`` is the number of data bytes per read. ``count`` 0 means all parameters from ``start`` on. PX4 keeps a
-    value and its default in the same block. ArduPilot (``whole_defaults=False``) only keeps the last number of an entry
-    in one block: the default, or the value if there is no default (AP_Filesystem_Param.cpp). InvalidArgument is raised
-    if ``start`` is beyond the list.
+    ``block_size`` is the number of data bytes per read (a block). ``count`` 0 means all parameters from ``start`` on.
+    An entry may be split between two blocks, but PX4 keeps its value and its default in the same block. ArduPilot
+    (``whole_defaults=False``) may split between value and default, and even the value if a default follows it
+    (AP_Filesystem_Param.cpp). InvalidArgument is raised if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):

@@ -281,7 +281,7 @@ _FLOAT = _STRUCTS[MavParamExtType.REAL32]
 def setting_key(value: SettingValue) -> object:
     """Return a key that is the same for values that are equal according to :func:`settings_equal`.
 
-    The exception is an int above 2**24, which has its own key, but may equal the nearest 32-bit float.
+    There is one exception: an int beyond ±2**24 may equal a float according to that function, but have another key.
     """
     if isinstance(value, (str, bytes)):
         return _encoded(value)

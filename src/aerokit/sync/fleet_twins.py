@@ -164,7 +164,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             speed_m_s: ground speed of all members in m/s, for corridors; above 0.
             max_altitude_m: highest layer in metres above sea level; None: no limit.
             slack_s: for corridors: how early or late a member may be relative to another, in seconds. A member that
-                would start later, because the event loop was blocked, does not start.
+                would start too late by more than this, because the event loop was blocked, does not start.
 
         Raises:
             InvalidArgument: a name is unknown, or a required argument is missing.
@@ -389,8 +389,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
             **options: keyword arguments of the method.
 
         Raises:
-            InvalidArgument: there is no such action, or there are arguments for a function. Nothing was sent. If the
-                method refuses an argument, each member fails instead.
+            InvalidArgument: there is no such method, or arguments were given although ``action`` is a function. Nothing
+                was sent. If the method refuses an argument, each member fails instead.
         """
         return self._loop.run(self.aio.do, action, *arguments, timeout=timeout, stagger_s=stagger_s, **options)
 
@@ -628,9 +628,9 @@ def fleet(
     system 7 of network "north". Several networks can therefore use the same system ids.
 
     Args:
-        *sources: addresses, links or open connections, all of whose vehicles become members, and vehicle objects. A
-            mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
-        count: total number of vehicles to wait for; None: wait for one on each network, and 2.5 seconds for more.
+        *sources: vehicle objects, which become members, and addresses, links or open connections, whose vehicles become
+            members. A mapping gives names to networks or vehicles; other networks are named ``"1"``, ``"2"`` …
+        count: total number of vehicles to wait for; None: wait until each network has one, then 2.5 seconds for others.
         system_ids: system ids to use, for all networks or mapped by network name; None: all that are found.
         groups: maps groups to names or patterns of members (``"north/*"``). Other members have the group ``""``.
         roles: maps roles to names or patterns of members.

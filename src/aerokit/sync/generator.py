@@ -218,7 +218,7 @@ class Page:
     def import_literals_in(self, node: ast.AST | None, module: str) -> None:
         """Import the Literals of an annotation at run time, because ``checked`` needs their values.
 
-        ``checked`` knows classes by their names, so classes are only imported for type checkers.
+        Classes need no import at run time, because ``checked`` knows them by their names.
         """
         if node is None:
             return
@@ -356,7 +356,7 @@ def _class(page: Page, twin: Twin) -> str:
 
 
 def _opener(page: Page, path: str) -> str:
-    """Return the source code of a blocking function such as ``connect``, which opens its object on a loop thread."""
+    """Return the source code of a blocking function that opens an object on a loop thread, such as ``connect``."""
     module, _, name = path.rpartition(".")
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):

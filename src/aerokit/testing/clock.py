@@ -208,7 +208,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return events
 
     def _wait(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
-        """Return events of the selector. Without events, run event sources or else advance the clock by ``timeout``."""
+        """Return the selector's events. If there are none, run due event sources; if none is due, advance the clock."""
         events = poll(0)
         if events or (timeout is not None and timeout <= 0):
             return events

@@ -19,7 +19,7 @@ _MAX_TEXTS = 6
 
 
 def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
-    """Return the report on the vehicles of a failed test, with the lines about each vehicle.
+    """Return the report on a failed test: a few lines about each vehicle.
 
     If ``directory`` is given, also save files there: a picture of all tracks, the recordings, and reports on the
     recordings. Their names begin with the name of the test.

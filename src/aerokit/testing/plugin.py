@@ -114,7 +114,10 @@ def dronekit_address(served_flight: ServedFlight) -> str:
 
 @pytest.fixture
 def dronekit() -> Iterator[ModuleType]:
-    """`aerokit.dronekit`. In the test, ``import dronekit`` imports it, unless DroneKit itself was imported before."""
+    """The module `aerokit.dronekit`, which ``import dronekit`` also returns during the test.
+
+    Raises ImportError if DroneKit itself was imported before.
+    """
     import sys
 
     import aerokit.dronekit as package

@@ -122,8 +122,8 @@ class RecordedMissions(MissionServer):
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
         """Return the items of the plan that the vehicle has at present; None if it has no plan of this type.
 
-        This is the uploaded plan or else the latest recorded plan. Before the time of the first recorded plan, it is
-        the first one.
+        An uploaded plan takes precedence. Without one, it is the last plan recorded until the present position in the
+        recording, or the first recorded plan if there is none until then.
         """
         if mission_type in self._written:
             return self._written[mission_type]

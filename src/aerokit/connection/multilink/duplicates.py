@@ -212,7 +212,7 @@ class MergedStreams:
                 candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Return True if a frame, of which no copy was accepted yet, is to be delivered. Then record it as accepted."""
+        """Decide whether to deliver a frame that is no copy of an accepted one. If True, it is recorded as accepted."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)

@@ -103,7 +103,10 @@ class LinkProbes:
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes over any link; record the answer of an autopilot."""
+        """Return True if this TIMESYNC answers one of our probes, whichever link the probe was sent over.
+
+        If the autopilot has answered over that same link, record the answer.
+        """
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
         if not isinstance(message, m.Timesync) or is_request or message.ts1 not in self._pending:

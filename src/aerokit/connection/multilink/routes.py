@@ -317,9 +317,9 @@ class MultiLinkRoutes:
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
-        """Return peers that together reach every system with a link in use, mostly only once (chosen greedily).
+        """Return peers that together reach every system that has a link in use. Most systems are reached only once.
 
-        Links over which no system is known are added as well.
+        The peers are chosen greedily. Links over which no system is known are added as well.
         """
         peers: set[Peer] = set()
         links_with_systems: set[int] = set()

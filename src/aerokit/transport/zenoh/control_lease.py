@@ -190,7 +190,7 @@ class ClientFilter:
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
         """Return True if another program recently used this client name. Otherwise record this program as its user.
 
-        A program that takes control replaces the other program.
+        With the mode "take", this program becomes the user of the name in any case.
         """
         is_other_program = self._nonce not in (None, nonce)
         is_recent = now - self._nonce_at <= LEASE_TIMEOUT_S
@@ -222,9 +222,9 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
-        """Count a refused frame, and return a notice.
+        """Count a refused frame, and return a notice, unless a notice about this message was returned recently.
 
-        Without an answer in the notice, nothing is returned if a notice about this message was sent recently.
+        A notice with an answer for the client is always returned.
         """
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
@@ -348,7 +348,7 @@ class DelayEstimator:
         self._measured_at = 0.0  # time at which `_min_offset` was measured
 
     def delay(self, sent_s: float, now: float) -> float:
-        """Return how many seconds longer than the fastest data so far this data took; 0 for the first data.
+        """Return by how many seconds this data was slower than the fastest data so far; 0 for the first data.
 
         ``sent_s`` is the send time on the sender's clock, ``now`` the receive time on ours.
         """
@@ -384,7 +384,8 @@ class VehicleSideTracker:
     def receive_beacon(self, beacon: Beacon, now: float) -> bool:
         """Record a beacon. Return False if it is late, older than the last one, or not from the tracked vehicle side.
 
-        Another vehicle side is tracked when the first has been silent for `MAX_DELAY_S`, or after :meth:`reset`.
+        A vehicle side is a program that serves the vehicle to clients. Another one is tracked when the tracked one has
+        been silent for `MAX_DELAY_S`, or after :meth:`reset`.
         """
         if beacon.epoch != self.epoch:
             if self.epoch is not None and not self.is_silent(now):
