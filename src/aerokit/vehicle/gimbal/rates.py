@@ -116,7 +116,11 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        """Stop the gimbal, unless another order was given or control was lost. Raise if the stream has stopped."""
+        """Stop the gimbal, unless a newer order was given or control was lost.
+
+        In these cases, and if the stream stopped before the end of the block, raise the reason if it was not raised yet
+        and the block has raised no error.
+        """
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:
             self._stop(reason, hold=False)
