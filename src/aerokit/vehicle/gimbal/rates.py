@@ -118,8 +118,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Stop the gimbal, unless a newer order was given or control was lost.
 
-        In these cases, and if the stream stopped before the end of the block, raise the reason if it was not raised yet
-        and the block has raised no error.
+        Raises the reason in these cases, and if the stream stopped earlier, unless an error was already raised.
         """
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:
