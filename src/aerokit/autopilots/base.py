@@ -85,7 +85,7 @@ class SetpointRules(Snapshot):
     """Set-points that the autopilot supports, and how it treats a stream of set-points.
 
     - ``stream_before_mode``: the stream must be running before the mode is requested.
-    - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the current heading instead of north.
+    - ``body_yaw_is_relative``: in MAV_FRAME_BODY_NED, yaw is relative to the heading or its target, not to north.
     - ``position_restarts_path``: each position set-point, even a repeated set-point, restarts the path from a
       standstill.
     - ``trajectory``: set-points of positions with velocity and acceleration are supported.

@@ -2267,8 +2267,8 @@ class Parameters(TwinOf["AsyncParameters"]):
         Use it to find out which of several names a firmware has; for renamed ArduPilot parameters use :meth:`get`.
 
         Returns:
-            For each name the parameter, or the error that :meth:`get` would have raised. The error's ``code`` is None
-            if the vehicle reported no error for this name, but answered requests for other names.
+            For each name the parameter, or the error that :meth:`get` would have raised. The ``code`` of a
+            ParameterRejected is None if the vehicle ignored this name although it answered other requests.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
@@ -2326,8 +2326,8 @@ class Parameters(TwinOf["AsyncParameters"]):
     ) -> dict[str, ParameterWrite]:
         """Set the vehicle's parameters to those of a table, a dict or a parameter file.
 
-        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. If another
-        station may have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
+        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. Call
+        ``download(refresh=True)`` first if another station may have set values that your program has not received.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for
@@ -2646,8 +2646,8 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
 
         Args:
             item: number of the item.
-            timeout: seconds to wait for the end of a running transfer, and then again for MISSION_CURRENT; without
-                effect if the vehicle supports the command.
+            timeout: seconds to wait until a running transfer has ended, and as many again until MISSION_CURRENT
+                confirms the item. Not used with MAV_CMD_DO_SET_MISSION_CURRENT.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -2693,17 +2693,16 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         self._loop.run(self.aio.resume, timeout=timeout)
 
     def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end, including a landing at its end.
+        """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait, but a pilot who then changes to another mode than that of
-        the mission does. Cancelling this call does not stop the vehicle, and no
-        command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
-        a download, unless another station has replaced the mission since. If the item is unknown, the mode after the
-        completion shows whether the vehicle lands.
+        A :meth:`pause` by another task does not end the wait, unless a pilot then changes to a mode other than that of
+        the mission. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An upload or
+        a download shows whether the mission ends with a landing. Without them, or after another station has replaced
+        the mission, the mode after the completion shows whether the vehicle lands.
 
-        A replaced mission is noticed when the call begins, by another number of items, by another mission id (PX4 1.15
-        and later), or by the vehicle's answer to the other station (only on a link shared with that station). A mission
-        with the same number of items that arrives at ArduPilot over another link, or as a file, is not noticed: call
+        When the call begins, aerokit notices a replaced mission by its number of items, by its mission id (PX4 1.15 and
+        later), or by the vehicle's answer to the other station, if both stations share a link. It does not notice a
+        mission with the same number of items that ArduPilot has received over another link or as a file: call
         :meth:`download` first if another station may replace missions.
 
         Args:
@@ -3390,8 +3389,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
         """Wait until the camera is found and has identified itself.
 
-        All other calls also wait until the camera is found. They request its information unless it is known, and work
-        without it only on a camera that is attached to the autopilot.
+        All other calls first wait in the same way, but a camera that is attached to the autopilot only has to be found;
+        it need not identify itself.
 
         Raises:
             CommandRejected: the camera refused to identify itself.
@@ -3608,13 +3607,13 @@ class Settings(TwinOf["AsyncSettings"]):
     ) -> Setting:
         """Set one setting and return the value that the component confirms, which may differ from ``value``.
 
-        With a definition, ``value`` may be the name of an option. Settings that restrict this setting are read first if
-        their values are unknown. Settings that this setting may change are read again afterwards.
+        If the camera definition is loaded, ``value`` may be the name of an option. Settings that restrict this setting
+        are then read first if their values are unknown, and settings that it may change are read again afterwards.
 
         Raises:
-            InvalidArgument: the name or value is invalid; or, with a definition, the value is not allowed, or the
+            InvalidArgument: the name or value is invalid; or, by the definition, the value is not allowed, or the
                 setting is read-only or excluded now. Nothing was set.
-            ParameterRejected: the component has no such setting, or refused; ``code`` is its PARAM_ACK.
+            ParameterRejected: the component has no such setting, or refused; ``code`` is the PARAM_ACK in its answer.
             ParameterTimeout: the component did not confirm the value, but may have set it; or the settings that it may
                 change could not be read again.
         """
@@ -4215,14 +4214,20 @@ class Vehicle(VehicleTwin):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
-        or their effect is reported. The retries also end when a newer order about the first subject is given, when the
-        vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
-        the first subject is motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
-        vehicle hold nor monitors late arming; use the actions for that.
+        or their effect is reported. The retries also end in these cases:
+
+        - A newer order is about the first subject of this order, perhaps among other subjects.
+        - The vehicle changes to a mode to which neither this order nor another order of the last ten seconds leads,
+          unless this order disarms.
+        - A failsafe becomes active, unless this order lands, returns or disarms.
+        - The vehicle reboots; or it disarms, and the first subject is motion.
+
+        If you leave the block early, aerokit neither makes the vehicle hold nor disarms it if it arms later. Use the
+        actions for that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. An order ends each earlier order whose first subject is one
-                of its own subjects. If its first subject is mode or motion, it also ends the action in progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first one is mode or motion, the order also ends the
+                action in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
@@ -4502,10 +4507,10 @@ class Vehicle(VehicleTwin):
         ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
         command is sent again. In all other cases the command is sent only once, because a repetition might arm a
         vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
-        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open. If
-        this command arms the vehicle after all, aerokit disarms it. This command counts as the cause if the vehicle
-        accepts it, or if the next HEARTBEAT reports armed and no pilot has taken over. A vehicle that was armed
-        otherwise stays armed. Logger "aerokit" warns about the outcome.
+        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open, and
+        disarms it if this command arms it after all. Arming is attributed to this command if the vehicle accepts the
+        command, or if the next HEARTBEAT reports armed and no pilot has taken over. If another party has armed the
+        vehicle, it stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which
@@ -4874,9 +4879,9 @@ class Vehicle(VehicleTwin):
         vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, as the
-                position of another vehicle, the one above home counts, and is taken as above this vehicle's home. The
-                vehicle keeps its present altitude if the target has none, or is ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, only the
+                altitude above home is used. Home is always this vehicle's home, also for the position of another
+                vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the present altitude is kept.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -4936,9 +4941,9 @@ class Vehicle(VehicleTwin):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left. PX4 always turns the shorter way to the new heading, and ArduPilot does so unless the angle is 170
-                to 350 degrees to either side.
-            relative: True to turn by an angle from the present heading. A full turn ends at once.
+                left. The vehicle turns the shorter way to the new heading, but ArduPilot turns by a relative angle of
+                170 to 350 degrees in the direction of its sign.
+            relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
@@ -4948,7 +4953,8 @@ class Vehicle(VehicleTwin):
             InvalidArgument: an argument is out of range. Nothing was sent.
             ValueUnknownError: ``relative`` is True, but the heading is unknown or older than 2 s. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement. A turn of 170 to 350 degrees is sent once, and may happen.
+            CommandTimeout: there was no acknowledgement; the vehicle may still turn. ArduPilot gets a relative angle of
+                170 to 350 degrees only once.
             OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.

@@ -62,8 +62,8 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
     async def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
         """Wait until the camera is found and has identified itself.
 
-        All other calls also wait until the camera is found. They request its information unless it is known, and work
-        without it only on a camera that is attached to the autopilot.
+        All other calls first wait in the same way, but a camera that is attached to the autopilot only has to be found;
+        it need not identify itself.
 
         Raises:
             CommandRejected: the camera refused to identify itself.

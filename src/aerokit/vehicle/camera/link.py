@@ -183,9 +183,9 @@ class CameraLink(CameraOrders):
             raise self.timeout_error("did not identify itself")
 
     async def require_capability(self, action: str, *capabilities: str) -> None:
-        """Raise NotSupported if the camera reports its capabilities and has none of ``capabilities``.
+        """Raise NotSupported if the camera is known to have none of ``capabilities``.
 
-        A trigger output reports none; it has only "capture_image".
+        A trigger output has only "capture_image". Any other camera that reports no capabilities passes the check.
         """
         information = await self.identify()
         if self.is_trigger and "capture_image" not in capabilities:

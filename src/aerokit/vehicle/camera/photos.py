@@ -320,9 +320,9 @@ class PhotoInterval:
             await self._check_silence(silent_checks)
 
     def _first_after_reset(self, capture: Capture) -> Capture | None:
-        """Return the first capture since the camera began to count from 0 again, once the next capture has arrived.
+        """Return the previous capture if it was the first one after the camera began to count from 0 again.
 
-        Only two successive low indices show a reset, because a single index could be corrupt.
+        Only two successive low indices show such a reset, because a single index could be corrupt.
         """
         previous, self._possible_first = self._possible_first, None
         if (
@@ -389,7 +389,8 @@ class PhotoInterval:
     async def _fetch_missing(self) -> None:
         """Request the next capture; if it does not arrive, count it as missed.
 
-        After too many unanswered requests, all captures up to the next received one count as missed.
+        After `MAX_UNANSWERED` unanswered requests, nothing more is requested, and all captures before the first one in
+        `_waiting` count as missed.
         """
         index = self._next_index
         assert index is not None

@@ -203,8 +203,8 @@ class CommandArbiter:
     ) -> Iterator[Order]:
         """Create a posted order, which is valid during the `with` block.
 
-        A newer order about the first subject ends it. The posted order itself ends earlier posted orders about any of
-        its subjects and, if it steers, the action in progress.
+        It ends earlier posted orders whose first subject is one of its subjects. If its own first subject is mode or
+        motion, it also ends the action in progress. A newer order about its first subject ends it.
         """
         first_subject = subjects[0]
         is_steering = first_subject != "arm"
@@ -318,8 +318,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program.
 
-        This is so if the program has given an order since the vehicle was last disarmed, and no takeover has ended
-        this order. A takeover does not undo an arm command.
+        Becomes False when the vehicle disarms. A takeover also makes it False, unless the program has ordered to arm
+        since the vehicle was last disarmed, which a takeover does not undo.
         """
         order, topics = self.newest, self._ordered_since_disarmed
         # After an order without modes, such as a raw command, a mode change does not prove a takeover. If a posted

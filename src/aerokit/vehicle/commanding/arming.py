@@ -130,10 +130,10 @@ class ArmingActions(VehicleBase):
         ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
         command is sent again. In all other cases the command is sent only once, because a repetition might arm a
         vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
-        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open. If
-        this command arms the vehicle after all, aerokit disarms it. This command counts as the cause if the vehicle
-        accepts it, or if the next HEARTBEAT reports armed and no pilot has taken over. A vehicle that was armed
-        otherwise stays armed. Logger "aerokit" warns about the outcome.
+        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open, and
+        disarms it if this command arms it after all. Arming is attributed to this command if the vehicle accepts the
+        command, or if the next HEARTBEAT reports armed and no pilot has taken over. If another party has armed the
+        vehicle, it stays armed. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which

@@ -238,9 +238,9 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """While a call awaits the effect of its order, let `end_flights` replace the order by a hold.
+        """Register the order whose effect a call awaits, so that `end_flights` can replace it by a hold.
 
-        If the vehicle hits the ground in the block, it is ordered to hold. Otherwise, it could climb again to the
+        The vehicle is also ordered to hold if it hits the ground in the block, because it could climb again to the
         target of the order.
         """
         self._awaited_order = order

@@ -210,7 +210,7 @@ class LobeCounter:
     def add(self, north_m: float, east_m: float) -> None:
         """Process a position of the vehicle, in metres from the center.
 
-        Each arrival in another lobe than the previous one counts as half a figure, and so does the first arrival.
+        The first lobe that the vehicle reaches counts as half a figure, and so does each change to the other lobe.
         """
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._min_along_m

@@ -136,8 +136,8 @@ class Health:
         return reasons
 
     def _unnamed_reasons(self) -> list[str]:
-        """Return the probable reasons why checks fail, if the vehicle names none. PX4 names a low battery only once."""
-        low_batteries = []
+        """Return low batteries, or a general text, as reasons for failing checks that the vehicle does not explain."""
+        low_batteries = []  # PX4 sends its status text about a low battery only once.
         for battery in self._telemetry.batteries.latest or ():
             # With these charge states (critical, emergency, failed, unhealthy), vehicles refuse to arm.
             if MavBatteryChargeState.CRITICAL <= battery.charge_state <= MavBatteryChargeState.UNHEALTHY:

@@ -285,14 +285,20 @@ class MessagingActions(VehicleBase):
         """Open an order without waiting for its effect, so that mode, arming and take-off can be sent in one go.
 
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
-        or their effect is reported. The retries also end when a newer order about the first subject is given, when the
-        vehicle changes to a mode that neither this order nor another order of the last ten seconds explains, and, if
-        the first subject is motion, when the vehicle disarms. If a posted order is abandoned, aerokit neither makes the
-        vehicle hold nor monitors late arming; use the actions for that.
+        or their effect is reported. The retries also end in these cases:
+
+        - A newer order is about the first subject of this order, perhaps among other subjects.
+        - The vehicle changes to a mode to which neither this order nor another order of the last ten seconds leads,
+          unless this order disarms.
+        - A failsafe becomes active, unless this order lands, returns or disarms.
+        - The vehicle reboots; or it disarms, and the first subject is motion.
+
+        If you leave the block early, aerokit neither makes the vehicle hold nor disarms it if it arms later. Use the
+        actions for that.
 
         Args:
-            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. An order ends each earlier order whose first subject is one
-                of its own subjects. If its first subject is mode or motion, it also ends the action in progress.
+            subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first one is mode or motion, the order also ends the
+                action in progress.
             modes: the modes that the order leads to.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 

@@ -249,8 +249,8 @@ class Order:
     def on_mode(self, mode: Mode, reported_at: float) -> None:
         """Update the order from a mode reported at this time; the class docstring describes the kinds of modes.
 
-        Once the order has taken effect, a return to the mode before the order is a takeover. It has taken effect when
-        one of its own modes is reported; with ``requires_mode_change``, only if the mode has changed to it.
+        The order has taken effect once one of its own modes is reported; with ``requires_mode_change``, once the mode
+        has changed to one of them. After that, a return to the mode before the order is a takeover.
         """
         number = mode.custom_mode
         is_first_report = self._mode_now is None

@@ -168,7 +168,7 @@ class StallDetector:
         return self._place is not None and self._there_since - self._sank_fast_at <= FALL_STOP_S
 
     def __call__(self, timeout_s: float = STALL_TIMEOUT_S) -> str | None:
-        """Return a clause if the vehicle has not moved for ``timeout_s`` seconds, otherwise None.
+        """Return an error text if the vehicle has not moved for ``timeout_s`` seconds, otherwise None.
 
         While the position is unknown, the result is None.
         """

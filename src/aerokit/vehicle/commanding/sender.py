@@ -144,7 +144,7 @@ class OrderSender:
     ) -> None:
         """Order the mode and wait until a message received after ``reported_since`` reports it.
 
-        While the mode is in doubt, only messages received after the acknowledgement count.
+        If the result of an earlier mode change is unknown, only messages received after the acknowledgement count.
         """
         started = self._session.connection.now()
         was_in_doubt = self._arbiter.mode_is_in_doubt
@@ -197,7 +197,7 @@ class OrderSender:
     async def await_mode(
         self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
     ) -> None:
-        """Wait until a message received after ``reported_since``, and recently, reports the mode."""
+        """Wait until the mode is reported by a message received after ``reported_since`` and not too long ago."""
         telemetry = self._session.telemetry
 
         def is_reported() -> bool:

@@ -244,7 +244,7 @@ async def receive_once(
 ) -> MessageT | None:
     """Request one message and return it; None if the vehicle refuses, or sends nothing after three requests.
 
-    Waits up to half a second for each acknowledgement, and then as long for the message.
+    After each request, it waits up to 0.5 s for the acknowledgement, and then up to 0.5 s for the message.
     """
     session = context.session
     target = session.component_id if component_id is None else component_id

@@ -89,9 +89,9 @@ class TravelActions(VehicleBase):
         vehicle that does not support this command.
 
         Args:
-            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, as the
-                position of another vehicle, the one above home counts, and is taken as above this vehicle's home. The
-                vehicle keeps its present altitude if the target has none, or is ``vehicle.home.value``.
+            target: latitude and longitude, and an altitude above home or above mean sea level. If it has both, only the
+                altitude above home is used. Home is always this vehicle's home, also for the position of another
+                vehicle. Without an altitude, or if the target is ``vehicle.home.value``, the present altitude is kept.
             speed_m_s: ground speed from now on, above 0; None keeps the present speed.
             heading_deg: heading on arrival, 0–360 clockwise from north; None leaves it to the autopilot.
             tolerance_m: arrival radius in metres; None: the default of the type of vehicle.
@@ -270,9 +270,9 @@ class TravelActions(VehicleBase):
 
         Args:
             heading_deg: −360 to 360, clockwise from north. With ``relative``, an angle to turn by, negative to the
-                left. PX4 always turns the shorter way to the new heading, and ArduPilot does so unless the angle is 170
-                to 350 degrees to either side.
-            relative: True to turn by an angle from the present heading. A full turn ends at once.
+                left. The vehicle turns the shorter way to the new heading, but ArduPilot turns by a relative angle of
+                170 to 350 degrees in the direction of its sign.
+            relative: True to turn by an angle from the present heading. With 360 or −360, the vehicle does not turn.
             rate_deg_s: turn rate in degrees per second; 0 leaves it to the autopilot. PX4 ignores it.
             tolerance_deg: accepted deviation in degrees.
             timeout: seconds until the vehicle has the heading.
@@ -282,7 +282,8 @@ class TravelActions(VehicleBase):
             InvalidArgument: an argument is out of range. Nothing was sent.
             ValueUnknownError: ``relative`` is True, but the heading is unknown or older than 2 s. Nothing was sent.
             CommandRejected: the vehicle refused.
-            CommandTimeout: there was no acknowledgement. A turn of 170 to 350 degrees is sent once, and may happen.
+            CommandTimeout: there was no acknowledgement; the vehicle may still turn. ArduPilot gets a relative angle of
+                170 to 350 degrees only once.
             OperationRejected: the mode changed, or the vehicle disarmed or hit the ground, during the turn.
             HeartbeatTimeout: the vehicle was silent for ``max_silence_s`` seconds.
             OperationTimeout: the vehicle did not reach the heading in time.

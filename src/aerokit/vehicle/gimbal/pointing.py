@@ -171,7 +171,7 @@ async def wait_until_reached(
 
 
 def _describe_state(orders: GimbalOrders, since: float) -> str:
-    """Return a clause about the gimbal's attitude, failures and limits; the order was given at ``since``."""
+    """Describe the gimbal's attitude, failures and limits for an error text; the order was given at ``since``."""
     source, device = orders.attitude_source, orders.device
     attitude = source.attitude
     if not attitude.is_known:

@@ -116,7 +116,10 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        """Stop the gimbal, unless another order was given or control was lost. Raise if the stream has stopped."""
+        """Stop the gimbal, unless a newer order was given or control was lost.
+
+        Raises the reason in these cases, and if the stream stopped earlier, unless an error was already raised.
+        """
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:
             self._stop(reason, hold=False)

@@ -259,8 +259,8 @@ class MissionControl(VehiclePlan["Mission"]):
 
         Args:
             item: number of the item.
-            timeout: seconds to wait for the end of a running transfer, and then again for MISSION_CURRENT; without
-                effect if the vehicle supports the command.
+            timeout: seconds to wait until a running transfer has ended, and as many again until MISSION_CURRENT
+                confirms the item. Not used with MAV_CMD_DO_SET_MISSION_CURRENT.
 
         Raises:
             InvalidArgument: there is no such item. Nothing was sent.
@@ -355,17 +355,16 @@ class MissionControl(VehiclePlan["Mission"]):
             self._is_paused = False
 
     async def wait_finished(self, *, timeout: float | None = None, max_silence_s: float | None = MAX_SILENCE_S) -> None:
-        """Wait until the mission has been flown to its end, including a landing at its end.
+        """Wait until the mission has been flown to its end and, if it ends with a landing, the vehicle has landed.
 
-        A :meth:`pause` by another task does not end the wait, but a pilot who then changes to another mode than that of
-        the mission does. Cancelling this call does not stop the vehicle, and no
-        command is sent when it fails. The end of the mission depends on its last item, which is known from an upload or
-        a download, unless another station has replaced the mission since. If the item is unknown, the mode after the
-        completion shows whether the vehicle lands.
+        A :meth:`pause` by another task does not end the wait, unless a pilot then changes to a mode other than that of
+        the mission. Cancelling this call does not stop the vehicle, and no command is sent when it fails. An upload or
+        a download shows whether the mission ends with a landing. Without them, or after another station has replaced
+        the mission, the mode after the completion shows whether the vehicle lands.
 
-        A replaced mission is noticed when the call begins, by another number of items, by another mission id (PX4 1.15
-        and later), or by the vehicle's answer to the other station (only on a link shared with that station). A mission
-        with the same number of items that arrives at ArduPilot over another link, or as a file, is not noticed: call
+        When the call begins, aerokit notices a replaced mission by its number of items, by its mission id (PX4 1.15 and
+        later), or by the vehicle's answer to the other station, if both stations share a link. It does not notice a
+        mission with the same number of items that ArduPilot has received over another link or as a file: call
         :meth:`download` first if another station may replace missions.
 
         Args:

@@ -251,7 +251,7 @@ class ParameterAccess:
             return await transfers.run(exchange)
 
     def _read_later(self, name: str, time: float) -> None:
-        """Read a parameter in the background at a time of the loop's clock, so that the store has its true value."""
+        """Read a parameter in the background at ``time`` (loop's clock), because its stored value may be wrong."""
 
         async def read() -> None:
             await anyio.sleep(time - self._transfers.connection.now())

@@ -166,8 +166,8 @@ class Parameters(ReadOnly):
         Use it to find out which of several names a firmware has; for renamed ArduPilot parameters use :meth:`get`.
 
         Returns:
-            For each name the parameter, or the error that :meth:`get` would have raised. The error's ``code`` is None
-            if the vehicle reported no error for this name, but answered requests for other names.
+            For each name the parameter, or the error that :meth:`get` would have raised. The ``code`` of a
+            ParameterRejected is None if the vehicle ignored this name although it answered other requests.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
@@ -220,8 +220,8 @@ class Parameters(ReadOnly):
     ) -> dict[str, ParameterWrite]:
         """Set the vehicle's parameters to those of a table, a dict or a parameter file.
 
-        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. If another
-        station may have changed parameters without your program receiving it, call ``download(refresh=True)`` first.
+        Values that equal the known ones (:attr:`table`) are not sent, and get the outcome ``"unchanged"``. Call
+        ``download(refresh=True)`` first if another station may have set values that your program has not received.
 
         ``method="ftp"`` writes one file (``@PARAM/param.pck``) and reads the values back, ``"set"`` sets them one by
         one, ``"auto"`` uses the file if the vehicle supports it and there are many changes. Results are as for

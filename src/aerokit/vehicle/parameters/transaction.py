@@ -98,8 +98,8 @@ class _Block:
     def _take_saved(self) -> list[Parameter]:
         """Return the parameters that this block must restore.
 
-        If an overlapping block has written a parameter later, that block restores it, to the value from before this
-        block.
+        If an overlapping block has written a parameter later, the value that this block saved is handed to the other
+        block, which restores it at its own end.
         """
         self._has_ended = True
         to_restore = []

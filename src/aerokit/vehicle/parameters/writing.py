@@ -267,8 +267,8 @@ class ParameterWriter:
     ) -> dict[str, ParameterWrite]:
         """Write the values; return a result for each, in order.
 
-        With ``upload``, send only values that differ from the known ones, by the method ``upload``. ``resolve`` is
-        called before each round of writes instead of :meth:`NameResolver.resolve`.
+        ``upload`` is the method of an upload, which sends only values that differ from the known ones; None sends all
+        values by PARAM_SET. ``resolve`` is called before each round of writes instead of :meth:`NameResolver.resolve`.
         """
         resolve = resolve or self.names.resolve
         results: dict[str, ParameterWrite] = {}

@@ -291,8 +291,8 @@ class VehicleSession:
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
         """Collect the acks that refuse a command during a `with` block.
 
-        PX4 acknowledges some commands twice, so that a refusal may follow an acceptance. An acceptance, for example of
-        a repetition, cancels the refusals before it.
+        PX4 acknowledges some commands twice, and may first accept and then refuse them. If it accepts the command
+        again, for example because the command was repeated, the refusals so far are removed.
         """
         refusals: list[CommandAck] = []
 
@@ -398,7 +398,7 @@ class VehicleSession:
         ]
 
     def _attach_watched_streams(self) -> None:
-        """Arrange that a message without a default rate is requested while a state that it reports is watched."""
+        """Let each state whose message has no default rate request it while the program watches the state."""
         for name, state in STATES.items():
             cell = self.telemetry.cells[name]
             for source in state.sources:

@@ -76,9 +76,9 @@ class ComponentSubscriber:
         *,
         entire_system: bool = False,
     ) -> Subscription[ItemT]:
-        """Return a subscription to events and messages; entering it requests the rates of its messages.
+        """Return a subscription to events and messages, which requests the messages during its `with` block.
 
-        The messages are those of this component, or of all components if ``entire_system`` is True.
+        It receives the messages of this component, or of all components if ``entire_system`` is True.
         """
         self._connection.check_types(types)
         message_types: list[type[Message]] = [type_ for type_ in types if issubclass(type_, Message)]

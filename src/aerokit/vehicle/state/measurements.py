@@ -146,7 +146,7 @@ def _scaled(factor: float, x: float, y: float, z: float) -> tuple[float, float, 
 
 
 def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
-    """Return the readings in HIGHRES_IMU, whose magnetic field has a unit that depends on the autopilot."""
+    """Return the readings in HIGHRES_IMU, with the magnetic field converted from the autopilot's unit."""
     return Imu(
         acceleration_m_s2=(message.xacc, message.yacc, message.zacc),
         rate_deg_s=_scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),

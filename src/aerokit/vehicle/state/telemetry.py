@@ -192,9 +192,9 @@ class Telemetry(States):
         return Source(self.system_id, self.component_id, message_type(class_name).NAME)
 
     def _receiver(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
-        """Return a function that passes the messages of the vehicle's autopilot to ``handler``, and no others.
+        """Return a function that passes a message to ``handler``, unless a component other than the autopilot sent it.
 
-        A message without a frame was not received from a link, but given by a program or a log; it is passed, too.
+        A message without a frame is always passed: it was not received from a link, but given by a program or a log.
         """
         source = self._source(class_name)
 
