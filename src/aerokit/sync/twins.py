@@ -538,7 +538,7 @@ class Guided(TwinOf["AsyncGuided"]):
         """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
 
         With ``yaw_deg`` on ArduPilot, "forward" is the direction of the vehicle's nose at the time of ``set``, and
-        stays so while the vehicle turns. Supply a new set-point often meanwhile.
+        stays so while the vehicle turns. Therefore call ``set`` often during a turn.
         """
         return SetpointStream(
             self._loop,
@@ -1171,8 +1171,8 @@ class Gimbal(TwinOf["AsyncGimbal"]):
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
                 then turns with the vehicle, so a yaw from north is correct only at the time of the order.
-            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards, except after a
-                mount command (see ``roll_deg`` and below), after which it always turns with the vehicle.
+            frame: reference of the yaw. Afterwards the gimbal keeps its yaw from north (``"earth"``), or it turns with
+                the vehicle (``"vehicle"``, and after every mount command: see ``roll_deg`` and below).
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.
@@ -1824,11 +1824,12 @@ class Actuators(TwinOf["AsyncActuators"]):
         self._loop.run(self.aio.set_actuator, number, value)
 
     def set_actuators(self, *values: float | None) -> None:
-        """Set up to six actuators: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+        """Set up to six actuators (MAV_CMD_DO_SET_ACTUATOR).
 
-        PX4 only; for ArduPilot use ``set_servo``. Returns when PX4 has acknowledged, because no message reports the
-        values. PX4 acknowledges even if no output has the function of the actuator (PWM_MAIN_FUNCn 301 to 306). Raises
-        as :meth:`repeat_servo`.
+        PX4 only; for ArduPilot use ``set_servo``. The first value sets the outputs with the function "Peripheral via
+        Actuator Set 1" (PWM_MAIN_FUNCn is 301), the sixth value those with "… Set 6" (306). Returns when PX4 has
+        acknowledged, because no message reports the values. PX4 acknowledges even if no output has the function.
+        Raises as :meth:`repeat_servo`.
 
         Args:
             values: one to six values, −1 to 1; None leaves an actuator as it is.
@@ -2544,9 +2545,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare ``plan`` with the vehicle's plan: by PX4's checksum; on ArduPilot by reading it again,
-                if an earlier transfer makes few differences likely. Send nothing if both are equal. Send only the
-                items that differ if the vehicle supports that.
+            only_changes: send nothing if the vehicle already has this plan, and only the items that differ if the
+                vehicle supports that. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only
+                if ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2752,9 +2753,9 @@ class FenceControl(TwinOf["AsyncFenceControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare ``plan`` with the vehicle's plan: by PX4's checksum; on ArduPilot by reading it again,
-                if an earlier transfer makes few differences likely. Send nothing if both are equal. Send only the
-                items that differ if the vehicle supports that.
+            only_changes: send nothing if the vehicle already has this plan, and only the items that differ if the
+                vehicle supports that. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only
+                if ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -2861,9 +2862,9 @@ class RallyControl(TwinOf["AsyncRallyControl"]):
         Args:
             plan: checked before anything is sent.
             method: ``"ftp"`` (ArduPilot's ``@MISSION/…`` files), ``"items"`` (the mission protocol), or ``"auto"``.
-            only_changes: compare ``plan`` with the vehicle's plan: by PX4's checksum; on ArduPilot by reading it again,
-                if an earlier transfer makes few differences likely. Send nothing if both are equal. Send only the
-                items that differ if the vehicle supports that.
+            only_changes: send nothing if the vehicle already has this plan, and only the items that differ if the
+                vehicle supports that. PX4's plan is compared by its checksum. ArduPilot's plan is read first, but only
+                if ``plan`` is similar to the plan that was last transferred. Otherwise, all items are sent.
             verify: read the plan back and compare it, or compare PX4's checksum if that is faster. A plan that is sent
                 as a file is read back even if this is False.
             max_distance_m: refuse a plan with a position farther than this from the vehicle, if the vehicle's position
@@ -4122,13 +4123,13 @@ class Vehicle(VehicleTwin):
 
         Args:
             command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, even where the command allows NaN.
+            params: param1 to param7; missing ones are sent as 0, never as NaN.
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
-            retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
-                command that changes more than streams is sent again only right after a HEARTBEAT, and only if the mode
-                has not changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a
-                request for data, 0 for all other commands, because a retry after a lost ack would execute the command
-                twice.
+            retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time.
+                None: 3 for a request for data, 0 for all other commands, because a retry after a lost ack would execute
+                the command twice. A command that is not a request for data is sent again only right after a HEARTBEAT,
+                and only if the mode has not changed, no failsafe is active and there is no newer order
+                (docs/reliability.md).
             attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
                 trips if necessary. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
@@ -4170,8 +4171,8 @@ class Vehicle(VehicleTwin):
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
         ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with ``x`` and ``y``
-        in degrees. COMMAND_LONG has no frame, so ``frame`` must be 0 then, and the altitude of this command must always
-        be above mean sea level. Other arguments and errors are those of :meth:`command`.
+        in degrees. Because COMMAND_LONG has no frame, ``or_long`` requires ``frame=0``, and is only for commands whose
+        altitude is always above mean sea level. Other arguments and errors are those of :meth:`command`.
         """
         return self._loop.run(
             self.aio.command_int,
@@ -4192,8 +4193,9 @@ class Vehicle(VehicleTwin):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command or a SET_MODE counts as an order and ends the action in progress, like :meth:`command`. A
-        set-point supersedes :meth:`posted` orders about motion. A message to another system has neither effect.
+        If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
+        as :meth:`command` does. A set-point does not end the action, only orders about motion that :meth:`posted` has
+        opened. A message to another system ends nothing.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.

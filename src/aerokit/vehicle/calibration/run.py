@@ -223,10 +223,10 @@ class CalibrationRun:
             self.finish()
 
     def _is_cancelled(self, cancel_command: float) -> bool:
-        """Return True if the vehicle has confirmed the cancellation.
+        """Return True if the vehicle has confirmed ``cancel_command``, or has rebooted.
 
-        COMMAND_ACK confirms DO_CANCEL_MAG_CAL, and ArduPilot's end of the radio calibration. HEARTBEAT confirms
-        PREFLIGHT_CALIBRATION on PX4, because PX4 acknowledges it twice with different results.
+        On ArduPilot, the confirmation is a COMMAND_ACK. On PX4, it is a HEARTBEAT that no longer reports a calibration,
+        because PX4 acknowledges PREFLIGHT_CALIBRATION twice with different results.
         """
         if self._has_rebooted:
             return True

@@ -178,9 +178,10 @@ class CommandArbiter:
 
     @contextmanager
     def auxiliary_order(self, device_order: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
-        """Create an order that does not steer (speed, home, arming …).
+        """Create an order that does not say where to fly (speed, home, arming …).
 
-        With ``device_order``, the order is a part of that order about a device, and ends with it.
+        With ``device_order``, which is an order about a device, the new order is for one of its commands. It ends when
+        a newer order about the device is given.
 
         Raises:
             OperationRejected: a newer order about the device was given.
@@ -340,10 +341,10 @@ class CommandArbiter:
 
     @contextmanager
     def changing_mode(self) -> Iterator[None]:
-        """Distrust the reported mode until the vehicle has answered a command that changes the mode.
+        """Keep the reported mode in doubt during a `with` block in which a command changes the mode.
 
-        After a cancellation or a time-out, the mode stays in doubt until a later change is confirmed. A refusal adds no
-        doubt. Blocks may overlap, because a new order replaces one whose block has not ended.
+        If the block is cancelled or times out, the mode stays in doubt until a later change is confirmed. After
+        a refusal, it is as certain as before. Blocks may overlap, because a new order may be given during a block.
         """
         change = next(self._order_numbers)
         self._open_mode_changes += 1

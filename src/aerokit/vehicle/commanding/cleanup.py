@@ -161,15 +161,15 @@ class FlightCleanup:
     # ---------------------------------------------------------------------- abandoned orders
 
     def hold_in_background(self, order: Order) -> bool:
-        """Hold after an order was abandoned, without waiting. For use at the ends of blocks and in cancelled calls.
+        """Order a hold because ``order`` was abandoned. Never waits, so that cancelled calls can use it.
 
-        Return False if nothing is sent: the order cannot have moved the vehicle, no hold can be sent, the vehicle is
-        disarmed, or the order has ended, for example because a pilot took over.
+        Returns False, and sends nothing, if ``order`` cannot have moved the vehicle or has ended (for example because a
+        pilot took over), if the vehicle is disarmed or has no hold mode, or if its session has ended.
 
-        Otherwise return True. One command is sent at once if the last HEARTBEAT is recent and the order has not begun
-        to hold itself. Otherwise it is sent after the next HEARTBEAT, unless the order has ended or the vehicle is
-        disarmed by then. While the connection is open, a background task waits for the confirmation, and sends the hold
-        again if there is none.
+        Otherwise returns True. The hold is sent at once if the last HEARTBEAT is recent. If it is not, or if ``order``
+        was itself a hold, the hold is sent after the next HEARTBEAT, but only if ``order`` has not ended and the
+        vehicle is not disarmed by then. A background task waits for the confirmation, and repeats the hold if there is
+        none.
         """
         if not order.may_move:
             return False
@@ -261,15 +261,15 @@ class FlightCleanup:
 
     @contextmanager
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
-        """Create the order to change to ``mode``, which the caller sends after the `with` block.
+        """Create an order to change to ``mode`` for a `with` block that prepares a stream, and may wait.
 
-        The caller prepares a stream in the block, and may wait there. After any error but BusyError, the vehicle is
-        ordered to hold if an earlier order of the program may still move it; see `hold_in_background`.
+        The caller sends the order after the block. If the block fails, the order is abandoned: the vehicle is ordered
+        to hold if an earlier order of the program may still move it (see `hold_in_background`).
 
         Raises:
-            BusyError: another stream is open.
-            OperationRejected: the order has ended meanwhile: it was superseded or taken over.
-            HeartbeatTimeout: the vehicle is silent.
+            BusyError: another stream is open. No order was created.
+            OperationRejected: at the end of the block, the order was superseded or taken over.
+            HeartbeatTimeout: at the end of the block, the vehicle was silent.
         """
         self.check_no_stream()
         order = self._arbiter.order(mode)

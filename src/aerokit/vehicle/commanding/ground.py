@@ -189,7 +189,7 @@ class GroundCheck:
         return self._impact.describe() or None
 
     def _has_settled(self, now: float, updated_at: float) -> bool:
-        """Return True if the vehicle moves no faster than on the ground.
+        """Return True if the vehicle has stopped climbing or sinking, or if it reports no recent velocity.
 
         ``updated_at`` is the time of the last velocity.
         """

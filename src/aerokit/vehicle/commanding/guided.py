@@ -91,7 +91,7 @@ class Guided:
         """Stream velocities in the body frame (SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_BODY_NED).
 
         With ``yaw_deg`` on ArduPilot, "forward" is the direction of the vehicle's nose at the time of ``set``, and
-        stays so while the vehicle turns. Supply a new set-point often meanwhile.
+        stays so while the vehicle turns. Therefore call ``set`` often during a turn.
         """
         return self._stream("velocity", self._encode.body_velocity, initial, rate_hz, valid_for_s, max_lag_s)
 

@@ -225,11 +225,10 @@ class Health:
         return sensors is not None and sensors.prearm_checks_pass is False and not is_meaningless
 
     def _failing_sensors(self) -> list[str]:
-        """Return failing sensors.
+        """Return the failing sensors that may prevent arming; none if the vehicle reports that it can be armed.
 
-        If the vehicle reports that it can be armed, failing sensors are left out, because they are not required (for
-        example an RC receiver on PX4). PX4 reports a missing RC receiver as failing even in modes that do not require a
-        receiver.
+        An RC receiver is left out in modes that do not require one, because PX4 reports a missing receiver as failing
+        in all modes.
         """
         sensors = self._telemetry.sensors.latest
         # In a mode that does not allow arming, PX4 reports what this mode requires. The report then does not show what

@@ -176,13 +176,13 @@ class MessagingActions(VehicleBase):
 
         Args:
             command: the number, or a member of ``enums.MavCmd``.
-            params: param1 to param7; missing ones are 0, even where the command allows NaN.
+            params: param1 to param7; missing ones are sent as 0, never as NaN.
             component_id: the target component, by default the autopilot. 0: all components; the autopilot's ack counts.
-            retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time. A
-                command that changes more than streams is sent again only right after a HEARTBEAT, and only if the mode
-                has not changed, no failsafe is active and there is no newer order (docs/reliability.md). None: 3 for a
-                request for data, 0 for all other commands, because a retry after a lost ack would execute the command
-                twice.
+            retries: maximum number of retransmissions without an ack, from 0; ``confirmation`` increments each time.
+                None: 3 for a request for data, 0 for all other commands, because a retry after a lost ack would execute
+                the command twice. A command that is not a request for data is sent again only right after a HEARTBEAT,
+                and only if the mode has not changed, no failsafe is active and there is no newer order
+                (docs/reliability.md).
             attempt_timeout: seconds to wait for an ack after each transmission, above 0, extended to two measured round
                 trips if necessary. None: 1, or 4 if the command is sent only once.
             progress_timeout: seconds to wait for the next ack after each IN_PROGRESS; calibrations can take long.
@@ -224,8 +224,8 @@ class MessagingActions(VehicleBase):
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees, or 1e-4 m in local frames; ``z`` is in metres. With
         ``or_long``, firmware that does not support the command as COMMAND_INT gets a COMMAND_LONG with ``x`` and ``y``
-        in degrees. COMMAND_LONG has no frame, so ``frame`` must be 0 then, and the altitude of this command must always
-        be above mean sea level. Other arguments and errors are those of :meth:`command`.
+        in degrees. Because COMMAND_LONG has no frame, ``or_long`` requires ``frame=0``, and is only for commands whose
+        altitude is always above mean sea level. Other arguments and errors are those of :meth:`command`.
         """
         if or_long and frame != MavFrame.GLOBAL:
             raise InvalidArgument(f"frame = {frame} is not allowed with or_long: it must be MAV_FRAME_GLOBAL (0)")
@@ -250,8 +250,9 @@ class MessagingActions(VehicleBase):
     def send(self, message: Message) -> None:
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
-        A steering command or a SET_MODE counts as an order and ends the action in progress, like :meth:`command`. A
-        set-point supersedes :meth:`posted` orders about motion. A message to another system has neither effect.
+        If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
+        as :meth:`command` does. A set-point does not end the action, only orders about motion that :meth:`posted` has
+        opened. A message to another system ends nothing.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.

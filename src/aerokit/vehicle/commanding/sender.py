@@ -51,12 +51,12 @@ class OrderSender:
         """Send one command of an order until it is acknowledged or its effect is reported.
 
         The effect is reported once the vehicle has changed to one of ``modes`` or to ``armed``, or ``is_done()``
-        returns True. In a steering order, each command but the first one waits for a recent HEARTBEAT.
+        returns True. If the order flies the vehicle, each of its commands but the first waits for a recent HEARTBEAT.
 
         Raises:
-            OperationRejected: the order has ended: it was superseded or taken over. Or the computer slept before a
-                later command of the order.
-            HeartbeatTimeout: the vehicle was silent before a later command of the order.
+            OperationRejected: the order was superseded or taken over, or the computer slept before a later command of
+                an order that flies the vehicle.
+            HeartbeatTimeout: the vehicle was silent before a later command of such an order.
             CommandRejected: the vehicle refused; ``reasons`` has its status texts.
             CommandTimeout: there was no acknowledgement; the text says why the command was not sent again.
         """

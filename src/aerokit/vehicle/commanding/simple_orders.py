@@ -108,8 +108,8 @@ class SimpleOrder(Snapshot):
         Args:
             context: the vehicle.
             values: one for each `Argument`, in order; they are also passed to `Effect.is_reported`.
-            device_order: an earlier order to the device, if this command belongs to that order.
-            topic: key of the device that the command is for. A newer order with the same topic ends this call.
+            device_order: the order of which this command is a part. None: create one about ``topic``, if given.
+            topic: identifies the device, e.g. ``("relay", 3)``. A newer order with the same topic ends this call.
             component_id: the target component; None: the autopilot.
             timeout: seconds after the acknowledgement within which a message must report the effect.
 

@@ -368,8 +368,8 @@ class TakeoverCheck:
     def raise_if_changed(self, operation: str) -> None:
         """Raise OperationRejected if an order was given, or if the mode was changed.
 
-        Two changes are allowed: to the mode that is ordered next, and from the take-off mode to the hold mode, which is
-        the end of a take-off.
+        Two mode changes are allowed: to the mode that the caller wants to order, and from the take-off mode to the hold
+        mode, as at the end of a take-off.
         """
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")

@@ -141,11 +141,12 @@ class Actuators(ReadOnly):
         await self.set_actuators(*(value if index == number else None for index in range(1, ACTUATORS + 1)))
 
     async def set_actuators(self, *values: float | None) -> None:
-        """Set up to six actuators: the first value is for "Peripheral via Actuator Set 1" (MAV_CMD_DO_SET_ACTUATOR).
+        """Set up to six actuators (MAV_CMD_DO_SET_ACTUATOR).
 
-        PX4 only; for ArduPilot use ``set_servo``. Returns when PX4 has acknowledged, because no message reports the
-        values. PX4 acknowledges even if no output has the function of the actuator (PWM_MAIN_FUNCn 301 to 306). Raises
-        as :meth:`repeat_servo`.
+        PX4 only; for ArduPilot use ``set_servo``. The first value sets the outputs with the function "Peripheral via
+        Actuator Set 1" (PWM_MAIN_FUNCn is 301), the sixth value those with "… Set 6" (306). Returns when PX4 has
+        acknowledged, because no message reports the values. PX4 acknowledges even if no output has the function.
+        Raises as :meth:`repeat_servo`.
 
         Args:
             values: one to six values, −1 to 1; None leaves an actuator as it is.

@@ -251,7 +251,8 @@ class Logs:
     ) -> tuple[str | None, LogEntry]:
         """Return the path of a log for MAVFTP, and the entry of the log.
 
-        If the path is None, download the log by LOG_* messages. The entry, which they require, is then up to date.
+        If the path is None, the caller must download the log by LOG_* messages. The entry was then just received, so
+        that its size is right.
         """
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
@@ -288,9 +289,9 @@ class Logs:
         """Return the current entry of a log.
 
         With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
-        If only an id is given, the whole list is requested: if there is no log with this id, a request for it alone
-        would make ArduPilot list nonexistent logs endlessly. A log that was listed rarely disappears; LOG_REQUEST_END
-        then ends the listing.
+        For a `LogEntry`, only this entry is requested. For an id, the whole list is requested, because the log may not
+        exist: ArduPilot answers the request for a single nonexistent log by a list of nonexistent logs that does not
+        end until LOG_REQUEST_END.
         """
         log_id = log if isinstance(log, int) else log.id
         only_id = None if isinstance(log, int) else log.id
@@ -375,9 +376,9 @@ async def log_path(
 ) -> str | None:
     """Return the path of a log for MAVFTP; None if the file cannot be identified.
 
-    ArduPilot's log 1 is the lowest of its numbered files such as ``00000001.BIN``. PX4 writes a list of paths to a file
-    when its logs are requested, in the order of the ids. The size must match the entry. ArduPilot's file of a log that
-    is still being written, or that was being written at the time of the entry (``may_have_grown``), may be larger.
+    ArduPilot: log 1 is the file with the lowest number, such as ``00000001.BIN``. PX4: when its logs are requested, it
+    writes a list file, which has one path for each log id. The file must be as large as ``log`` says. On ArduPilot, it
+    may be larger if it is the newest one, or if the log was still being written at that time (``may_have_grown``).
     """
     for directory in directories:
         try:

@@ -266,7 +266,7 @@ class GimbalControl:
         return self
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        """Release control, or raise GimbalTaken if control was lost and the program does not know that yet."""
+        """Release control. If it was lost, and no call has reported that yet, raise GimbalTaken instead."""
         if self._taken is not None:
             self._end()
             if error is None and not self._was_loss_raised:
@@ -339,7 +339,7 @@ class GimbalControl:
         return controllers.primary if self._is_primary else controllers.secondary
 
     def _release_command(self) -> ReleaseCommand:
-        """Return the command that releases control. It is not sent if control was lost or other blocks need control."""
+        """Return the command that releases control. It sends nothing if control was lost or other blocks need it."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary, release=True)
         requests = orders.registry.control_requests

@@ -181,9 +181,9 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Record the sender as manager if its rank is high enough, and return the gimbal that its message is about.
+        """Return the gimbal that a manager's message is about; record the sender as this gimbal's manager.
 
-        Returns None if orders to this gimbal go to another component, or if the gimbal or the sender is unknown.
+        Returns None if a better manager of this gimbal is known, or if the gimbal or the sender is unknown.
         """
         frame = message.received_frame
         if frame is None:

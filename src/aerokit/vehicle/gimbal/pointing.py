@@ -275,8 +275,8 @@ class PointingMixin(GimbalMixin):
             yaw_deg: −360 to 360, clockwise from north (``frame="earth"``) or from the nose (``"vehicle"``).
             roll_deg: from the horizon, −360 to 360. A roll other than 0 is sent by the older mount command. The gimbal
                 then turns with the vehicle, so a yaw from north is correct only at the time of the order.
-            frame: reference of the yaw. The gimbal keeps the yaw relative to this reference afterwards, except after a
-                mount command (see ``roll_deg`` and below), after which it always turns with the vehicle.
+            frame: reference of the yaw. Afterwards the gimbal keeps its yaw from north (``"earth"``), or it turns with
+                the vehicle (``"vehicle"``, and after every mount command: see ``roll_deg`` and below).
             wait: False: return when the manager has accepted the order.
             tolerance_deg: accepted deviation in each axis, above 0 and at most 45.
             timeout: seconds to wait.

@@ -66,10 +66,10 @@ class _Block:
     async def _resolve_and_save(
         self, names: Iterable[str], idle_timeout_s: float
     ) -> dict[str, ResolvedParameter | ParameterFailure]:
-        """Resolve names, and save the parameters before their first write.
+        """Resolve names, and remember the parameters as they are before their first write, to restore them later.
 
-        They are read again, because the store may be outdated. The writer calls this before each of its rounds, so that
-        parameters that appear after the first round are saved too.
+        Reads the parameters from the vehicle, because the store may be outdated. The writer calls this before each
+        round of writes, because some parameters appear only after the first round.
         """
         results = await self._writer.names.resolve(names, idle_timeout_s)
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]

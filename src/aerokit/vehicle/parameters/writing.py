@@ -294,7 +294,7 @@ class ParameterWriter:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
-        """Send the planned values, and return the vehicle's answers by the names on the vehicle."""
+        """Send the planned values. Return the vehicle's answers; the keys are the parameters' names on the vehicle."""
         if upload is None:  # `ParameterWrites` sends each name once, even if two plans have it.
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
         # Two names may mean the same parameter, which must be in the file only once.
@@ -330,7 +330,7 @@ class ParameterWriter:
         return plans, errors
 
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
-        """Compare a plan with the vehicle's answer, and convert the result to the name and unit of the program."""
+        """Return the result of one write, with the name and the unit in which the program requested it."""
         name, requested = plan.resolved.requested, plan.requested
         answer = answers[plan.to_send.name]
         outcome = outcome_of(plan.to_send, plan.old, answer)

@@ -142,8 +142,8 @@ class MessageRates:
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
 
-        If a message for which all present requests are optional is refused or never arrives, for example because its
-        sensor is missing, neither StreamUnavailable nor StreamSlow is published.
+        ``is_optional`` means that the vehicle may lack the message, for example because it lacks the sensor. If all
+        present requests for a message are optional, no event reports that it was refused or never arrives.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)

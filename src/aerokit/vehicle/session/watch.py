@@ -153,8 +153,8 @@ class VehicleWatch:
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
         """Detect a reboot by the time since boot in an answer to our TIMESYNC request.
 
-        If the request was sent after the previous answer had been processed, its answer cannot be a late message. A
-        lower time than before then proves a reboot, without confirmation by a second message.
+        An answer is ignored if its request was sent before the previous answer arrived, because the two may be in the
+        wrong order. In any other answer, a time lower than the previous one proves a reboot.
         """
         answered_at, milliseconds_before = self._last_answer
         if requested_at <= answered_at:
