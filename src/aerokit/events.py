@@ -150,7 +150,7 @@ class FrameRefused(Event):
 class OrderRefused(Event):
     """The program that serves the vehicle on the network did not forward a message of this program (docs/network.md).
 
-    ``message`` is the name of the MAVLink message, and ``reason`` a clause that explains the refusal. ``lease_holder``
+    ``message`` is the name of the MAVLink message, and ``reason`` a text that explains the refusal. ``lease_holder``
     is the client that controls the vehicle, if its control is the reason of the refusal; otherwise None. Published at
     most twice a second for each message name.
     """

@@ -148,7 +148,7 @@ def other_names(name: str) -> tuple[str, ...]:
 
 
 def replacement_of(name: str) -> str:
-    """Describe what replaces a parameter that has no direct successor, as a clause; empty if unknown."""
+    """Return a text about what replaces a parameter that has no direct successor; empty if unknown."""
     return REPLACED.get(name, "")
 
 

@@ -108,7 +108,7 @@ class OrderStatus(Protocol):
 
     @property
     def end(self) -> str:
-        """Reason why the order has ended, as a clause; empty while the order may be sent again."""
+        """Text that explains why the order has ended; empty while the order may be sent again."""
         ...
 
     @property

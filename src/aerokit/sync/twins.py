@@ -1343,7 +1343,7 @@ class PostedOrder(TwinOf["AsyncPostedOrder"]):
 
     @property
     def end(self) -> str:
-        """Reason why the order's commands are not repeated, as a clause; empty while they may be repeated."""
+        """Text that explains why the order's commands are not repeated; empty while they may be repeated."""
         return self.aio.end
 
     def command(self, command: int, *params: float, component_id: int | None = None) -> None:
@@ -4331,7 +4331,7 @@ class Vehicle(VehicleTwin):
         return self._loop.call(self.aio.describe_link)
 
     def describe_now(self) -> str:
-        """Return a clause about the reported state.
+        """Return a text about the reported state.
 
         For example: ``holding in BRAKE, still armed, 9 m above home, last heartbeat 0.3 s ago``.
         """
@@ -4452,7 +4452,7 @@ class Vehicle(VehicleTwin):
 
     @property
     def taken_over(self) -> str:
-        """The takeover that ended the program's last action, as a clause; empty if there was none.
+        """Text about the takeover that ended the program's last action; empty if there was none.
 
         A change of the mode (``"the mode changed to LOITER"``) may come from a pilot, a failsafe or another program:
         HEARTBEAT does not distinguish them. A failsafe (``"a failsafe became active (MAV_STATE_CRITICAL)"``) may be

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def ground_station_failsafe(vehicle: Vehicle) -> dict[str, Any]:
     """Return the vehicle's action after the loss of the ground station, according to its parameters.
 
-    ``action`` is a clause, or None while the action is unknown. ``because`` is the parameter that decides, with its
+    ``action`` is a text, or None while the action is unknown. ``because`` is the parameter that decides, with its
     value. ``unread`` lists parameters that would be needed but were not read. Requests nothing.
     """
 

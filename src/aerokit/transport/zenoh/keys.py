@@ -156,7 +156,7 @@ class RefusalNotice(Snapshot):
     message: str
     """Name of the MAVLink message, e.g. "COMMAND_LONG"."""
     reason: str
-    """Reason for the refusal, as a clause."""
+    """Text that explains the refusal."""
     lease_holder: str | None = None
     """Client that has control, if its control is the reason."""
     answer: bytes = b""

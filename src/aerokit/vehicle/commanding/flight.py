@@ -376,7 +376,7 @@ class ModeActions(VehicleBase):
 
     @property
     def taken_over(self) -> str:
-        """The takeover that ended the program's last action, as a clause; empty if there was none.
+        """Text about the takeover that ended the program's last action; empty if there was none.
 
         A change of the mode (``"the mode changed to LOITER"``) may come from a pilot, a failsafe or another program:
         HEARTBEAT does not distinguish them. A failsafe (``"a failsafe became active (MAV_STATE_CRITICAL)"``) may be

@@ -192,7 +192,7 @@ class FollowStream(SteeringStream[TargetState]):
         self._impact = ImpactDetector(context.session.telemetry)
         # Cancels the background task that reads the target, if there is one.
         self._reading: Cancellation | None = None
-        # Why the source of positions ended or failed, as a clause; empty while it works.
+        # Text that explains why the source of positions ended or failed; empty while it works.
         self._end_reason = ""
         # Set when the block is entered: bearing from the target, course of the target, altitude of the follower.
         self._bearing_deg = 0.0

@@ -120,7 +120,7 @@ class ImpactDetector:
         self._has_slowed = self._impact_m_s is not None and (self._has_slowed or is_slow)
 
     def describe(self) -> str:
-        """Return a clause about the impact; empty if there was none, or if the vehicle has flown on since."""
+        """Return a text about the impact; empty if there was none, or if the vehicle has flown on since."""
         if self._impact_m_s is None or not self._has_slowed:
             return ""
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
@@ -181,7 +181,7 @@ class GroundCheck:
         return self.fall() if self.is_reported_on_ground else in_flight()
 
     def fall(self) -> str | None:
-        """Return a clause if the vehicle has hit the ground, or sinks fast although reported landed and disarmed."""
+        """Return a text if the vehicle has hit the ground, or sinks fast although reported landed and disarmed."""
         telemetry = self._session.telemetry
         is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
         if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:

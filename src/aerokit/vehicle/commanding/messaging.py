@@ -417,7 +417,7 @@ class MessagingActions(VehicleBase):
         return self._session.describe_link()
 
     def describe_now(self) -> str:
-        """Return a clause about the reported state.
+        """Return a text about the reported state.
 
         For example: ``holding in BRAKE, still armed, 9 m above home, last heartbeat 0.3 s ago``.
         """

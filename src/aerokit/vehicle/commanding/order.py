@@ -107,7 +107,7 @@ def is_worse_failsafe(state: int, state_before: int | None) -> bool:
 
 
 def failsafe_text(state: int) -> str:
-    """Return a clause about the failsafe, for error texts."""
+    """Return a part of an error text that names the failsafe."""
     name = MavState(state).name
     return f"a failsafe became active (MAV_STATE_{name}) and keeps control; no hold was ordered"
 
@@ -168,11 +168,11 @@ class Order:
         """The previous order about the same device, which becomes valid again if this order is withdrawn."""
         self.is_withdrawn: bool = False
         self.takeover_reason: str = ""
-        """The action of another party that ended the order, as a clause; empty if there was none."""
+        """Text about the action of another party that ended the order; empty if there was none."""
         self.impact: str = ""
-        """The impact on the ground while a call waited for the order, as a clause; empty if there was none."""
+        """Text about an impact on the ground while a call waited for the order; empty if there was none."""
         self.failsafe: str = ""
-        """The failsafe that became active after the order, as a clause; empty if there was none."""
+        """Text about the failsafe that became active after the order; empty if there was none."""
         self.unexplained: str = ""
         """A clause about a mode change that a raw command or another party may have caused; empty if there was none."""
         self.has_lost_mode: bool = False
@@ -215,7 +215,7 @@ class Order:
 
     @property
     def end(self) -> str:
-        """Reason why no command of the order may be sent, as a clause; empty while commands may be sent."""
+        """Text that explains why no command of the order may be sent; empty while commands may be sent."""
         if not self.is_newest:
             return SUPERSEDED
         return self.takeover_reason or ("" if self._ends_flight else self.failsafe)
@@ -348,7 +348,7 @@ class SentCommand:
 
     @property
     def end(self) -> str:
-        """Reason why the command is not sent again, as a clause for error texts; empty while it may be sent again."""
+        """Error text that explains why the command is not sent again; empty while it may be sent again."""
         if self.is_confirmed:
             return "its effect was reported"
         if self._slept_s() > 0:  # Hours may have passed since the last transmission.

@@ -53,7 +53,7 @@ class PostedOrder:
 
     @property
     def end(self) -> str:
-        """Reason why the order's commands are not repeated, as a clause; empty while they may be repeated."""
+        """Text that explains why the order's commands are not repeated; empty while they may be repeated."""
         return "its effect was reported" if self._order.is_confirmed else self._order.end or self._order.unexplained
 
     async def command(self, command: int, *params: float, component_id: int | None = None) -> None:

@@ -109,7 +109,7 @@ def _reasons(session: VehicleSession, reason: str, since: float) -> tuple[str, .
 
 
 def _height_when_disarmed(session: VehicleSession) -> str:
-    """Return the height of a vehicle that is disarmed in the air, as a clause; empty otherwise."""
+    """Return a text with the height of a vehicle that is disarmed in the air; empty otherwise."""
     height_m = height_above_home(session.telemetry)
     is_falling = session.telemetry.is_confirmed_disarmed and height_m is not None and height_m > 1.0
     return f" {height_m:.1f} m above home" if is_falling else ""
@@ -195,7 +195,7 @@ class StallDetector:
             self._sank_fast_at = self._there_since
 
     def _describe_descent(self, here: Position) -> str:
-        """Return a clause about a fast descent before the standstill; empty if there was none."""
+        """Return a text about a fast descent before the standstill; empty if there was none."""
         height_m = here.altitude_relative_m
         if height_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._max_height_m - height_m <= 1.0:
             return ""

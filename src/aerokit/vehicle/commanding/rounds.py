@@ -130,7 +130,7 @@ class RoundFlight:
         """
         session, started = self._session, self._session.connection.now()
         detect_stall, mode_failure = StallDetector(session), self._context.sender.mode_failure(order, mode)
-        wrong_radius = ""  # a clause about the last reported radius; empty if it is the ordered one
+        wrong_radius = ""  # error text about the last reported radius; empty if it is the ordered one
 
         def on_status(status: OrbitExecutionStatus) -> None:
             """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""

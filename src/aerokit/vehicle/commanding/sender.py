@@ -268,7 +268,7 @@ class OrderSender:
         return mode
 
     def mode_failure(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """Return a function that returns why the order cannot succeed, as a clause; None while it may succeed.
+        """Return a function that returns a text if the order cannot succeed; None while it may succeed.
 
         The reasons are: the order was superseded, or the vehicle has hit the ground, is disarmed or is not in one of
         ``modes``. The vehicle has three seconds to report one of the modes.
@@ -298,7 +298,7 @@ class OrderSender:
         return failure_reason
 
     def impact_failure(self, order: Order) -> Callable[[], str]:
-        """Return a function that returns a clause if the vehicle has hit the ground and ``order`` is still newest."""
+        """Return a function that returns a text if the vehicle has hit the ground and ``order`` is still newest."""
         detector = ImpactDetector(self._session.telemetry)
 
         def failure_reason() -> str:

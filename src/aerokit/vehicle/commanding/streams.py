@@ -155,11 +155,11 @@ class ValueStream(Generic[ValueT]):
         self._session.connection.send(self._message)
 
     def _takeover_reason(self) -> str | None:
-        """Return a clause if a pilot, a failsafe or another program took over, else None."""
+        """Return a text if a pilot, a failsafe or another program took over, else None."""
         return None
 
     def _stop_reason(self, lag: float) -> str | None:
-        """Return why the stream must stop, as a clause, else None; ``lag`` is the delay of this tick in seconds."""
+        """Return a text if the stream must stop, or None; ``lag`` is the delay of this tick in seconds."""
         # A value does not expire while the mode is changed, because the program cannot supply values then.
         age = 0.0 if self._is_changing_mode else self._now() - self._set_at
         slept_s = self._session.connection._slept_since(self._began_sending_at)

@@ -187,7 +187,7 @@ class PlanChannel:
     def _describe_items_on_vehicle(
         self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused_item: int | None = None
     ) -> str:
-        """Return a clause for the error of an upload: which items, old or new, the vehicle has now."""
+        """Return the part of an upload's error text that says which items, old or new, the vehicle has now."""
         if not isinstance(exchange, MissionUpload):
             return ""
         overwrites_in_place = self.mission_type in self._context.autopilot.overwrites_plans_in_place
