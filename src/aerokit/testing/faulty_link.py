@@ -291,7 +291,7 @@ class FaultyLink(Link):
         self._expired_writes += writes
 
     def _on_stalled(self, is_stalled: bool) -> None:
-        """Report to the receiver that the link stalls or is drained."""
+        """Report the beginning or the end of a stall to the receiver, by `link_stalled` or `link_drained`."""
         now = asyncio.get_running_loop().time()
         stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
