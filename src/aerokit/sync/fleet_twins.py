@@ -330,8 +330,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: there is no mission to start, because the last upload failed or was for other members
-                only; or a member is unavailable or not armed. Nothing was sent.
+            OperationRejected: no mission was uploaded, the last upload failed or was for other members only, or a
+                member is unavailable or not armed. Nothing was sent.
         """
         return self._loop.run(self.aio.start_missions, timeout=timeout, stagger_s=stagger_s)
 
@@ -342,7 +342,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds until all members have finished; None: no limit.
 
         Raises:
-            OperationRejected: there is no mission, because the last upload failed or was for other members only.
+            OperationRejected: no mission was uploaded, or the last upload failed or was for other members only.
         """
         return self._loop.run(self.aio.wait_missions_finished, timeout=timeout)
 
