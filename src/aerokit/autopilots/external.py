@@ -61,9 +61,10 @@ class ExternalRules(Snapshot):
 
 
 def _external_navigation(quantity: str) -> ExternalRule:
-    """Return the rule for AP_VisualOdom: VISO_TYPE, and source 6 (ExternalNav) in each set of EK3_SRC parameters.
+    """Return the rule for measurements that ArduPilot reads if VISO_TYPE is set (AP_VisualOdom).
 
-    Sets 2 and 3 may also have source 0 (none).
+    They are the only source of ``quantity`` (POSXY or VELXY) if EK3_SRC1_<quantity> is 6 (ExternalNav), and the same
+    parameters of EK3_SRC2 and EK3_SRC3 are 6 or 0 (none).
     """
     sole_source = (
         (f"EK3_SRC1_{quantity}", (6.0,)),

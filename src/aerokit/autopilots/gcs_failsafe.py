@@ -62,9 +62,9 @@ navigator parameters of PX4.
 def gcs_failsafe(firmware: str, value_of: Callable[[str], float | None]) -> tuple[str | None, str | None]:
     """Return the parameter that decides on the action after the loss of the ground station, and the action.
 
-    ``value_of`` returns the value of a parameter, or None if it is unknown. The action is a part of a sentence, such as
-    ``lands``. It is None if the value of the returned parameter is unknown. Both results are None if the table has no
-    action for the values. A parameter without an action for its value leaves the decision to the next parameter.
+    The parameters of :data:`GCS_FAILSAFE_ACTIONS` are tried in order, until the value of one has an action in the
+    table. ``value_of`` returns a value, or None if it is unknown; this parameter is then returned without an action.
+    If no value has an action, both results are None. The action is a part of a sentence, such as ``lands``.
     """
     for name, actions in GCS_FAILSAFE_ACTIONS.get(firmware, {}).items():
         value = value_of(name)

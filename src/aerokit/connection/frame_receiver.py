@@ -258,7 +258,7 @@ class FrameReceiver:
     def _on_blocked(self, seconds: float) -> None:
         """Publish that the event loop was blocked, and log a warning if it was blocked for long.
 
-        ``seconds`` is the greatest length that the pause may have had, see `LoopWatch`.
+        ``seconds`` is the longest time for which the loop can have been blocked, see `LoopWatch`.
         """
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(

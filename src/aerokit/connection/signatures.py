@@ -171,7 +171,10 @@ class _Handover:
         return (frame.system_id, frame.component_id) == self._source
 
     def is_completed_by(self, frame: Frame, unix_time_s: float) -> bool:
-        """Return True once the frames up to this one show the change: the new key is used or, if it is None, no key."""
+        """Process a frame of the component. Return True if it proves that the component has changed its key.
+
+        The proof is a frame signed with the new key or, if the new key is None, a long enough run of unsigned frames.
+        """
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _is_signed_with_a_key(frame):

@@ -78,8 +78,8 @@ class BackgroundTasks:
 async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
     """Await ``work`` to its end, even if the caller is cancelled (by asyncio or anyio, once or repeatedly).
 
-    anyio's shield stops anyio's cancel scopes, but not ``task.cancel()`` or ``asyncio.timeout``. The work must be
-    bounded in time. A cancellation is raised afterwards, with an exception of the work as its cause.
+    The work must be bounded in time. When it has ended, the cancellation is raised; if the work has failed, its
+    exception is the cause. A shield of anyio alone would let ``task.cancel()`` and ``asyncio.timeout`` through.
     """
     task = asyncio.get_running_loop().create_task(work)
     cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end

@@ -113,8 +113,8 @@ class Fleet(Selection):
             rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
-            The number of MAVLink messages sent on a link. If another sender has just sent the same corrections on some
-            links, fewer are sent there; the largest number is returned.
+            The number of MAVLink messages sent on the link that got the most. Corrections that another sender has just
+            sent on a link are not sent there again.
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.

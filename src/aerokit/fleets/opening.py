@@ -163,7 +163,7 @@ def _members_of_vehicles(
 ) -> list[Member]:
     """Return a member for each vehicle object among the sources, and add the vehicles' connections to the networks.
 
-    ``given_names`` are the names that the program gave; the others are numbers.
+    A source's name becomes the member's name if it is in ``given_names``: the program has chosen it.
     """
     members: list[Member] = []
     for name, source in sources_by_name.items():

@@ -217,9 +217,9 @@ def _closest(leg: Leg, other: Leg, slack_s: float) -> Approach | None:
 def _closest_inside(
     start_difference: Sequence[float], vector: Sequence[float], other_vector: Sequence[float]
 ) -> tuple[float, float] | None:
-    """Return s and t of the closest points of two lines; None if a point is outside of its leg, or they are parallel.
+    """Return the s and t (see `_closest`) at which the straight lines through two legs are closest to each other.
 
-    At the closest points, the derivatives of the squared distance with respect to s and t are 0.
+    There, both derivatives of the squared distance are 0. None if s or t is not from 0 to 1, or the lines are parallel.
     """
     # Dot products of a (`vector`), b (`other_vector`) and d (`start_difference`).
     aa, bb = _dot(vector, vector), _dot(other_vector, other_vector)

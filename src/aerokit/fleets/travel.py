@@ -399,8 +399,8 @@ class Missions(SelectionBase):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: the last upload failed for a member, or had no mission for these members, or a member is
-                unavailable or not armed. Nothing was sent.
+            OperationRejected: no mission was uploaded, the last upload failed or was for other members only, or a
+                member is unavailable or not armed. Nothing was sent.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         if not names:
@@ -425,7 +425,7 @@ class Missions(SelectionBase):
             timeout: seconds until all members have finished; None: no limit.
 
         Raises:
-            OperationRejected: the last upload failed for a member, or had no mission for these members.
+            OperationRejected: no mission was uploaded, or the last upload failed or was for other members only.
         """
         names = tuple(name for name in self._context.missions if name in self.members)
         if not names:

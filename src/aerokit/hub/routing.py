@@ -289,11 +289,11 @@ class Router(Generic[PortT]):
             self._report("route_changed", sender.source, node, former_number)
 
     def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
-        """Return True if a frame is a copy of an earlier frame, not the first frame of a restarted program.
+        """Return True if a frame with the same bytes as an earlier frame is a copy.
 
-        A restarted program numbers its frames from the start again. Its first command may therefore be the same bytes
-        as an earlier command, and must not be lost as a copy. Such a frame comes over a new port after the program's
-        former port was removed, or over the same port after a while.
+        It may instead be the first command of a restarted program, which numbers its frames from the start again. It is
+        therefore not a copy if it arrives too late, in sequence at the same port, at a port that is newer than the
+        earlier frame, or after the earlier frame's port was removed.
         """
         first_port, port_count, received_at = earlier
         if first_port == number:
@@ -395,10 +395,10 @@ class Router(Generic[PortT]):
         return plan
 
     def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
-        """Return the numbers of the ports by which a component or system is reached, for a frame of ``source``.
+        """Return the numbers of the ports for a frame to a component or, if it is unknown or 0, to its whole system.
 
-        If the sender itself is a target, the result has only ``here`` for it, even if another port reaches the sender.
-        The caller removes ``here``, the port of the frame, so that no sender gets its own frame.
+        ``source`` is the sender, ``here`` the number of the port that received the frame. If the sender is itself a
+        target, its only port is ``here``. The caller then removes ``here``, so that no sender gets its own frame.
         """
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None

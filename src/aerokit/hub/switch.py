@@ -118,7 +118,7 @@ class Switch:
     def receive(
         self, port: Port, framer: Framer, frames: list[Frame], data: bytes | None, now: float, arrived_at: float
     ) -> None:
-        """Forward frames received at a port. ``data`` has their bytes; None if other bytes were between them.
+        """Forward frames received at a port. ``data`` is the received bytes, or None if not all belong to the frames.
 
         Commands that may have waited too long since ``arrived_at`` are dropped.
         """

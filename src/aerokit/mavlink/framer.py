@@ -207,9 +207,9 @@ class PythonFramer:
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
         """Sort the frames that were out of order into :attr:`late` and :attr:`foreign`.
 
-        ``out_of_order`` has (position in ``frames``, result of `SourceStatistics.out_of_order`, sequence and sender).
-        A frame of an unwanted message is not in ``frames``. At its position is the next wanted frame, if any, which is
-        skipped because its sequence or sender differs.
+        ``out_of_order`` has (position in ``frames``, result of `SourceStatistics.out_of_order`, sequence and sender) of
+        each. An unwanted message is not in ``frames``, so a later frame may be at its position. That frame is not
+        sorted, because its sequence or sender differs.
         """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
@@ -224,7 +224,7 @@ class PythonFramer:
     # -------------------------------------------------------------------------------- slow path
 
     def _search(self, data: bytes, begin: int, scan: _ScanState) -> _ValidFrame | None:
-        """Return the next valid frame from ``begin`` on, or keep possible beginnings of frames in ``_rest``."""
+        """Return the next valid frame from ``begin`` on, or None. Keep data that may become a frame in ``_rest``."""
         size = len(data)
         keep_from = -1  # position from which data is kept
         unknown_begin = unknown_end = -1  # a whole frame of an unknown message, unless it contains a valid frame

@@ -92,7 +92,7 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
 def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
     """Return the fields of both definitions.
 
-    If both have a field, units, enum and invalid value are the added ones, even if empty; the rest is the existing one.
+    A field in both gets its units, enum and invalid value from ``added``, even if empty; the rest from ``existing``.
     """
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:

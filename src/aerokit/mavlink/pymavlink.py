@@ -218,10 +218,10 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
     Args:
         frame: a received frame: ``message.received_frame``, or the argument of a frame observer.
-        dialect: preferred pymavlink module, used if it is for MAVLink 2 and has the message, with the CRC_EXTRA of the
-            standard if that has the message, too. The fallbacks are pymavlink's ardupilotmega and development for
-            MAVLink 2, with extension fields. A message that none of them has, or whose checksum is wrong for it,
-            becomes pymavlink's ``MAVLink_unknown``, with type ``UNKNOWN_<id>``.
+        dialect: pymavlink module that is tried first, if it is for MAVLink 2. Then pymavlink's ardupilotmega and
+            development for MAVLink 2 are tried. The first module that has the message decodes it, with its extension
+            fields. A module that contradicts the CRC_EXTRA of a standard message is skipped. If no module has the
+            message, or the checksum is wrong, the result is a ``MAVLink_unknown`` with type ``UNKNOWN_<id>``.
         timestamp: ``_timestamp`` of the message: in pymavlink, seconds since 1970.
     """
     return _decoder(frame.message_id, dialect)(frame, timestamp)

@@ -256,7 +256,7 @@ def _render_decode(message: MessageDefinition) -> list[str]:
 
 
 def _render_decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[str]:
-    """Render the statements for a message with long arrays, which are slices of the unpacked values."""
+    """Render the statements that decode a message with long arrays: each array is a slice of the unpacked values."""
     lines = [f"        values = {unpacked}"]
     index = 0
     for field in fields:

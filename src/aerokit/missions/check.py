@@ -37,8 +37,8 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
     Args:
         items: the items, without home.
         mission_type: the MAV_MISSION_TYPE.
-        home_is_item_0: True for missions of ArduPilot, which stores home as item 0, so that one item fewer fits. False
-            for other autopilots, for which 0°, 0° does not mean "the current position". None if unknown.
+        home_is_item_0: True for missions of ArduPilot: home takes the place of an item, so the limit is one item lower.
+            False for other autopilots: 0°, 0° is refused, which only ArduPilot takes for "here". None if unknown.
 
     Raises:
         InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.

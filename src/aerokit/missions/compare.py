@@ -254,7 +254,7 @@ def item_differences(
 ) -> tuple[str, ...]:
     """Describe each field that differs: ``"z is 20.0 instead of 30.0"``.
 
-    With ``single_precision``, the comparison tolerates the steps of up to 1.7 m between 32-bit floats (MISSION_ITEM).
+    With ``single_precision``, places may differ by the rounding to 32-bit floats in MISSION_ITEM, up to 1.7 m.
     """
     if expected.command != actual.command:
         return (f"the command is {actual.name} instead of {expected.name}",)

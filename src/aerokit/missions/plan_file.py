@@ -108,7 +108,7 @@ def format_plan(plan: Plan | Mission) -> str:
 
 
 def _document(plan: Plan) -> dict[str, Any]:
-    """Return the JSON object of a .plan file: that in ``plan.source``, in which only changed parts are replaced."""
+    """Return the JSON object of a .plan file: a new one, or that of ``plan.source`` with the changed parts replaced."""
     document: dict[str, Any]
     if plan.source:
         old = parse_plan(plan.source)  # first, because it raises FileFormatError if the text is no plan

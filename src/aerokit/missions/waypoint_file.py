@@ -43,7 +43,7 @@ def read_waypoint_file(path: str | os.PathLike[str]) -> Mission:
     """Read a mission from a ``QGC WPL`` file (.waypoints, .txt).
 
     Spaces are accepted instead of tabs; empty lines and lines that begin with ``#`` are skipped. The home line becomes
-    ``mission.home``. Places in MAVProxy's files are rounded to 1e-6 degrees.
+    ``mission.home``. MAVProxy rounds places to 1e-6 degrees when it writes a file.
 
     Raises:
         FileFormatError: the file is invalid; the error text names the file, the line and what was expected there.

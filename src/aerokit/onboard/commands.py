@@ -156,7 +156,7 @@ class ComponentCommands:
         *,
         is_stop: Callable[[ReceivedCommand], bool] = lambda _: False,
     ) -> None:
-        """Register a handler. A command for which ``is_stop`` returns True cancels the one that the handler executes.
+        """Register a handler. If it is running, a command for which ``is_stop`` returns True cancels it first.
 
         Raises:
             InvalidArgument: the command already has a handler, or an annotation of the function is not supported.

@@ -330,8 +330,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
             stagger_s: delay in seconds between the starts of consecutive members; None: all at once.
 
         Raises:
-            OperationRejected: the last upload failed for a member, or had no mission for these members, or a member is
-                unavailable or not armed. Nothing was sent.
+            OperationRejected: no mission was uploaded, the last upload failed or was for other members only, or a
+                member is unavailable or not armed. Nothing was sent.
         """
         return self._loop.run(self.aio.start_missions, timeout=timeout, stagger_s=stagger_s)
 
@@ -342,7 +342,7 @@ class Selection(SelectionTwin["AsyncSelection"]):
             timeout: seconds until all members have finished; None: no limit.
 
         Raises:
-            OperationRejected: the last upload failed for a member, or had no mission for these members.
+            OperationRejected: no mission was uploaded, or the last upload failed or was for other members only.
         """
         return self._loop.run(self.aio.wait_missions_finished, timeout=timeout)
 
@@ -554,8 +554,8 @@ class Fleet(FleetTwin, Selection):
             rtcm: one or more complete RTCM 3 messages of at most 720 bytes each.
 
         Returns:
-            The number of MAVLink messages sent on a link. If another sender has just sent the same corrections on some
-            links, fewer are sent there; the largest number is returned.
+            The number of MAVLink messages sent on the link that got the most. Corrections that another sender has just
+            sent on a link are not sent there again.
 
         Raises:
             InvalidArgument: a message is incomplete, damaged or too long, or ``rtcm`` is empty. Nothing was sent.

@@ -281,9 +281,9 @@ class Page:
         return render_function(node, returns, member.text, body)
 
     def _property_twin(self, twin: Twin, member: ClassMember) -> str:
-        """Return the source of a property.
+        """Return the source of a property of a twin.
 
-        If the property wraps its value in a twin, it is cached, so that each access returns the same object.
+        A property that returns another twin is a cached property, so that each access returns the same object.
         """
         name = member.name
         read = f"self.aio.{name}"

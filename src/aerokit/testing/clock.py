@@ -84,11 +84,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return self._now
 
     def add_event_source(self, next_due: Callable[[], float], run: Callable[[], None]) -> Callable[[], None]:
-        """Call ``run`` whenever the clock would pass ``next_due()``. Return a function that removes the event source.
+        """Call ``run`` each time the clock reaches ``next_due()``. Return a function that removes the event source.
 
-        An event source does the same as a timer in a fraction of the time, because it needs neither timers nor
-        iterations of the loop. ``next_due`` returns seconds on this clock, or infinity for never. After each ``run``,
-        ``next_due`` must return a later time. Event sources run before timers of the same instant.
+        An event source costs a fraction of a timer that is set again after each call, because it needs no iteration of
+        the loop. ``next_due`` returns seconds on this clock, or infinity for never. After each ``run``, ``next_due``
+        must return a later time. Event sources run before timers of the same instant.
         """
         source = (next_due, asyncio.Handle(run, (), self))
         self._sources.append(source)

@@ -293,7 +293,7 @@ class FaultyLink(Link):
         self._expired_writes += writes
 
     def _on_stalled(self, is_stalled: bool) -> None:
-        """Report to the receiver that the link stalls or is drained."""
+        """Report the beginning or the end of a stall to the receiver, by `link_stalled` or `link_drained`."""
         stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.

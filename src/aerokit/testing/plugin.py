@@ -204,7 +204,10 @@ def _fleets(item: pytest.Item) -> list[SimulatedFleet]:
 
 
 def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
-    """Return the function that pytest must call to run the test, with its flights open if it is an ``async def``."""
+    """Return the function that pytest must call to run the test.
+
+    If the test is an ``async def`` with flights, the function opens them, runs the test and closes them.
+    """
     fleets = _fleets(item)
     test: Callable[..., Any] = item.obj
     marked_test = getattr(test, _TEST_WITH_OPEN_FLIGHTS, None)

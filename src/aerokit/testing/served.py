@@ -118,8 +118,8 @@ def hosted_flight(
 
     Timeouts after which the vehicle reacts to a silent client are multiplied by ``speedup``, except those in
     ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, and
-    LinkOpenError if the address cannot be opened. At the end, the block raises an exception of the vehicle that was not
-    raised before.
+    LinkOpenError if the address cannot be opened. If the vehicle has failed with an exception, the end of the block
+    raises it, unless `ServedFlight.raising_vehicle_errors` has raised it already.
     """
     from anyio.from_thread import start_blocking_portal
 

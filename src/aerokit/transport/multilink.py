@@ -225,7 +225,10 @@ class MultiLink(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _retry_opening(self, index: int) -> None:
-        """Try to open a link, with increasing delays, until it is open, it can never be opened, or this link ends."""
+        """Try to open a link, with increasing delays, until it is open or the `MultiLink` is closed.
+
+        Give up after any error but LinkOpenError.
+        """
         backoff = Backoff()
         is_reported = False
         while not self._is_closed:

@@ -181,8 +181,8 @@ class MergedStreams:
     def was_accepted(self, frame: Frame, link: int, *, may_prove: bool) -> bool:
         """Return True if this frame is a copy of a frame that was accepted over another link.
 
-        Also record what a copy proves: its link works, and may lead to the vehicle. ``may_prove`` is False for a frame
-        of a second sender with the same ids.
+        A copy also shows that its link works, and counts as evidence that both links lead to one vehicle. It is no such
+        evidence if ``may_prove`` is False: a second sender with the same ids has sent the frame.
         """
         if not self.copies.is_copy(frame, link, may_prove=may_prove):
             return False
@@ -198,9 +198,9 @@ class MergedStreams:
         return True
 
     def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
-        """Record what a copy over this link proves: links that carry the frames of the link in use lead to its vehicle.
+        """Count a frame as evidence that its links lead to one vehicle, if the link in use is among them.
 
-        Copies over other links prove only that these lead to one vehicle, which may be another one.
+        ``link`` brought the last copy. A frame without a copy over the link in use may come from another vehicle.
         """
         used = choice.used
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):

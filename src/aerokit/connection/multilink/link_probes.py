@@ -151,7 +151,7 @@ class LinkProbes:
         return max(0.0, now - sent_at)
 
     def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
-        """If the link is doubted, report a second vehicle with the same system id, once until the doubt has ended."""
+        """If the link is doubted, report a second vehicle with the same system id; only once for each doubt."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)

@@ -37,9 +37,9 @@ class VehicleClock:
         self._previous_rate: tuple[float, float] | None = None
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
-        """Add a sample from the link in use. Return False if the clock does not continue, i.e. the vehicle rebooted.
+        """Add a sample from the link in use. Return False if the clock jumped, which shows that the vehicle rebooted.
 
-        A clock that was paused for a moment counts as continuing, although it is late.
+        A simulation that paused for up to `MAX_PAUSE_S` does not count as rebooted, although its clock is late.
         """
         continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
         is_unexpected = self._fits(at, vehicle_s, round_trip_s) is False  # None: the rate is not known yet

@@ -230,7 +230,7 @@ def attachment_of(sample: Any) -> bytes:
 
 
 def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
-    """Build zenoh's configuration from the file or aerokit's default settings, and the options."""
+    """Build zenoh's configuration from the options. A file, ``options.config``, replaces aerokit's default settings."""
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
     except zenoh.ZError as error:
