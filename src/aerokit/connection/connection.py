@@ -435,8 +435,8 @@ class Connection:
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record all sent and received frames to a ``.tlog`` file until the connection is closed.
 
-        When the first frame is received, an existing file is renamed to the next free number: ``flight.1.tlog``. Until
-        then nothing is written to it, and of the sent frames only the last 1000 are kept for the recording.
+        A file that exists already stays as it is until the first frame is received. It is then renamed to the next free
+        number (``flight.1.tlog``), and the recording begins with the frames sent before that, at most the last 1000.
 
         Raises:
             LinkOpenError: the file cannot be written.
@@ -560,9 +560,9 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
-        """Write a frame to the peers of system ``to``, or of the target of ``message``; without both, to all peers.
+        """Write a frame to the peers that lead to the target of ``message``; ``to`` replaces its target system.
 
-        Return False if there is no such peer, so that nothing was sent.
+        A frame without a target goes to all peers. Return False if no peer leads to the target: nothing was sent.
         """
         system_id = getattr(message, "target_system", 0) if to is None else to
         peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)

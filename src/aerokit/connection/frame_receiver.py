@@ -296,9 +296,9 @@ class FrameReceiver:
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        """Return True if the signature check admits a frame.
+        """Return True if the signature check admits a frame, or has admitted the same frame over another link.
 
-        Copies of an admitted frame over other links are not checked, because the check would refuse them as replays.
+        A frame that was admitted before is not checked again, because the check would refuse it as a replay.
         """
         # `copies` still refers to this frame, because `is_copy` was just called for it.
         if self._multilink is not None and self._multilink.copies.was_admitted:
@@ -312,10 +312,10 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
     def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:
-        """Return True if a frame must be dropped.
+        """Return True for the frames of a second sender with the same ids, and for outdated heartbeats.
 
-        Frames of a second sender with the same ids are dropped, if it is known that there are two. A heartbeat is also
-        dropped if it is outdated, or if only its sequence number suggests a second sender. Two senders are reported.
+        A frame may be that of a second sender if its sequence number does not continue the earlier ones. A heartbeat
+        is then dropped at once; another frame only if the counters prove that there are two senders, which is reported.
         """
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:

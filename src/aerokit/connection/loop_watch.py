@@ -137,10 +137,10 @@ class LoopWatch:
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _detect_sleep(self) -> bool:
-        """Return True if the computer was suspended for more than `LATE_THRESHOLD_S` since the last call.
+        """Record and report a suspension of the computer since the last call. Return True if there was one.
 
-        Record and report the suspension. Shorter differences are dropped and never add up, because NTP may adjust only
-        one of the two clocks (macOS), which would soon look like a suspension.
+        Two clocks are compared, one of which stands still in a suspension. Differences of up to `LATE_THRESHOLD_S` are
+        dropped and never added up: on macOS, NTP may adjust only one of the clocks, so they also drift apart slowly.
         """
         # `_suspended` subtracts two clock readings. Its result is too small if the process was preempted between the
         # readings. The true value never decreases, so the largest result so far is used.

@@ -271,7 +271,7 @@ class _Diagnosis:
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        """Return why the received bytes may contain no valid frame."""
+        """Return the most likely reason why no valid frame was found in the received bytes."""
         # Noise contains a few patterns that look like frames of an unknown dialect. An unknown dialect is therefore
         # only diagnosed if most bytes belong to frames.
         received = f"{self._bytes} bytes were received"

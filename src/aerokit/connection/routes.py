@@ -207,10 +207,11 @@ class Routes:
         return 0 < (route.sequence - frame.sequence) & 0xFF < 128
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peer of a component; if the component is 0 or unknown, those of its system, or else every peer.
+        """Return the peers to which a message for a component is sent.
 
-        Peers that send under the ids of another peer are excluded, because they would execute a message for the whole
-        system, too.
+        It is sent to the peer of the component; if the component is 0 or unknown, to all peers of the system; if the
+        system is 0 or unknown, to every peer. A peer of the system is left out if it belongs to a second vehicle with
+        the same system id, which would also execute the message.
         """
         if system_id == 0:
             return EVERY_PEER
@@ -296,7 +297,7 @@ class Routes:
         return claim
 
     def _evidence(self, route: _Route, frame: Frame) -> Evidence:
-        """Compare the sequence number and the time since boot of a frame with those expected of the route's owner."""
+        """Return whether a frame's sequence number and time since boot continue those of the route's owner."""
         sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0

@@ -83,9 +83,9 @@ class SignatureGate:
         self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
-        """Return True if a frame may be delivered. A frame that shows the use of the new key completes a handover.
+        """Return True if a frame may be delivered. Within :meth:`key_handover`, the frame may cause the switch of keys.
 
-        ``may_hand_over=False`` is for frames of another peer, which must not complete a handover.
+        ``may_hand_over`` is False for a frame from another peer than its component's, which must not cause the switch.
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)

@@ -211,9 +211,10 @@ class FleetAction:
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _record_failure(self, member: Member, error: Exception) -> None:
-        """Record that a member failed, and ask the policy what the others do.
+        """Record that a member failed, and ask the policy what the other members do.
 
-        The policy is not asked about a safe action (such as a landing), nor after it has given orders.
+        The policy is not asked if the action is a safe one (such as a landing), or if an earlier failure in this action
+        has already led to orders of the policy.
         """
         if member.name in self._failed:
             return

@@ -267,7 +267,10 @@ class Following:
             self._stop(reason or "no follower is left", self._action.orders, {**result.skipped, **failed})
 
     def _stop_if_leader_lost(self) -> bool:
-        """Stop following if the leader is unavailable or its place or heading unknown. Return True after a stop."""
+        """Stop following if the leader is unavailable, or its position or a needed heading is unknown or outdated.
+
+        Return True if following has stopped, now or before.
+        """
         if not self._stopped.is_set():
             try:
                 self._check_leader()

@@ -132,7 +132,10 @@ class Member:
             self._set_state(MemberState.ACTIVE, "")
 
     def reclaim(self) -> None:
-        """Make the member active, whatever its state is, or lost if its vehicle is silent."""
+        """Set the state to ACTIVE, or to LOST if the vehicle is silent.
+
+        The vehicle's present mode and failsafe no longer count as a takeover.
+        """
         self._control_when_reclaimed = self._current_control()
         self._ignored_failsafe = self.vehicle.system_status.latest
         self.vehicle._arbiter.clear_failsafe()
@@ -154,7 +157,10 @@ class Member:
         return bool(self._detachments)
 
     def _takeover_reason(self) -> str:
-        """Return why the member counts as taken over; an empty string if it does not. Notice the end of a failsafe."""
+        """Return why the member counts as taken over; an empty string if it does not.
+
+        A failsafe that was active at `reclaim` is ignored until it gets worse, or until a call finds that it has ended.
+        """
         vehicle = self.vehicle
         state = vehicle.system_status.latest
         if state not in FAILSAFE_STATES:

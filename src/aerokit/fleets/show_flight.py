@@ -350,8 +350,8 @@ class Shows(Travel):
                 altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start, 0 to 3600.
-            lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
-                time (``lag_s`` in the report), 0 to 10; None: 0.
+            lead_s: seconds by which velocities are sent early, to compensate for the vehicles' reaction time (``lag_s``
+                in the report), 0 to 10; None: 0.
             speed_m_s: ground speed to the first points in m/s; None: unchanged.
 
         Raises:
@@ -464,8 +464,8 @@ async def _fly_track(
     """Fly a member along its path, from the current time until the end of the path.
 
     Raises:
-        OperationRejected: the member is ready more than ``max_late_s`` after the path begins. Its way to the path was
-            not compared with the other paths.
+        OperationRejected: the member would join its path more than ``max_late_s`` late. It is not flown there, because
+            the way from its position to the path was not compared with the other paths.
     """
     vehicle, period_s = member.vehicle, 1 / rate_hz
     with vehicle._session.streaming("position"):

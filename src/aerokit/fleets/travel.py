@@ -265,7 +265,7 @@ class Travel(SelectionBase):
         stagger_s: float | None = None,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
-        """Fly members straight to their targets; in corridors, each member starts after its delay."""
+        """Fly members straight to their targets. If ``corridors`` has a delay for a member, that member waits first."""
 
         async def fly(member: Member) -> None:
             if corridors is not None and corridors.delays_s.get(member.name):

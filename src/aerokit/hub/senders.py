@@ -193,7 +193,10 @@ class IdentityGuard:
         self._heartbeat_at.pop(peer, None)
 
     def _publish(self, event: Event) -> None:
-        """Report an event of the routes under the hub's names. A duplicate is reported again after `REPEAT_EVENT_S`."""
+        """Report an event of the routing table as the hub's event "route_changed" or "duplicate_sender".
+
+        A duplicate sender is reported again after `REPEAT_EVENT_S`, even if nothing has changed.
+        """
         if isinstance(event, RouteChanged):
             ids = event.system_id, event.component_id
             self._reported_at.pop(ids, None)  # The peer that owned the ids may now be the duplicate: report it.

@@ -168,7 +168,10 @@ class Switch:
                     self._on_error(port, error)
 
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
-        """Return the frames that the sender may send, without signatures, and the out-of-order ones among them."""
+        """Return the frames that this sender is allowed to send, and those of them that arrived out of order.
+
+        If the port verifies signatures, they are removed from the frames.
+        """
         admitted: list[Frame] = []
         late: list[Frame] = []
         gateway, guard, peer = port.gateway, port.guard, port.peer

@@ -154,9 +154,9 @@ class Signing:
                 from a camera without a key. Anyone can send such frames. None accepts only RADIO_STATUS, which
                 telemetry radios send.
             keep: a file that stores the timestamp, so that a restarted program refuses frames from before the restart.
-                Each key needs a separate file, and two programs must not use one file at the same time. The file is
-                replaced atomically, at most twice a minute, because it contains a timestamp up to half a minute in the
-                future.
+                Each key needs a separate file, and two programs must not use one file at the same time. The stored
+                timestamp is up to half a minute in the future, so the file is written at most twice a minute. Each
+                time, it is replaced atomically.
 
         Raises:
             InvalidArgument: a number is out of range, or ``key`` is not a SigningKey.
@@ -320,9 +320,9 @@ class TimestampFile:
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the stored timestamp is later than ``timestamp``: if needed, write ``timestamp + ahead``.
+        """Write ``timestamp + ahead`` to the file, unless the last written timestamp is later than ``timestamp``.
 
-        A failed write is repeated only after ``ahead``, because each attempt may block the event loop.
+        A timestamp counts as written even if writing failed, because each new attempt may block the event loop.
         """
         if timestamp < self.timestamp:
             return

@@ -157,9 +157,9 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        """Process a frame with an old number that was not missing. Return a result of :meth:`out_of_order`.
+        """Process a frame that is older than `expected`, but not lost. Return a result of :meth:`out_of_order`.
 
-        A single old number is a repetition. Several in direct succession show that the sender rebooted.
+        A single such frame is a repetition. Several with consecutive numbers show that the sender rebooted.
         """
         follows = sequence == (self._repeated_sequence + 1) & 0xFF
         is_direct_succession = follows and self._received_at_repetition == self.received

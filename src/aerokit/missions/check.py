@@ -37,8 +37,9 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
     Args:
         items: the items, without home.
         mission_type: the MAV_MISSION_TYPE.
-        home_is_item_0: True for missions of ArduPilot: home takes the place of an item, so the limit is one item lower.
-            False for other autopilots: 0°, 0° is refused, which only ArduPilot takes for "here". None if unknown.
+        home_is_item_0: True for missions of ArduPilot: home takes the place of one item, so 65,534 others are allowed.
+            False for other autopilots: a destination at 0°, 0° is refused, because only ArduPilot takes it for the
+            current position. None if the autopilot is unknown: 65,535 items and 0°, 0° are allowed.
 
     Raises:
         InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.

@@ -47,8 +47,9 @@ class _ItemSequence(Snapshot):
         """Check that all items can be sent.
 
         NaN is accepted where the standard defines it as "not given": headings and reserved parameters. If you know the
-        autopilot, pass ``home_is_item_0`` to check more. True is for ArduPilot: home takes the place of an item, so the
-        limit is one item lower. False is for others: 0°, 0° is refused, which only ArduPilot takes for "here".
+        autopilot, pass ``home_is_item_0`` to check more. True is for missions of ArduPilot: home takes the place of one
+        item, so 65,534 others are allowed. False is for other autopilots: a destination at 0°, 0° is refused, because
+        only ArduPilot takes it for the current position.
 
         Raises:
             InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.

@@ -172,8 +172,8 @@ def take_off(
 ) -> MissionItem:
     """Take off to an altitude. If no place is given, take off at the current position (ArduPilot; PX4 needs the place).
 
-    A number alone is an altitude: ``take_off(15)`` is 15 m above home. ``take_off(place, altitude_relative_m=15)`` has
-    a place.
+    A number as the only argument is the altitude above home: ``take_off(15)``. A place comes before the altitude:
+    ``take_off(place, altitude_relative_m=15)``.
 
     ``pitch_deg`` is the minimum pitch of a plane, 0 to 90 degrees.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_TAKEOFF

@@ -171,11 +171,11 @@ def translate_values(
     known: Container[str],
     types: Mapping[str, ParameterType] = MappingProxyType({}),
 ) -> tuple[dict[str, int | float], tuple[Renamed, ...]]:
-    """Convert the values of a file or table to the names and units of a vehicle with the ``known`` names.
+    """Convert the values of a file or table to the names and units that a vehicle uses; ``known`` are its names.
 
-    Names of parameters that the vehicle does not have are kept. If ``values`` also has the vehicle's own name of a
-    parameter, the value under that name is used; of several other names, the last one counts. ``types`` are the
-    vehicle's types, for rounding. The second result lists the converted parameters.
+    A parameter that the vehicle has under no name is not changed. If ``values`` has a parameter under several names,
+    the value under the vehicle's name is used, or the last value if that name is missing. ``types`` are the vehicle's
+    types, for rounding. The second result lists the converted parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []

@@ -218,8 +218,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 altitude (0 if not given) counts from the first member's home.
             rate_hz: set-points per second for each member, 2 to 50.
             start_in_s: seconds from the arrival of the last member at its first point to the start, 0 to 3600.
-            lead_s: how many seconds before their time velocities are sent, to compensate for the vehicles' reaction
-                time (``lag_s`` in the report), 0 to 10; None: 0.
+            lead_s: seconds by which velocities are sent early, to compensate for the vehicles' reaction time (``lag_s``
+                in the report), 0 to 10; None: 0.
             speed_m_s: ground speed to the first points in m/s; None: unchanged.
 
         Raises:

@@ -102,7 +102,7 @@ def _write_recordings(flights: Sequence[Flight | ServedFlight], test: str, direc
 
 
 def _write_report(path: Path, flight: Flight | ServedFlight, *, shares_recording: bool) -> str:
-    """Write the report on one vehicle of a recording, and return the line about it."""
+    """Write the report on one vehicle of the recording at ``path``. Return the report's path or the error as text."""
     from aerokit.logs.report import write_report
 
     system_id = flight.simulated.system_id

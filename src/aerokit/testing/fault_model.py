@@ -174,9 +174,10 @@ class FaultyPath:
 
 
 def split_frames(data: bytes) -> Sequence[bytes]:
-    """Split a write or datagram into MAVLink frames. If no complete frame begins at a byte, the rest is one piece.
+    """Split a write or datagram into MAVLink frames.
 
-    Only the lengths of frames are checked, not their checksums.
+    Where no complete frame follows, the remaining data is the last piece. Only the lengths of frames are checked, not
+    their checksums.
     """
     pieces: list[bytes] = []
     size = len(data)

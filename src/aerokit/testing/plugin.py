@@ -263,8 +263,8 @@ def _only_on_virtual_time(test_with_open_flights: Callable[..., Any]) -> Callabl
 def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] | None = None) -> Callable[..., None]:
     """Return a function that runs an ``async def`` test on virtual time.
 
-    ``try_first`` is the same test, as pytest-asyncio runs it. It runs to its end if the event loop of pytest-asyncio is
-    on virtual time; otherwise, it raises at once, and ``test`` runs on a loop of its own.
+    ``try_first`` is the test as wrapped by pytest-asyncio, and is called first. If pytest-asyncio's event loop is not
+    on virtual time, ``try_first`` raises `_NotVirtualTime` before the test begins, and ``test`` runs on a new loop.
     """
 
     @functools.wraps(test)

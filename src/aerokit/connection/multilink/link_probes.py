@@ -69,9 +69,9 @@ class LinkProbes:
         *,
         is_attached: bool,
     ) -> None:
-        """Send a probe, and a request for the hardware id while it is unknown, if a probe is due.
+        """If a probe is due, send it; while the hardware id of the vehicle is unknown, also request the id.
 
-        ``is_attached`` is True if the system has a vehicle object.
+        ``is_attached`` is True if the system has a vehicle object. All other systems share a limited rate of probes.
         """
         # An unused costly link is probed rarely once it is known whether the link leads to the vehicle.
         is_idle = candidate.is_costly and candidate is not choice.used

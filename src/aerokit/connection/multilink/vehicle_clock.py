@@ -72,9 +72,9 @@ class VehicleClock:
         return abs(last_vehicle_s + rate * (at - last_at) - vehicle_s) <= tolerance
 
     def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
-        """Return True unless the clock went back or ran too fast since the last sample.
+        """Return False if the vehicle's clock went back or ran too fast since the last sample.
 
-        Once its rate is measured, also return False if it was paused for too long.
+        Once the rate of the clock is measured, also return False if the clock stood still for more than `MAX_PAUSE_S`.
         """
         last_at, last_vehicle_s = self._samples[-1]
         advance_s = vehicle_s - last_vehicle_s

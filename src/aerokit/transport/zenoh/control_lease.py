@@ -200,9 +200,10 @@ class ClientFilter:
         return False
 
     def refuse_late(self, data: bytes, now: float) -> list[RefusalNotice]:
-        """Refuse an outdated datagram. Return notices about its commands.
+        """Refuse the frames of a datagram that arrived too late. Return the notices for the client.
 
-        The notices have no answer, because the client may have repeated the command already.
+        The notices contain no rejection such as a COMMAND_ACK. If the client has sent its command again, it would take
+        this for the rejection of the new command.
         """
         notices: list[RefusalNotice] = []
         for frame in _framer().receive(data, now):
