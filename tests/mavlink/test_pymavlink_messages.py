@@ -151,7 +151,7 @@ def test_from_pymavlink_reads_latest_text() -> None:
     ("given", "complaint"),
     [
         (object(), "is not a MAVLink message"),
-        (looks_like("ATTITUDE", time_boot_ms=1), "ATTITUDE.roll cannot be sent: it is missing"),
+        (looks_like("ATTITUDE", time_boot_ms=1), "ATTITUDE cannot be sent: its field roll has no value"),
         (looks_like("PLAY_TUNE", target_system=1, target_component=1, tune=5), "PLAY_TUNE.tune = 5"),
         (
             looks_like("SYSTEM_TIME", time_unix_usec=math.nan, time_boot_ms=0),

@@ -155,7 +155,7 @@ class LatestMessage(Generic[MessageT]):
 
 
 class Core:
-    """State that the parts of a classic vehicle share: the asynchronous vehicle, messages, listeners and orders."""
+    """State that the parts of a DroneKit `Vehicle` share: the asynchronous vehicle, messages, listeners and orders."""
 
     def __init__(self, handler: MAVConnection, owner: object) -> None:
         self.handler = handler

@@ -93,7 +93,7 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
         try:
             value = _original_text(message, name) if field.type == "char" else getattr(message, name)
         except AttributeError:
-            raise InvalidArgument(f"{message_class.NAME}.{name} cannot be sent: it is missing") from None
+            raise InvalidArgument(f"{message_class.NAME} cannot be sent: its field {name} has no value") from None
         values[field.name] = _converted(message_class, field, value)
     return values
 

@@ -145,7 +145,8 @@ class ComponentCommands:
         self._host, self._tasks = host, tasks
         # Tasks that wait for a handler in a thread. They cannot be cancelled, because a thread cannot be stopped.
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
-        # The loop has only a few threads of its own. Handlers that wait there would keep parameters from being saved.
+        # Handlers have their own threads. In the loop's few default threads, slow handlers would delay the saving of
+        # parameters, which uses them, too.
         self._threads: ThreadPoolExecutor | None = None  # None before the first call in a thread
         host.knows_command = self.handlers.__contains__
 

@@ -188,11 +188,12 @@ WRITE_WINDOW = 10
 class ParameterWrites(ParameterRequests):
     """Set some parameters. The result has the value that each parameter has afterwards, as the vehicle reports it.
 
-    An answer with the requested value and type completes a write. If no answer arrives, the value is read. PARAM_SET is
-    sent again only if the vehicle may still have the value from before the write: it reports the value in ``before``,
-    or ``before`` lacks the name. If it reports such a value eight times in a row, that is the result. Any other value
-    is the result once it was reported twice in a row: the vehicle rounded or clamped the requested value, or another
-    station set it. A later change by another station is therefore not undone.
+    - An answer with the requested value and type completes a write.
+    - If no answer arrives, the value is read.
+    - If the vehicle reports the value in ``before``, or ``before`` lacks the name, the write may have been lost, so
+      PARAM_SET is sent again. After eight such answers in a row, the reported value is the result.
+    - Another value was rounded, clamped, or set by another station. It is the result if it is reported twice in a row,
+      and PARAM_SET is not sent again, so that a change by another station is not undone.
 
     ``recent`` has names that an earlier call has just written. Answers to the earlier write may still arrive, so the
     first matching answer is verified by another read.

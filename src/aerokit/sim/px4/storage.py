@@ -51,8 +51,8 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 class Px4ParameterMount(ParameterPackMount):
     """``@PARAM`` files of PX4.
 
-    They differ from those of ArduPilot. Opening the file reports the exact size. Neither a value nor a default extends
-    over the end of a block of 239 bytes. Uploaded parameters are applied as they arrive.
+    Unlike ArduPilot, PX4 reports the exact size when the file is opened, divides no value and no default between two
+    blocks of 239 bytes, and applies uploaded parameters as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:
