@@ -231,7 +231,7 @@ class _TopicChannels:
                 self._send(name, now, link)
 
     def _publish_location_and_pose(self, system_id: int, vehicle: Vehicle) -> None:
-        """Send the location and, in the map frame, transform and pose, which combine position and attitude."""
+        """Send the location; then, in the map frame, the transform and the pose, from position and attitude."""
         position, attitude = vehicle.position.latest, vehicle.attitude.latest
         if position is None:
             return

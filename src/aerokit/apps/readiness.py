@@ -60,7 +60,7 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
     Args:
         vehicle: the vehicle, whose known state is used. Nothing is sent to it.
         reasons: result of ``vehicle.why_not_armable()``; None: health flags of SYS_STATUS, mode and estimator decide.
-        changes_mode: True if a mode that does not allow arming is no reason, because `Vehicle.arm` will change it.
+        changes_mode: True: do not report a mode that does not allow arming, because `Vehicle.arm` will change it.
     """
     grouped = _grouped(vehicle, reasons)
     if reasons is not None or changes_mode:  # `reasons` already includes the mode
@@ -72,8 +72,8 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
 def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
     """Return what is missing for a flight, in its two groups.
 
-    If the vehicle's checks pass, its mode decides which missing estimates prevent arming. Otherwise a mode that does
-    not allow arming is not included.
+    If the vehicle's checks pass although estimates are missing, its mode decides whether they prevent arming.
+    The reason that the mode itself does not allow arming is added by `readiness`.
     """
     missing = vehicle.missing_for_flight()
     against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
@@ -113,7 +113,8 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     """Return the known reasons why `Vehicle.arm` would fail; empty if none is known. Sends nothing.
 
-    ``missing`` are the missing conditions for flight. In modes that need no position, ArduPilot arms without most.
+    ``missing`` is the result of `Vehicle.missing_for_flight`. In modes that need no position, ArduPilot arms although
+    most of these conditions are missing.
     """
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
@@ -140,7 +141,7 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
 
 
 def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return data about the current mode if the vehicle cannot arm in it, or only if a parameter permits it.
+    """Return data about the current mode if the vehicle cannot arm in it, or can only if a parameter permits it.
 
     Return None for other modes, and for an unknown mode. ``mode`` is the name of the current mode, ``arms_in`` that of
     the mode to which ``arm`` would change, or None. ``unless`` is the autopilot's parameter that can permit arming in

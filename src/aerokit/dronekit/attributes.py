@@ -221,8 +221,8 @@ class VehicleAttributes(VehicleCore):
     def is_armable(self) -> bool:
         """True if the vehicle has booted and seems ready to arm.
 
-        ArduPilot needs a GPS fix and a predicted position; on PX4, the vehicle's pre-arm checks must pass. The
-        vehicle's other arming checks may still fail. :meth:`Vehicle.arm` reports the reasons.
+        ArduPilot needs a GPS fix and a predicted position; PX4 must report that its pre-arm checks pass. The vehicle
+        may still refuse to arm. :meth:`Vehicle.arm` reports the reasons.
         """
         if self._flightmode in NO_MODE or self._dk_heartbeat is None:
             return False

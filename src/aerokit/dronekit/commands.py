@@ -213,9 +213,9 @@ class CommandSequence:
     def add(self, cmd: Any) -> None:
         """Append a copy of a command; :meth:`upload` sends the change. Waits for a running download.
 
-        ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` is set. The
-        first row of a waypoint file is home; it is stored separately. Raises APIException if the last download has
-        failed.
+        ``cmd`` is a :class:`Command` or a MISSION_ITEM of pymavlink (else TypeError); its ``target_system`` is set. If
+        it is added first and is home, like the first row of a waypoint file, it is stored as home and not appended.
+        Raises APIException if the last download has failed.
         """
         self._require_downloaded()
         added = _command_from(cmd)
@@ -375,8 +375,8 @@ def _comparable(value: Any) -> Any:
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
     """Return True if a command is the home row of a waypoint file rather than a waypoint.
 
-    The home row is a waypoint without parameters whose frame has altitudes above sea level. In addition, its
-    ``current`` is 1, its position is all zeros, or its position is that of home.
+    The home row is a waypoint without parameters whose frame has altitudes above sea level. It also has one of three
+    marks: its ``current`` is 1, its position is all zeros, or its position is that of home.
     """
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False

@@ -81,9 +81,9 @@ def _px4_base_mode(name: str) -> int:
 
 
 def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
-    """Return the vehicle's autopilot, or ArduPilot if no mode numbers are known, as for iNav.
+    """Return the vehicle's autopilot, or ArduPilot in place of one whose mode numbers are unknown, such as iNav.
 
-    pymavlink also uses ArduPilot's mode numbers then.
+    pymavlink, too, uses ArduPilot's mode numbers for such autopilots.
     """
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
@@ -160,10 +160,9 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which a reposition command may be sent; empty if the vehicle checks its mode itself.
+    """Return the modes in which PX4 may get a reposition command, which changes its mode to the first of them.
 
-    On PX4, the command sets the first of these modes. On other autopilots, it does not change the mode, and the vehicle
-    refuses it in wrong modes.
+    Empty for other autopilots: the command does not change their mode, and they refuse it in wrong modes.
     """
     if not aio.autopilot.repositions_amsl:  # not PX4
         return ()

@@ -56,10 +56,11 @@ class ListenerThread:
         self.dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
-        """Queue a call and wait for it, at most two seconds, because the caller may hold a lock that a callback needs.
+        """Queue a call and wait until it has run, but at most two seconds.
 
-        On this thread, or after it has ended, the function is called directly. On the thread of an event loop or of
-        other listeners, the call is queued without waiting, because waiting could cause a deadlock.
+        The wait is limited because the caller may hold a lock for which a callback waits. On this thread, or after it
+        has ended, the function is called directly. The thread of an event loop, and any other listener thread, does not
+        wait, because that could cause a deadlock.
         """
         if self.is_current or self.is_stopped:
             function(*args)

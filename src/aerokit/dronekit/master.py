@@ -96,7 +96,10 @@ class Master:
         return dict(modes) if modes is not None else None
 
     def set_mode(self, mode: str | int, custom_mode: int | None = 0, custom_sub_mode: int | None = 0) -> None:
-        """Set a mode by name (KeyError if unknown), by number, or on PX4 by the numbers of :meth:`mode_mapping`."""
+        """Set a mode by name (KeyError if unknown) or by number.
+
+        On PX4, a mode has three numbers: those that :meth:`mode_mapping` returns for its name.
+        """
         _, heartbeat = self._autopilot()
         is_px4 = heartbeat is not None and heartbeat.autopilot == MavAutopilot.PX4
         vehicle = self._connection.vehicle

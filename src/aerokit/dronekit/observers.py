@@ -81,11 +81,11 @@ class Listeners:
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
         """Call the listeners of a name with a value.
 
-        With a listener thread, returns immediately or, with ``waits``, after the calls. Without one, the listeners run
-        in this call.
+        The listeners run on the listener thread. This method returns at once; with ``waits``, it waits for them as
+        :meth:`ListenerThread.call` does. Without a listener thread, they run in this call.
 
-        With ``cache``, listeners are called only if the value has changed. Without ``cache`` and ``waits``, values are
-        skipped while too many calls are queued.
+        With ``cache``, listeners are called only if the value has changed. While too many calls are queued, the value
+        is skipped, unless ``cache`` or ``waits`` is set.
         """
         if cache:
             if name in self.last_values and self.last_values[name] == value:

@@ -76,8 +76,8 @@ class ParameterDownload:
     async def wait_for(self, name: str) -> None:
         """Wait until the parameter is received, alone or with the list, or reported as missing by the vehicle.
 
-        If the list is complete, the vehicle may hide the parameter from it, so the parameter is requested once, and the
-        call returns even without an answer. The call also returns if the connection ends.
+        A vehicle may leave a parameter out of the list. If the list is already complete, the parameter is therefore
+        requested once, and the call returns even without an answer. The call also returns if the connection ends.
         """
         if self.is_complete:
             await self._request(name)
@@ -133,7 +133,7 @@ async def _download(
     on_failure: Callable[[AerokitError], None],
     on_ended: Callable[[], None],
 ) -> None:
-    """Download all parameters on the loop, without a reference that keeps the classic vehicle alive."""
+    """Download all parameters on the loop. The callbacks must be weak, so that the program's vehicle can be freed."""
     try:
         on_success(await vehicle.parameters.download(method=await _download_method(vehicle)))
     except ConnectionClosed:
@@ -194,8 +194,8 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
     """Set a parameter. Return None if the vehicle confirms the value, otherwise the error.
 
     Values of integer parameters are truncated, as in ArduPilot. If PARAM_SET is not answered, the value is requested.
-    PARAM_SET is sent again only if the vehicle still reports the old value. The call ends after the time of ``retries``
-    attempts, and `LAST_WAIT_SHARE` of another one, without an answer.
+    PARAM_SET is sent again only if the vehicle still reports the old value. ParameterTimeout is returned if the vehicle
+    does not answer for the time of ``retries + LAST_WAIT_SHARE`` attempts.
     """
     idle_timeout_s = (retries + LAST_WAIT_SHARE) * _attempt_s(aio)
     try:
@@ -265,8 +265,8 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
     ) -> float | None:
         """Return a value, or ``default`` if the vehicle has no such parameter.
 
-        Note that the second argument is not the default. If it is false, nothing is requested: ``default`` is returned
-        unless the value is already known.
+        Unlike in a dict, the second argument is ``wait_ready``, not the default. With ``wait_ready`` false, nothing is
+        requested: the result is the value if it is already known, otherwise ``default``.
         """
         if isinstance(name, str) and (value := self._values.get(name.upper())) is not None:
             return value

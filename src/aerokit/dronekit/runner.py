@@ -179,7 +179,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Return the parser for the command's own arguments, which end with the program."""
+    """Return the parser for the command line up to and including the program; the program parses the rest."""
     parser = _Parser(
         prog=prog,
         usage=f"{prog} [-h] [--sim [OPTION ...]] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",

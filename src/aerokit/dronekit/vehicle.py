@@ -262,7 +262,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving, in the same loop iteration in which the vehicle was found.
 
-        The loop gets weak references only. The handler, which the vehicle owns, gets strong ones.
+        What is given to the loop refers to this vehicle weakly, so that it can be garbage collected when the program
+        drops it. The handler may refer to it strongly, because the handler belongs to the vehicle.
         """
         core = self._dk
         core.start_receiving(aio, tasks)
@@ -316,7 +317,10 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 async def _connected(
     connection: Connection, timeout: float, begin: Callable[..., None], rate: float | None
 ) -> AsyncIterator[AsyncVehicle]:
-    """Connect on the loop, and request streams. Does not refer to the classic vehicle."""
+    """Connect on the loop, call ``begin``, and request streams.
+
+    ``begin`` must be a weak callback, because the loop keeps it until the connection ends.
+    """
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = BackgroundTasks(connection.fail)
         rate_hz: float | None = None

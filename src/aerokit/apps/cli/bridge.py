@@ -85,7 +85,7 @@ def _add_publishing(
 
 
 def _add_common(action: argparse.ArgumentParser, default_hz: float, max_hz: float, what: str) -> None:
-    """Add the options that all bridges have. ``what`` names what is sent at the rate."""
+    """Add the options that all bridges have. ``what`` is the word for one of the published values, for the help."""
     action.add_argument(
         "--rate",
         type=number(0.1, max_hz),

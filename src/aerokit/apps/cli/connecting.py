@@ -252,7 +252,7 @@ def add_seconds(command: argparse.ArgumentParser, text: str, default: float | No
 async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> AsyncIterator[Connection]:
     """Open a connection to the address. Only heartbeats are sent.
 
-    With ``reconnect``, a lost link is reopened, if it was given as an address.
+    With ``reconnect``, a lost link is reopened, unless the options have a `Link` in place of the address, as in tests.
     """
     from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
 

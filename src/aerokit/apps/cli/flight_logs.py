@@ -132,7 +132,7 @@ async def _report(options: argparse.Namespace) -> int:
 
 
 def _report_text(report: Report) -> str:
-    """Return the summaries and failsafes of the flights, followed by the file and the falls."""
+    """Return the summaries and failsafes of the flights; the last line has the report's file and each fall."""
     lines = []
     # A report covers one log, or two logs called A and B.
     for letter, sentences, failsafes in zip("AB", report.summaries, report.failsafes, strict=False):

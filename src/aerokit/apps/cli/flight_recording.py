@@ -87,7 +87,7 @@ class _StillnessNearGround:
     def update(self) -> None:
         """Update ``has_lasted`` from the vehicle's latest position. Call this regularly.
 
-        An old position, and one without a height, do not show that the vehicle lies still near the ground.
+        If the position is old or has no height, the vehicle may be moving or high, so the time is counted anew.
         """
         now = self._vehicle.connection.now()
         position = self._vehicle.position.latest

@@ -162,7 +162,10 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
-        """Parse arguments. Unrecognized arguments are reported here, by the subparser, which prints the right usage."""
+        """Parse arguments; exit if one is not recognized.
+
+        argparse would leave this to the top-level parser, whose usage does not show the options of the subcommand.
+        """
         if args is not None and not isinstance(self, _TopParser):
             if self._subparsers is None:
                 self._check_option_names(args)

@@ -134,9 +134,9 @@ def plain_text(error: BaseException) -> str:
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Within the block, print aerokit's warnings without their source lines, and reword its log messages.
+    """Within the block, adapt aerokit's warnings and log messages to the users of a command.
 
-    Users of a command have no code to change.
+    Warnings are printed without source lines, and log messages do not advise to change code.
     """
     import logging
     import warnings

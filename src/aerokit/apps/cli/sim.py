@@ -364,7 +364,8 @@ def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
 def _client_address(address: str, argument: str) -> str:
     """Return the address with which a client on this machine connects; for a serial line, a placeholder.
 
-    ``address`` is the address of the open link, ``argument`` the address in the command line, without placeholders.
+    ``address`` is the address of the open link. ``argument`` is the address in the command line, with its placeholders
+    filled in.
     """
     scheme, _, location = address.partition(":")
     if scheme == "zenohin":

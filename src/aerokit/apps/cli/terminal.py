@@ -102,8 +102,8 @@ def on_interrupt(
 
     Before that, ``at_once(number)`` is called in the signal handler, so it is called even if the loop is blocked.
 
-    SIGHUP counts once. When a terminal or an SSH session ends, both the shell and the kernel send it, a moment apart.
-    The second one must not be taken for another Ctrl-C, which would end what makes the vehicle safe.
+    Only the first SIGHUP is handled. When a terminal or an SSH session ends, both the shell and the kernel send one, a
+    moment apart. Handled like a second Ctrl-C, the second one would cancel the action that makes the vehicle safe.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()

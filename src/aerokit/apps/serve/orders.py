@@ -80,9 +80,9 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Check that no argument is unknown or missing, and that boolean arguments, and no others, are bools.
+        """Check that no argument is unknown or missing, and that bools are given exactly for the boolean arguments.
 
-        The method that the order calls checks all other types, and ranges.
+        Ranges and all other types are checked later, by the method that the order calls.
 
         Raises:
             InvalidArgument: a check failed.
@@ -448,7 +448,7 @@ class OrderRunner:
         self._publish(record)
 
     def _replacing(self, record: OrderRecord, error: Exception) -> str | None:
-        """Return the key of the vehicle's newest motion order, if a later one has superseded this order; else None."""
+        """If later motion orders have superseded this order, return the key of the newest of them; else None."""
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
         newest_key = None
