@@ -127,7 +127,7 @@ class RouteChanged(Event):
 
 
 class RouteChangeRefused(Event):
-    """Frames of a silent component arrive from the new address ``peer``, but aerokit ignores them.
+    """Frames of a component that fell silent arrive from the new address ``peer``, but aerokit ignores them.
 
     Their sequence numbers do not continue those of the component, so the sender may be another vehicle, or the same
     vehicle after a reboot. ``aerokit.connect(…, may_move=True)`` accepts the frames in both cases.

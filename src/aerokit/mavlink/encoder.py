@@ -62,7 +62,7 @@ class FrameEncoder:
         ``now`` is in seconds since 1970, for the timestamp of the signature.
 
         Raises:
-            InvalidArgument: a field has an invalid value; no sequence number is used.
+            InvalidArgument: a field has an invalid value, or MAVLink 1 has no such id. The sequence number stays.
         """
         signing = self.signing if self._version == 2 else None
         flags = 0 if signing is None else SIGNED

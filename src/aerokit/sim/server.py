@@ -124,8 +124,8 @@ class SimulatorServer:
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
-        """Open each link, with a channel of each of its vehicles. ``opening`` closes them again."""
-        connected: set[int] = set()
+        """Open each link, with one channel for each of its vehicles. ``opening`` closes the links again."""
+        connected: set[int] = set()  # vehicles whose first channel is in use; `_channels` adds to them
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
             opening.push_async_callback(port.close)

@@ -140,8 +140,9 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     def _update_link(self, name: str, *, is_lost: bool) -> None:
         """Record whether a link is lost, and start or end the common failsafe of both links.
 
-        Like the firmware (failsafe.cpp, failsafe_trigger), text and parameter are those of the link that is checked
-        when the timeout ends, and a link whose check is disabled while it is lost stays lost.
+        As in the firmware (failsafe.cpp, failsafe_trigger), the link that is checked when the timeout ends decides
+        about the status text, and about the parameter that selects the action. A lost link stays lost while its check
+        is disabled.
         """
         rover = self.vehicle
         was_any_link_lost = bool(self._lost)

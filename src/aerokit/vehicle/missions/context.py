@@ -118,8 +118,8 @@ class PlanContext:
     def version(self, mission_type: int) -> tuple[int, int]:
         """Return a value that changes whenever this program notices that the vehicle's plan has changed.
 
-        It consists of the number of transfers, also of other stations on a shared link, and of the plan's id (PX4
-        only).
+        It is a pair: the number of transfers, which includes those of other stations on a shared link, and the plan's
+        id (0 except on PX4).
         """
         cache = self.caches[mission_type]
         return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id

@@ -119,6 +119,7 @@ class MissionEndDetector:
             return completes_at_home or self._has_returned() or self._is_on_ground
         if self._ends_by_landing_or_return:
             return self._is_on_ground
+        # The last item is neither a landing nor a return. If the items are unknown, it may still be one of them.
         return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
