@@ -162,7 +162,7 @@ class Bus:
         return None
 
     def _deliver_both(self, frame: Frame) -> None:
-        """Deliver a frame to sinks that take different arguments: the message, the frame, or both."""
+        """Deliver a frame. Each sink is called with what it takes: the message, the frame, or both."""
         message = self.dialect.decode(frame)
         for kind, sink in self._entries(frame):
             try:

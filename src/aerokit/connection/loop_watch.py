@@ -171,7 +171,7 @@ class LoopWatch:
         return self.oldest_arrival
 
     def _end_assumption_when_idle(self) -> None:
-        """Use the time of reading as receive time again, once nothing was read for `MIN_IDLE_ITERATIONS` iterations."""
+        """Stop assuming that data has waited, once nothing was read for `MIN_IDLE_ITERATIONS` loop iterations."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:  # The connection is closed.

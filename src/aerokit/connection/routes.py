@@ -334,9 +334,9 @@ class Routes:
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
-        """Publish that a second sender uses the ids, once for each peer; and that its claim to the route is refused.
+        """Publish that a second sender uses the ids, and that it does not get the route of the silent owner.
 
-        The refusal is published each time the owner of the route has fallen silent.
+        For each peer, DuplicateSender is published once, RouteChangeRefused once during each silence of the owner.
         """
         source = frame.system_id, frame.component_id
         may_be_owner = is_same_host and claim.may_continue_owner  # The owner may just have changed its port.

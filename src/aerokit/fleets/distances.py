@@ -130,7 +130,7 @@ class DistanceMonitor:
         return positions
 
     def _on_too_close(self, first: Member, second: Member, distance_m: float) -> None:
-        """Order each of the two that this program flies to hold, unless only reports are wanted. Publish the event."""
+        """Publish TooClose. Members that this program flies are ordered to hold, unless only reports are wanted."""
         pair = (first, second)
         for member in pair:
             member.refresh()

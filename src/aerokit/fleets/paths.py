@@ -254,9 +254,9 @@ def _closest_on_edge(
     difference: Sequence[float],
     other_difference: Sequence[float],
 ) -> tuple[float, float]:
-    """Return s and t where the distance is smallest on an edge of the polygon.
+    """Return the point (s, t) on an edge of the polygon at which the distance between the two legs is smallest.
 
-    ``difference`` and ``other_difference`` are the difference vectors at the corners of the edge.
+    ``difference`` and ``other_difference`` are the vectors between the legs at the two corners of the edge.
     """
     step = _difference(other_difference, difference)
     squared_length = _dot(step, step)

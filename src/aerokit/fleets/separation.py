@@ -156,7 +156,9 @@ def separate_by_time(
     slack_s: float = SLACK_S,
     max_delay_s: float = 300.0,
 ) -> Deconfliction:
-    """Separate conflicting routes by time. The decision is "clear", "corridors" with the delays, or "refused".
+    """Separate conflicting routes by time: delay the starts of vehicles.
+
+    The decision is "clear" if there are no conflicts, "corridors" if delays resolve them, and otherwise "refused".
 
     Args:
         routes: routes of the moving vehicles.

@@ -191,9 +191,10 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
 def max_relative_error(
     paths: Mapping[str, Path], samples: Mapping[str, Sequence[tuple[float, LocalPoint]]], duration_s: float
 ) -> float | None:
-    """Return the largest error of the vector from one vehicle to another in metres; None for fewer than two vehicles.
+    """Return by how many metres the position of one vehicle relative to another differed most from the plan.
 
-    The errors are computed at 61 times of the show, with positions that are interpolated between samples.
+    Positions are compared at 61 moments of the show, interpolated between samples. Return None if no two vehicles have
+    samples around the same moment.
     """
     largest_m: float | None = None
     for index in range(RELATIVE_ERROR_SAMPLES + 1):
@@ -484,7 +485,10 @@ async def _fly_track(
 
 
 def _setpoint(path: Path, at_s: float, lead_s: float, position: LocalPoint) -> VelocitySetpoint:
-    """Return the velocity of the path at ``at_s + lead_s``, plus a correction towards its position at ``at_s``."""
+    """Return the velocity of the path at ``at_s + lead_s``, corrected for the vehicle's deviation from the path.
+
+    The deviation is the vector from ``position`` to the point of the path at ``at_s``.
+    """
     planned, _ = state_at(path, at_s)
     _, velocity = state_at(path, at_s + lead_s)
     speed = math.hypot(*velocity)

@@ -66,12 +66,12 @@ class Travel(SelectionBase):
             max_distance_m: reject targets that are farther than this from the vehicle.
             timeout: seconds for each member and leg; None: no limit.
             stagger_s: delay in seconds between the starts of consecutive members, on each leg; None: all at once. Not
-                for corridors.
+                with a ``separation`` by corridors, which has delays of its own.
             separation: result of :meth:`plan_separation` for these targets, if no member has moved since.
 
         Raises:
-            InvalidArgument: a name is unknown, a target is too far away, or ``stagger_s`` or another ``speed_m_s`` does
-                not fit the delays of corridors. Nothing was sent.
+            InvalidArgument: a name is unknown, a target is too far away, or the ``separation`` is by corridors, and
+                ``stagger_s`` is given or ``speed_m_s`` is not the planned speed. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
                 members, targets or positions, and nothing was sent; or a member became unavailable during the flight.

@@ -219,7 +219,7 @@ class Switch:
         return True
 
     def _forward(self, port: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        """Forward one frame. Whether a port must queue it is checked only for the first frame of a batch."""
+        """Forward one frame: add it to the batch of each port; if a port has none, start a batch or queue the frame."""
         for out in plan.outs:
             if out.batch:
                 out.batch.append(raw)
@@ -233,7 +233,7 @@ class Switch:
             self.recording.write(raw, now)
 
     def _start_batch(self, out: Port, raw: bytes, plan: ForwardingPlan[Port], now: float) -> None:
-        """Start the batch of a port with this frame, or queue the frame if the link of the port does not drain."""
+        """Start the batch of a port with this frame; queue the frame if the port's link has too much unsent data."""
         if out.node is None:
             return  # The port was removed after the frame was routed.
         if out.must_queue():

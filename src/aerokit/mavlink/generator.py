@@ -53,7 +53,7 @@ def read_additions() -> list[DialectDefinition]:
 def with_added_messages(
     messages: Sequence[MessageDefinition], additions: Sequence[DialectDefinition]
 ) -> list[MessageDefinition]:
-    """Return pymavlink's messages, supplemented by the additions, followed by the new messages of the additions."""
+    """Merge pymavlink's messages with those of the additions. Messages that pymavlink lacks are appended."""
     merged = {message.id: message for message in messages}
     for added in (message for dialect in additions for message in dialect.messages):
         existing = merged.get(added.id)
@@ -64,7 +64,7 @@ def with_added_messages(
 
 
 def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]) -> list[EnumDefinition]:
-    """Return pymavlink's enums, supplemented by the additions, followed by the new enums of the additions.
+    """Merge pymavlink's enums with those of the additions. Enums that pymavlink lacks are appended.
 
     If a value has several names, that of the additions comes first. New entries do not change the Python names of
     existing entries.

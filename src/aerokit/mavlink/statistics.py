@@ -97,10 +97,10 @@ class SourceStatistics(SourceFields):
         return self._alternations >= _MIN_ALTERNATIONS and now - self._alternated_at < _EXPIRY_S
 
     def out_of_order(self, sequence: int, now: float) -> int:
-        """Process a frame whose sequence number is not `expected`.
+        """Process a frame whose sequence number is not `expected`, and return how it is to be treated.
 
-        Return `IN_ORDER` if the frame is the newest of its sender (after lost frames or a reboot), `LATE` if it was
-        overtaken or repeated, `OTHERS` if it belongs to another stream.
+        `IN_ORDER`: it is the newest frame, after lost frames or a reboot of the sender. `LATE`: a newer frame has
+        overtaken it, or it is a repetition. `OTHERS`: a second sender with the same ids has sent it.
         """
         if self.expected != self._last_expected:
             self._last_expected, self._advanced_at = self.expected, now

@@ -159,9 +159,10 @@ def _px4_letters(item: MissionItem) -> str:
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the value as stored in the form that ``letter`` stands for; nothing if a C conversion is undefined.
+    """Yield the value that the vehicle reports after it has stored ``value`` in the form that ``letter`` stands for.
 
-    The result is NaN for values that are not finite.
+    Yield nothing if the value is beyond the range of the form, where the result of C's conversion is undefined. For
+    NaN and infinities, forms that store a number yield NaN.
     """
     if letter == "-":  # not stored
         yield 0.0
@@ -235,10 +236,10 @@ def plan_differences(
 def changed_items(
     expected: Sequence[MissionItem], actual: Sequence[MissionItem], storage: ItemStorage = ItemStorage.WIRE
 ) -> tuple[int, ...]:
-    """Return the indices at which ``actual`` does not have the expected item, and which a partial update must send.
+    """Return the indices of expected items that ``actual`` lacks or has changed, so that an update must send them.
 
-    Items that ``actual`` has in excess are not reported. By default, only changes made by the protocol itself are
-    tolerated.
+    Further items at the end of ``actual`` are not reported. Changes that ``storage`` explains are tolerated: by
+    default, only those made by MISSION_ITEM_INT.
     """
     common = min(len(expected), len(actual))
     changed = [i for i in range(common) if item_differences(expected[i], actual[i], storage)]

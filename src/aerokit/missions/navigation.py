@@ -68,10 +68,10 @@ def waypoint(
     """Fly to a place and hold there for ``hold_s`` seconds.
 
     ``hold_s`` is 0 to 65,535; ArduPilot stores whole seconds, and ArduPlane does not support it. A place counts as
-    reached at a distance of ``acceptance_radius_m`` (0: the vehicle's parameter); ArduCopter ignores this distance. By
-    the standard, a plane passes the place at a distance of ``pass_by_m``, clockwise if positive, counter-clockwise if
-    negative. ArduPlane instead flies on this far beyond the place; PX4 ignores it. ArduPlane stores both distances in
-    whole metres up to 255.
+    reached within ``acceptance_radius_m`` (0: the radius in the vehicle's parameters); ArduCopter ignores this radius.
+    By the standard, ``pass_by_m`` is the distance at which a plane passes the place, clockwise if positive,
+    counter-clockwise if negative. ArduPlane instead flies over the place, to a point ``pass_by_m`` beyond it. PX4
+    ignores ``pass_by_m``. ArduPlane stores both distances in whole metres up to 255.
     https://mavlink.io/en/messages/common.html#MAV_CMD_NAV_WAYPOINT
     """
     return place_item(

@@ -187,9 +187,11 @@ def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
 def _jump_ids(
     entries: Sequence[JsonValue], groups: Sequence[Sequence[JsonValue] | None], sizes: Sequence[int]
 ) -> dict[int, int]:
-    """Map each doJumpId to the index of its item. Items with an entry of their own precede those inside surveys.
+    """Map each doJumpId in a .plan file to the index of the mission item that has this id.
 
-    ``groups`` has the simple items of each entry (None for a landing pattern), ``sizes`` its number of mission items.
+    An entry of the file is one simple item, a survey with several, or a landing pattern. ``groups`` has the simple
+    items of each entry (None for a landing pattern), ``sizes`` the number of mission items that the entry becomes. If
+    two items have the same id, an item that is an entry itself is preferred to one inside a survey.
     """
     ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}

@@ -78,11 +78,11 @@ def parse_waypoints(text: str, name: str = "waypoints") -> Mission:
 
 
 def format_waypoints(mission: Mission, *, version: int = 110) -> str:
-    """Format a mission as a ``QGC WPL`` file, with Mission Planner's precision, or more where a number needs more.
+    """Format a mission as a ``QGC WPL`` file. Numbers have as many decimal places as in Mission Planner, or more.
 
     Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
-    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 takes a heading of 0 for north. A .plan file
-    stores NaN as null.
+    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 then turns to the north, because it takes 0 for a given
+    heading; use a .plan file for PX4, because it keeps NaN (as null).
 
     Raises:
         InvalidArgument: ``mission`` is no mission, a number is infinite, the altitude of a place is NaN, or the version

@@ -61,7 +61,8 @@ def to_wire_float(
 ) -> messages.MissionItem:
     """Convert an item to MISSION_ITEM, for vehicles without MISSION_ITEM_INT. Places are rounded to about a metre.
 
-    ``place`` becomes ``x`` and ``y``; None: the item's own, in degrees where they are a position.
+    ``place`` has the values to send in ``x`` and ``y``. If it is None, those of the item are sent, converted to degrees
+    if they are a position.
 
     https://mavlink.io/en/messages/common.html#MISSION_ITEM
     """
@@ -254,7 +255,9 @@ def read_header(data: bytes) -> PlanHeader:
 
 
 def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
-    """Decode the items of a packed plan, from the ``first_index`` of its header on: on ArduPilot, item 0 is home.
+    """Decode all items of a packed plan. The first has the number ``first_index`` of the header.
+
+    In a mission of ArduPilot, the item with number 0 is home.
 
     Raises:
         RemoteProtocolError: the data is not a packed plan, is truncated, or has another ``mission_type``.

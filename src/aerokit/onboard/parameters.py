@@ -271,7 +271,8 @@ class _Store:
     def problem(self, name: str, value: object, type: int) -> tuple[int, int] | None:  # noqa: A002
         """Check a value, and offer it to the program's ``on_set``. Return None if it is accepted.
 
-        Otherwise return its MAV_PARAM_ERROR and PARAM_ACK. An error text is sent as a status text.
+        Otherwise return the MAV_PARAM_ERROR and the PARAM_ACK with which the server refuses the value. The text of the
+        exception, if there was one, is sent as a status text.
         """
         row = self._parameters._rows[name]
         if row.metadata.read_only:

@@ -66,7 +66,7 @@ class ComponentServices:
         is_failing = False
 
         def build(_: object) -> Iterable[Message]:
-            """Return the message of the program's function. Nothing is returned if the function fails."""
+            """Return the message that ``function`` returns; no message if it returns None or raises an exception."""
             nonlocal is_failing
             try:
                 message = function()

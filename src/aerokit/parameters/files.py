@@ -155,7 +155,7 @@ def parameter_file_text(
 
 
 def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -> ParameterFile:
-    """Parse a file of Mission Planner or MAVProxy. Each line comes with its place for error texts."""
+    """Parse a file of Mission Planner or MAVProxy. ``lines`` has (place, text) pairs; error texts name the place."""
     values: dict[str, int | float] = {}
     places: dict[str, str] = {}
     for place, line in lines:

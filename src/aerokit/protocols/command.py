@@ -304,7 +304,7 @@ class CommandExchange(Exchange[CommandAck]):
             self._fail(CommandTimeout(self._timeout_text(now)))
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        """Repeat an order if a new HEARTBEAT allows it; fail if the order has ended or its time is over."""
+        """Repeat an order after a new HEARTBEAT. Fail if the order has an ``end``, or if its time is over."""
         if order_status.end:
             self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
             return

@@ -182,10 +182,10 @@ class MessageStream:
 
     @property
     def due_at(self) -> float:
-        """Deadline for the next message.
+        """Time by which the next message must arrive. If none does, the stream has ended, or its request was lost.
 
-        If it passes, the stream has ended or, before the first message, has not started. Until a second message, the
-        interval is unknown, and only the round trip determines the deadline.
+        Before the first message, and while the interval between messages is unknown, only the round trip determines
+        this time.
         """
         # The first failures do not lengthen the wait, because radios lose single requests.
         silence_s = self._round_trip.timeout_s(max(1, self.failures - 1))

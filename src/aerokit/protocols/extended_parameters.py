@@ -262,7 +262,10 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
-        """Process a value that differs from the requested one. Write or read again until the value is conclusive."""
+        """Process a value that differs from the requested one. Write or read it again, until enough answers are equal.
+
+        The result is then the reported value. If that is the value from before the write, the write has failed.
+        """
         self._repeated_answers.add(reported)
         is_unchanged = self._before is not None and settings_equal(reported.value, self._before)
         if not self._repeated_answers.are_conclusive(is_unchanged=is_unchanged):

@@ -123,7 +123,8 @@ class FtpMessage(Snapshot):
     def decode(cls, payload: bytes, *, cut: bool = True) -> Self:
         """Decode a payload without validating it.
 
-        ``data`` has the first ``size`` bytes or, with ``cut=False``, all 239. A short payload is padded with zeros.
+        With ``cut``, the field ``data`` of the result has ``size`` bytes, otherwise all 239 bytes of the payload. A
+        short payload is padded with zeros.
         """
         payload = payload.ljust(PAYLOAD_SIZE, b"\0")
         sequence, session, opcode, size, request_opcode, burst_complete, offset = HEADER.unpack_from(payload)

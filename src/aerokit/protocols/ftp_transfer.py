@@ -333,7 +333,7 @@ class FtpDownload(FtpExchange[int]):
 
     @property
     def _next_block_deadline(self) -> float:
-        """Deadline for the next block. If it passes, the burst has ended or, before any block, has not started."""
+        """Time by which the next block must arrive. If none does, the burst has ended, or its request was lost."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:  # The time between two blocks has not been measured yet.
             # Repeating the burst of a long file is expensive, so the burst gets more time to start.

@@ -233,8 +233,9 @@ class MissionUpload(MissionExchange[UploadResult]):
     def _on_error(self, now: float) -> None:
         """Process an ERROR that may be temporary.
 
-        Before the first request, wait and announce the items again. Then repeat an item, unless it is in flight. At a
-        second ERROR fail, or end without a confirmation if all items were sent.
+        If the vehicle has not requested an item yet, wait and announce the items again. Otherwise, repeat the first
+        unconfirmed item, or the last item if all were sent. A second ERROR fails the upload or, if all items were sent,
+        ends it without a confirmation.
         """
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
         # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
@@ -318,9 +319,10 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
-        """Repeat the items that were sent but not confirmed, except those in flight, and send ``ahead`` more.
+        """Repeat the unconfirmed items, and send up to ``ahead`` further items.
 
-        The vehicle's requests for the repeated items may have been lost.
+        The vehicle's requests for the repeated items may have been lost. An item that was sent a moment ago is not
+        repeated, because the vehicle's answer cannot have arrived yet.
         """
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
             # Items before the last one may be repeated, too. PX4 takes any repeated item for the mission's last item,

@@ -228,7 +228,10 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ------------------------------------------------------------------------------------- result
 
     def _finish_when_complete(self) -> None:
-        """Finish if all values are known, unless some of them may be from before a change of the list."""
+        """Finish if all values are known and consistent. Otherwise drop values from before a change of the count.
+
+        If there are none to drop, inconsistent values are the result.
+        """
         count = self._count
         if count is None or len(self._received) < count:
             return

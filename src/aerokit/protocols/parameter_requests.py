@@ -230,8 +230,8 @@ class ParameterWrites(ParameterRequests):
     def _request(self, name: str) -> list[Message]:
         """Return the messages of the next request for a name.
 
-        This is PARAM_SET if the name is in `_to_set`, from which it is removed, and otherwise a request to read. After
-        an unexpected answer, the request has both.
+        If the name is in `_to_set`, remove it, and return PARAM_SET, followed by a request to read if an earlier
+        PARAM_SET was answered with another value. Otherwise, return only a request to read.
         """
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
         if name not in self._to_set:
@@ -249,7 +249,10 @@ class ParameterWrites(ParameterRequests):
         return [write]
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        """Accept the reported value as the result, or request it again, because it may be old or unintended."""
+        """Settle the name if the reported value is as requested, or was reported often enough; otherwise ask again.
+
+        A value that may answer an earlier request does not settle the name.
+        """
         name = message.param_id
         if not self._window.attempts(name):
             return  # No request for the name is in flight, so the message may answer another station.

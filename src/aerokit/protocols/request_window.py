@@ -108,10 +108,10 @@ class RequestWindow(Generic[KeyT]):
         self._requests.pop(key, None)
 
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
-        """Record an answer. Queue requests that are presumed lost once more, and return them.
+        """Record an answer. Queue again the requests that are presumed lost, and return them.
 
-        These were last sent at least ``overtaken`` transmissions before the first transmission of the answered request,
-        which the answer may belong to.
+        A request is presumed lost if it was last sent at least ``overtaken`` transmissions before the answered request.
+        If that was sent several times, its first transmission counts, because the answer may belong to it.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
@@ -134,7 +134,10 @@ class RequestWindow(Generic[KeyT]):
         return lost
 
     def take_due(self, now: float) -> list[KeyT]:
-        """Return the keys to request now, and count them as sent. A key that is listed twice is requested twice."""
+        """Return the keys to request now, and count them as sent.
+
+        The last few keys may be in the result twice, because their requests are sent twice; see the class.
+        """
         overdue = self.overdue(now)
         # If nothing was answered since an overdue request was sent, the whole link is silent.
         is_silent = any(self._in_flight[key].sent_at >= self._answered_at for key in overdue)
@@ -164,8 +167,8 @@ class RequestWindow(Generic[KeyT]):
     def _timeout_s(self, attempts: int) -> float:
         """Return the seconds to wait for an answer, up to MAX_TIMEOUT_S.
 
-        Repeating a request lengthens the wait only once, a silence of the whole link each time. If few requests are
-        left, the wait stays short.
+        Each silence of the whole link lengthens the wait. As long as there is none, a repeated request waits no longer
+        than a new one. If few requests are left, the wait stays short.
         """
         round_trip = self._round_trip
         seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)

@@ -187,7 +187,10 @@ class Page:
         self._page_of_other_twins = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
-        """Import the names that an expression uses; ``modules`` are the modules in which the names may be defined."""
+        """Add imports of the names in an expression, for type checkers only unless ``at_run_time`` is True.
+
+        A name is imported from where one of ``modules`` imports it; if none does, from the first of them.
+        """
         if node is None:
             return
         for part in ast.walk(node):

@@ -60,9 +60,9 @@ class Copies:
     def is_copy(self, frame: Frame, link: int, *, may_prove: bool = True) -> bool:
         """Remember a frame. Return True if it is a copy: an equal frame arrived recently, but only over other links.
 
-        Recently means within `COPY_WINDOW_S` and `COPY_WINDOW_FRAMES`. ``may_prove`` is False for a frame of a second
-        sender with the same ids. The other methods, and :attr:`is_late`, refer to the last frame for which this method
-        was called.
+        Recently means within `COPY_WINDOW_S` and `COPY_WINDOW_FRAMES`. With ``may_prove=False``, `arrived_over` does
+        not count this arrival, because a second sender with the same ids has sent the frame. The other methods, and
+        :attr:`is_late`, refer to the last frame for which this method was called.
         """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature

@@ -201,13 +201,14 @@ class MultiLinkRoutes:
         return None
 
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
-        """Return the peers that get a message for this component: those on the best link that reaches it.
+        """Return the peers that get a message for this component.
 
-        No peer gets it if the link in use leads to another vehicle with the same id, and no other link works. The
-        caller then sees a silent vehicle, as if the link were lost. A message for a system without a link in use goes
-        to every peer. A broadcast reaches each known system, mostly only once, and is also sent over links without a
-        known system; broadcasts of heartbeats and time go to all peers of all links. ``message`` is None for raw
-        frames, which count as commands. The call may change the link in use, and records the time of commands.
+        The message is sent over the link in use for its system or, if that has no route to the component, over a usable
+        link that has one. Without a link in use, every peer gets it. No peer gets it if the link in use leads to
+        another vehicle with the same id, and no other link works: the effect is that of a lost link. A broadcast
+        reaches each known system, mostly only once, and is also sent over links without a known system; broadcasts of
+        heartbeats and time go to all peers of all links. ``message`` is None for raw frames, which count as commands.
+        The call may change the link in use, and records the time of commands.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)

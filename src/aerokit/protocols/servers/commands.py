@@ -190,10 +190,10 @@ class RunningCommands:
 
     Sends IN_PROGRESS while they run, and handles COMMAND_CANCEL.
 
-    A repeated transmission (COMMAND_LONG with a confirmation) never executes a command twice: it is answered by
-    IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with the same MAV_CMD
-    is TEMPORARILY_REJECTED while the first command runs, unless it stops the first one. So is any new command while
-    ``MAX_RUNNING_COMMANDS`` run.
+    A repeated transmission (COMMAND_LONG with a confirmation) does not execute a command twice, except one that stops:
+    it is answered by IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with
+    the same MAV_CMD is TEMPORARILY_REJECTED while the first command runs, unless it stops the first one. So is any new
+    command while ``MAX_RUNNING_COMMANDS`` run.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:
@@ -213,7 +213,8 @@ class RunningCommands:
     ) -> RunningCommand | None:
         """Register a command that is to be executed. If it must not be executed, answer the sender and return None.
 
-        ``is_stop`` cancels a running command with the same MAV_CMD. Such a command may be executed twice.
+        With ``is_stop``, the command cancels a running one with the same MAV_CMD, and is executed again if the sender
+        repeats it after its end.
         """
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):

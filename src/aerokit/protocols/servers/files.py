@@ -242,10 +242,10 @@ class FileTree:
         return 4096 if isinstance(node, dict) else node.size
 
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
-        """Open a file; ``create`` creates a missing file and empties an existing one.
+        """Open a file.
 
-        In a mount, ``writing`` decides whether the file can be written, and ``create`` is ignored. Outside of mounts,
-        every file can be written.
+        In a mount (see `Mount`), the file can be written only with ``writing``, and ``create`` is ignored. Any other
+        file can always be written; ``create`` creates it if it is missing, and otherwise empties it.
         """
         mounted = self.mounted(path)
         if mounted is not None:

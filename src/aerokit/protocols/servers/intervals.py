@@ -100,9 +100,9 @@ class MessageStreams:
         return self.answer_with(to_int(command.param1), command)
 
     def _set_interval(self, command: ReceivedCommand) -> int:
-        """Set or stop a stream. Both 0 (default rate) and -1 stop it, because streams have no default rate.
+        """Set or stop a stream on one channel. Both 0 (default rate) and -1 stop it, because there is no default rate.
 
-        A stream to all channels ends for all of them, because a message cannot be sent to all channels but one.
+        A stream of the message on all channels is stopped on all of them, because it cannot leave out this channel.
         """
         message_id = to_int(command.param1)
         if message_id not in self.builders:

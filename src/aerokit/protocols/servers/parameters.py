@@ -67,7 +67,10 @@ class ParameterLists:
         return self.burst / self.list_rate_hz
 
     def _send_group(self, start: int, channel: Channel, number: int) -> None:
-        """Send ``burst`` parameters from index ``start`` on, and schedule the next group of list ``number``."""
+        """Send ``burst`` parameters from index ``start`` on, and schedule the next group, unless the list was stopped.
+
+        ``number`` identifies the list: a list that was restarted has another number.
+        """
         if self._lists.get(channel) != number:  # The list was stopped, or restarted with another number.
             return
         names, end = self._listed.names, start + self.burst

@@ -406,9 +406,10 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if frames are to be delivered, i.e. if they are in time and from the tracked vehicle side.
+        """Return True if a datagram is to be delivered. False if it is late, or not from the tracked vehicle side.
 
-        ``epoch`` identifies the vehicle side that sent them, ``sent_s`` is the send time on its clock.
+        ``epoch`` identifies the vehicle side that sent it, ``sent_s`` is the time of sending on the clock of that side.
+        A vehicle side is a program that serves the vehicle to clients.
         """
         if epoch != self.epoch:
             self.foreign += 1
