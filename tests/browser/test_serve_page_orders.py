@@ -189,6 +189,9 @@ def test_readiness_shows_all_reasons_and_notes(browser: Any, copters: tuple[list
         text = "Disarmed 4 s after arming, not by an order of this server (DISARM_DELAY = 10 s)"
         assert page.evaluate(READINESS, {"disarming": disarming}) == ["Ready to arm", text]
         assert page.evaluate(READINESS, {"disarming": {**disarming, "age_s": 61}}) == ["Ready to arm"]
+        switched_off = {**disarming, "parameter": "COM_DISARM_PRFLT", "delay_s": -1}
+        text_without_delay = "Disarmed 4 s after arming, not by an order of this server"
+        assert page.evaluate(READINESS, {"disarming": switched_off}) == ["Ready to arm", text_without_delay]
         refused = {"missing_for_flight": ["compass", "home"], "not_armable": ["compass"]}
         rows = page.evaluate(READINESS, refused)
         assert rows == ["Cannot arm", "compass", "and 2 more", "Also missing for flight:", "home", "A seventh"]

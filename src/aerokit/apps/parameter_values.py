@@ -56,9 +56,10 @@ def _problem(metadata: Metadata, name: str, value: float) -> str | None:
 
 
 def metadata_entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Callable[[float], float]]:
-    """Return the metadata of a parameter under any of its names; None if there is none.
+    """Return the metadata of a parameter, and a function that converts its values to the unit of the metadata.
 
-    The second result is a function that converts values of ``name`` to the unit of that metadata.
+    The metadata may list the parameter under a later or earlier name, with another unit. The metadata is None if there
+    is none; the function then returns values unchanged.
     """
     from aerokit.parameters.renames import resolve_rename
 

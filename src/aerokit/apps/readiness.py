@@ -203,7 +203,7 @@ class ArmingCheckRequests:
         self._requested_at: dict[Vehicle, float] = {}
 
     def take_due(self, vehicle: Vehicle) -> bool:
-        """Return True if the caller must now call `run_arming_checks`. True is returned once for each request."""
+        """Return True, only once, when arming checks become due. The caller must then call `run_arming_checks`."""
         failing = _failing_checks(vehicle)
         if failing is None:
             self._failing.pop(vehicle, None)

@@ -60,8 +60,8 @@ class AdaptiveWindow:
     def on_answer(self, seconds: float | None) -> None:
         """Record an answer.
 
-        ``seconds`` is the time since its request; None if it says nothing about the link, because the answer may be to
-        one of several transmissions, or the server was busy.
+        ``seconds`` is the time since the request. It is None if the time does not describe the link, because it is
+        unknown which transmission was answered, or because the server was busy.
         """
         self._loss -= LOSS_WEIGHT * self._loss  # The average moves towards 0 with an answer, towards 1 with a loss.
         if seconds is None:
@@ -176,8 +176,8 @@ class BlockRequests:
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
         """Return the offsets to request now, and count them as sent. Overdue blocks come first.
 
-        ``limit`` reduces the number of requests in flight. While fewer than ``batch_size`` requests are in flight, the
-        next one is sent without delay; beyond that, one every ``spacing_s`` seconds.
+        At most ``limit`` requests are in flight, and no more than the window allows. The first ``batch_size`` of them
+        are sent without delay, further ones ``spacing_s`` seconds apart.
         """
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)

@@ -199,9 +199,9 @@ class MessageStream:
         self._has_started = False
 
     def on_message(self, now: float, messages: int) -> None:
-        """Record a message. ``messages`` counts it and the lost messages right before it, so 1 means no loss.
+        """Record a message. ``messages`` is 1 plus the number of messages lost directly before it.
 
-        Without a count above 0, the message is a repeated or delayed one. It ends an interval without measuring it.
+        It is 0 or less for a repeated or delayed message. The time before such a message is not measured.
         """
         elapsed_s = now - self._last_at
         if self._has_started and messages > 0:
@@ -337,11 +337,11 @@ class StaleAnswerFilter:
         self._early_requests: dict[str, set[float]] = {}  # by name: send times of requests answered too early
 
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
-        """Return True if an answer at ``now`` cannot belong to the request for ``name`` sent at ``sent_at``.
+        """Return True if ``now`` is too early for an answer to the request for ``name`` sent at ``sent_at``.
 
-        Such an early answer is counted, because several of them show that the vehicle has become faster.
-        ``attempts`` is the number of transmissions of the request. The caller needs further evidence for answers that
-        are accepted: an answer to another station may be accepted once the vehicle counts as faster.
+        ``attempts`` is the number of transmissions of the request. After several early answers, the vehicle counts as
+        faster, and early answers are accepted. An accepted answer may be one to another station, so the caller must
+        check it in other ways too.
         """
         elapsed_s = now - sent_at
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):

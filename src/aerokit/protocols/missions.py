@@ -150,10 +150,10 @@ class MissionClear(MissionExchange[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Process the MISSION_ACK. A result that can only belong to an expired upload is ignored.
+        """Process the MISSION_ACK. OPERATION_CANCELLED and INVALID_SEQUENCE are ignored: they answer an earlier upload.
 
-        A late ACCEPTED of an earlier upload counts, because it looks the same. The caller therefore reads the number
-        of items afterwards.
+        A late ACCEPTED of an earlier upload looks like the answer to this request and is accepted. The caller therefore
+        reads the number of items afterwards.
         """
         if not isinstance(message, MissionAck) or not self._is_ours(message):
             return

@@ -155,7 +155,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _record_count(self, count: int, *, is_streamed: bool) -> None:
-        """Record the number of parameters that a message reports. If it has changed, indices may be missing."""
+        """Record the number of parameters that a message reports. After a change, missing indices are requested."""
         # All messages of ArduPilot's stream report the count from the start of the stream, although the number of
         # parameters may change meanwhile. A streamed count is therefore only compared with an earlier streamed count.
         if is_streamed:

@@ -319,6 +319,20 @@ async def test_early_disarming_by_pilot_is_not_called_automatic() -> None:
         assert (found["is_automatic"], found["armed_for_s"]) == (False, pytest.approx(3, abs=1))
 
 
+def test_disarming_is_not_called_automatic_if_parameter_is_negative() -> None:
+    """COM_DISARM_PRFLT = -1 switches PX4's automatic disarming off."""
+    flight = FakeFlight()
+    flight.autopilot.auto_disarm_parameter = "COM_DISARM_PRFLT"
+    flight.parameters = SimpleNamespace(known=lambda name: SimpleNamespace(value=-1.0))
+    flight.landed_state.set(MavLandedState.ON_GROUND, flight.now)
+    for is_armed in (False, True, False):
+        flight.armed.set(is_armed, flight.now)
+        flight.now += 0.3
+    found = flight.watch.disarming
+    assert found is not None
+    assert (found["delay_s"], found["is_automatic"]) == (-1.0, False)
+
+
 async def test_ordered_disarming_and_landing_are_not_reported() -> None:
     async with open_stage() as stage:
         await stage.submit("arm")

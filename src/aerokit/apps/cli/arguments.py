@@ -267,7 +267,7 @@ def add_faults(command: argparse._ActionsContainer) -> None:
 
 
 def add_conditions(command: argparse._ActionsContainer) -> None:
-    """Add the parameters, wind, battery and faults of simulated vehicles."""
+    """Add ``--parameter``, ``--wind``, ``--battery`` and ``--fault`` for simulated vehicles."""
     parameters = command.add_argument(
         "--parameter",
         action="append",

@@ -196,8 +196,8 @@ class LinkExamination:
     def _ids(self) -> Iterator[Finding]:
         """Yield findings about system and component ids.
 
-        These are ids with several senders, systems with several autopilots, another sender with the default ids of
-        aerokit programs, and system id 0.
+        Reported are ids that two senders use, systems with several autopilots, another ground station with aerokit's
+        default ids, and system id 0.
         """
         ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
         for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
@@ -256,7 +256,7 @@ class LinkExamination:
                 yield Finding("ok", "sender", text, _STATUS_ADVICE if is_autopilot(heartbeat) else "")
 
     def _signing(self) -> Iterator[Finding]:
-        """Yield problems with signatures: frames that the key does not fit, or signed frames without a key."""
+        """Yield problems with signatures: the given key does not fit, or frames are signed and no key is given."""
         signing = self._connection.signing
         if signing is not None:
             if problems := self._connection.describe_signature_problems():

@@ -166,9 +166,9 @@ class PlanFlight(SupervisedFlight):
             group.cancel_scope.cancel()
 
     async def _explain_wait(self, mode: str) -> None:
-        """Print why the flight does not fail at once when the mode changes to ``mode``.
+        """Print what the program waits for before it fails because of a change to ``mode``.
 
-        Nothing is printed at first, because a report that the mission has ended may soon explain the mode.
+        Sleeps first. If the vehicle reports meanwhile that the mission has ended, nothing is printed.
         """
         delay_s = END_GRACE_S / 4
         await anyio.sleep(delay_s)

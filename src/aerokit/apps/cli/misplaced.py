@@ -33,9 +33,9 @@ def is_address(word: str) -> bool:
 
 
 def misplaced_file(word: str) -> str | None:
-    """Return an error text if a word given as an address is a file other than a recording, or has such a file's suffix.
+    """Return an error text if a word, given as an address, is a file; otherwise None. Recordings are valid addresses.
 
-    The text has the right command if the suffix is known. The result is None for other words.
+    A word with a known suffix, such as .plan, need not exist as a file. The text then has the right command.
     """
     path = Path(word)
     suffix = path.suffix.lower()

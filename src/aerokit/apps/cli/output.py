@@ -229,7 +229,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def _requirement(extra: str) -> str:
-    """Return the pip argument that installs this package with an extra, from the source it was installed from."""
+    """Return the argument with which pip adds an extra, from PyPI or from the folder or URL of this installation."""
     from importlib.metadata import PackageNotFoundError, distribution
     from urllib.parse import unquote
 

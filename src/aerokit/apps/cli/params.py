@@ -311,8 +311,8 @@ def _emit_results(
 ) -> int:
     """Print a line for each result, and return the exit code. ``known`` are names for suggestions.
 
-    The exit code is that of the first error whose code is not FAILED, as for ``get``. If there is none, it is FAILED
-    after any error, or if a value differs from the requested value by more than rounding.
+    If an error has an exit code other than FAILED, the first such code is returned, as for ``get``. Otherwise FAILED is
+    returned if there was an error or the vehicle clamped a value, and DONE if not.
     """
     code = DONE
     for result in results:

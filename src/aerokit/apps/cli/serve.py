@@ -126,7 +126,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
-    """Return the uvicorn configuration, with limits on what clients may send and hold open."""
+    """Return the uvicorn configuration, with limits for anonymous connections and for WebSocket messages."""
     guard = import_extra("aerokit.apps.serve.guard", "serve")
     return uvicorn.Config(
         app,

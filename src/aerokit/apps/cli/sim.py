@@ -62,11 +62,11 @@ _SERIAL_LINE_PLACEHOLDER = "the other end of the serial line"
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     """Create a vehicle of a kind of `aerokit.sim.kinds`. ``options`` are arguments of its class.
 
-    Kinds without ``boot_text`` ignore this option.
+    Kinds that do not have the option ``boot_text`` ignore it.
 
     Raises:
-        InvalidArgument: the kind is unknown or does not have one of the options, or ``parameters`` (an option) has a
-            name that the kind does not have.
+        InvalidArgument: there is no such kind, the kind does not have one of the other options, or the option
+            ``parameters`` contains a parameter that the kind does not have.
     """
     from aerokit.sim.kinds import kind_class, simulated
 

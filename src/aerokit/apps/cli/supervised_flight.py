@@ -85,7 +85,10 @@ class SupervisedFlight(ABC):
         self._has_left_mode = False  # True once the armed vehicle was in a mode other than those it was armed in
 
     async def fly(self) -> int:
-        """Perform the flight and return the exit code. After an error, make an armed vehicle safe and re-raise."""
+        """Perform the flight and return the exit code.
+
+        Once an arm command was sent, an error is raised only after `_after_failure`. Ctrl-C runs `_after_interrupt`.
+        """
         try:
             code = await self._interrupts.run(self._fly)
         except Exception as error:
@@ -154,10 +157,10 @@ class SupervisedFlight(ABC):
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
 
     async def _after_failure(self, error: Exception) -> int:  # subclasses use the error
-        """Disarm on the ground, if this program still has control. In the air, leave control to pilot or failsafe.
+        """Make the vehicle safe after an error, which `fly` then raises again. `fly` ignores the exit code.
 
-        If the vehicle is disarmed, wait for a late arming. The result, an exit code, is not used, because the error is
-        raised again.
+        If the vehicle is disarmed, wait for a late arming. If it is armed on the ground and this program has control,
+        disarm it. Otherwise send nothing: in the air, the pilot or a failsafe decides.
         """
         vehicle = self._vehicle
         if vehicle.is_confirmed_disarmed:
@@ -364,9 +367,9 @@ class FlightReport:
         self._emit("flight_summary", record, "\n".join(lines), waits=True)  # the flight is over, so this may block
 
     def _describe_armed(self, speed: float) -> str:
-        """Return "armed for 47 s", with notes on the time until an impact and on the speed of a simulation.
+        """Return "armed for 47 s", followed in brackets by the time until an impact and the speed of a simulation.
 
-        ``speed`` is `speedup`, or the measured speed of a simulation that this program did not start.
+        ``speed`` is the vehicle's seconds per real second: `speedup`, or as measured if another program simulates.
         """
         notes = []
         if self._impact_s is not None:
@@ -437,7 +440,10 @@ class FlightReport:
             self._fast_sink_at = self._vehicle.velocity.updated_at
 
     def _on_position(self, _: Position | None, position: Position) -> None:
-        """Measure the track while the vehicle is armed, between points at least a metre apart, as reports do."""
+        """While the vehicle is armed, update the flown distance, the greatest height and the greatest speed.
+
+        The distance is measured between positions at least a metre apart, as in reports.
+        """
         if not self._vehicle.is_armed:
             self._previous_position = None
             return

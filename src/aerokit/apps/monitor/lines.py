@@ -204,9 +204,9 @@ class VehicleText:
         return against_arming + _with_prefix(flight_prefix, checks.against_flight)
 
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
-        """Return the first reason that prevents a flight, and as many others as fit into ``max_lines``.
+        """Return the first reason that prevents a flight, and the following ones that fit into ``max_lines`` lines.
 
-        ``width`` is the number of columns of a line. It is not needed for a single line, which shows one reason.
+        ``width`` is the number of columns of a line. It has no effect if ``max_lines`` is 1: one reason is returned.
         """
         missing = self._reasons()
         if not missing:

@@ -235,7 +235,7 @@ class MqttLink(BaseLink):
             self._connect_result.set_result(refusal)
 
     def _release(self) -> None:
-        """Close the connection, and publish "offline" if that is possible without waiting."""
+        """Publish "offline" if the client can send it at once, then close the connection."""
         client, self._client = self._client, None
         self._unsent.clear()
         if self._timer is not None:

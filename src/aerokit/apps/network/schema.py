@@ -127,7 +127,7 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
 
 
 def _enum_schema(name: str) -> dict[str, Any] | None:
-    """Return the schema of an integer that is published as a name, as a list of names (flags), or else as the number.
+    """Return the schema of an enum value: a name, for flags also a list of names, or an integer that has no name.
 
     ``name`` is a state or ``Class.field``. Return None if it is not in ``ENUMS``.
     """

@@ -102,20 +102,18 @@ class FlightWatch:
 
     @property
     def disarming(self) -> dict[str, Any] | None:
-        """The last time that the vehicle was disarmed without having flown, and without an order of this server.
+        """The last disarming, if it was before take-off and without an order of this server; otherwise None.
 
-        It is None if there was none.
-
-        ``age_s`` is the time since then, ``armed_for_s`` how long the vehicle was armed. ``parameter`` and ``delay_s``
-        are the autopilot's setting for automatic disarming. ``is_automatic`` is true if the vehicle was armed for about
-        ``delay_s``.
+        ``age_s`` is the time since the disarming. ``armed_for_s`` is the time from arming to disarming. ``parameter``
+        is the autopilot's parameter for automatic disarming, and ``delay_s`` its value. ``is_automatic`` is true if
+        ``armed_for_s`` is about ``delay_s``.
         """
         if self._disarming is None:
             return None
         at, armed_for_s = self._disarming
         delay_s = self.disarm_delay_s
         is_automatic = False
-        if delay_s is not None and delay_s != 0.0:
+        if delay_s is not None and delay_s > 0.0:
             is_automatic = abs(armed_for_s - delay_s) <= DISARM_DELAY_TOLERANCE_S
         return {
             "age_s": round(self._now() - at, 1),
@@ -169,8 +167,8 @@ class FlightWatch:
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
         """Detect when an impact begins or is over, and evaluate it with each new velocity.
 
-        An impact begins with the first slower velocity after a fast descent. A vehicle that falls again, from a tree,
-        has a second impact, unless it has already crashed.
+        An impact begins when a fast descent ends suddenly. A vehicle that falls again, for example out of a tree, has a
+        second impact. After a crash, no further impact is detected.
         """
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return

@@ -179,8 +179,8 @@ RawHeaders = list[tuple[bytes, bytes]]
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
     """Return a class that limits anonymous connections, for the argument ``http`` of `uvicorn.Config`.
 
-    A connection is anonymous until one of its requests has the token. Only anonymous connections are closed when there
-    are too many, so that their clients cannot exclude the owner.
+    A connection is anonymous until one of its requests has the token. If there are too many anonymous connections, one
+    of them is closed, never a connection with the token.
     """
     anonymous: dict[_HttpConnection, None] = {}
 

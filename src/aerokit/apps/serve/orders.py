@@ -311,8 +311,8 @@ class OrderRunner:
         """Start an order, or return the earlier order with this key. ``order_type.check`` has checked the arguments.
 
         Raises:
-            HttpProblem: the key is missing, or was used for another order or for one whose result is no longer stored;
-                the client has only seen an old state; ``force`` is not allowed; or the server has ended.
+            HttpProblem: there is no key; the key was used for a different order, or its order is no longer stored; the
+                client's state of the vehicle is too old; ``force`` is not allowed; or the server has ended.
             FileFormatError, InvalidArgument: the arguments cannot be parsed.
             BusyError: too many orders are running.
             HeartbeatTimeout: the vehicle is silent.
@@ -401,7 +401,7 @@ class OrderRunner:
             )
 
     def _store(self, record: OrderRecord) -> None:
-        """Store an order. If there are too many, drop the oldest orders that have ended, but keep their keys."""
+        """Store an order. If there are too many, drop the oldest ended ones, but remember their keys as used."""
         self._records[record.key] = record
         ended_keys = [key for key, stored in self._records.items() if stored.state != "running"]
         for key in ended_keys:

@@ -219,8 +219,8 @@ class ServedVehicles:
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
         """Return the overview of a vehicle, and further values that the page shows (docs/serve.md).
 
-        ``mission_item`` counts items without home, unlike the state ``mission_current``, which counts them as on the
-        wire, where ArduPilot's item 0 is home.
+        ``mission_item`` is an index in the plan, which does not contain home. The state ``mission_current`` is the item
+        number in MAVLink, where ArduPilot's item 0 is home.
         """
         watch = self._watch(vehicle)
         missing = vehicle.missing_for_flight()

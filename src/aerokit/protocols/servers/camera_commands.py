@@ -72,8 +72,8 @@ class _Pictures:
     async def start(self, command: ReceivedCommand) -> int:
         """Take images, if param 1 selects this camera.
 
-        A repeated command for a single image takes no further image: it has the sequence number (param 4) and the
-        sender of the last command.
+        A command for a single image is a repetition if it has the same sender and sequence number (param 4) as the last
+        one. It then takes no further image.
         """
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0

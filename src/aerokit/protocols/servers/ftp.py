@@ -322,9 +322,9 @@ class SessionFtpServer(Generic[FilesT]):
         self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
-        """Send a block of a burst. At the end of the file, or on an error, send the refusal that ends the burst.
+        """Send a block of a burst. At the end of the file, or on an error, send the NAK that ends the burst instead.
 
-        With ``may_end``, this block ends the burst if enough data was sent.
+        With ``may_end``, the block is marked as the burst's last one (``burst_complete``) if enough data was sent.
         """
         # Unlike in a request, the sequence number in `burst` is already that of the reply.
         number = session.number

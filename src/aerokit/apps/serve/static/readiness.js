@@ -89,7 +89,8 @@ export function disarmText({ disarming: known }) {
   if (!known || known.age_s * 1000 > RECENT_MS) return "";
   const after = `${Math.round(known.armed_for_s)} s after arming`, { parameter, delay_s: delay } = known;
   if (known.is_automatic) return `Disarmed by the vehicle ${after}, because it was not in the air (${parameter} = ${delay} s)`;
-  return `Disarmed ${after}, not by an order of this server${parameter && delay !== 0 ? ` (${parameter}${delay === null ? "" : ` = ${delay} s`})` : ""}`;
+  const isOff = delay !== null && delay <= 0;
+  return `Disarmed ${after}, not by an order of this server${parameter && !isOff ? ` (${parameter}${delay === null ? "" : ` = ${delay} s`})` : ""}`;
 }
 
 export const failsafeTitle = (vehicle) => `Failsafe: ${valueOf(vehicle, "mode")?.name ?? UNKNOWN}`;
