@@ -77,7 +77,7 @@ def printable(text: str) -> str:
 def format_value(value: object) -> str:
     """Format an event's field for people: enum members by name, floats with three digits, or as integers from 1000."""
     if isinstance(value, float):
-        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+        return f"{value:.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
     name = getattr(value, "name", None)
     return name if isinstance(name, str) else str(value)
 

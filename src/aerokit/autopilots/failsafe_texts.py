@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 _NO_EVIDENCE_PATTERN = re.compile(
-    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|(?<!dis)arming|re-?gained|recovered|restored"
+    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|\barming|re-?gained|recovered|restored"
     r"|compensation off|connection .*established|fence enabled|fence disabled",
     re.I,
 )

@@ -308,6 +308,11 @@ def test_fly_explains_wait_after_failsafe_mode(capsys: pytest.CaptureFixture[str
     assert changed < waiting < failed
 
 
+def test_fly_prints_long_wait_without_exponent(capsys: pytest.CaptureFixture[str]) -> None:
+    run_virtual(run_on(None, "fly", SURVEY, "--sim", "--fault", "gps_lost@25", "--speedup", "70"))
+    assert "waiting 105 s for the end of LAND" in capsys.readouterr().out
+
+
 @pytest.mark.exhaustive
 def test_px4_without_position_ends_fly_with_failsafe(capsys: pytest.CaptureFixture[str]) -> None:
     options = ("--vehicle", "px4", "--fault", "gps_lost@25", "--record", "x.tlog")

@@ -233,6 +233,7 @@ def test_report_of_crash_begins_and_ends_with_fall(
         ("Radio Failsafe - Disarming", "radio"),
         ("Arming: Radio failsafe on", None),
         ("PreArm: Battery failsafe", None),
+        ("Battery 1 is low, warming up", "battery"),
     ],
 )
 def test_disarming_texts_are_evidence_arming_texts_are_not(text: str, kind: str | None) -> None:

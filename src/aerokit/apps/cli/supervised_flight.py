@@ -374,7 +374,8 @@ class FlightReport:
         if self.speedup != 1.0:
             notes.append(f"simulated in {_duration(self._armed_s)}, {speed:g}x")
         elif speed != 1.0:
-            notes.append(f"a simulation at {speed:.2g} times real speed: {_duration(self._armed_s)} on this clock")
+            factor = f"{round(speed, 1):g}"
+            notes.append(f"a simulation at {factor} times real speed: {_duration(self._armed_s)} on this clock")
         return f"armed for {_duration(speed * self._armed_s)}" + (f" ({'; '.join(notes)})" if notes else "")
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:
