@@ -151,7 +151,8 @@ class SupervisedFlight(ABC):
                 self._print(f"interrupted again; no further commands: vehicle {self._vehicle.describe_now()}")
         except AerokitError as error:
             self._print(f"failed again: {plain_text(error)}")
-            self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
+            advice = "; take over, or command it from another ground station" if self._vehicle.is_armed else ""
+            self._print(f"no further commands: vehicle {self._vehicle.describe_now()}{advice}")
 
     async def _after_failure(self, error: Exception) -> int:  # subclasses use the error
         """Disarm on the ground, if this program still has control. In the air, leave control to pilot or failsafe.
@@ -191,11 +192,18 @@ class SupervisedFlight(ABC):
             # The vehicle is still armed, so it gets the command for a flying vehicle.
         text = INTERRUPT_ACTIONS[action]
         self._print(text if action == "nothing" else f"{text}; Ctrl-C exits at once")
-        if action == "return":
-            await vehicle.return_to_launch(timeout=None)
-        elif action == "land":
-            await vehicle.land(timeout=None)
-        elif action == "hold":
+        try:
+            if action == "return":
+                await vehicle.return_to_launch(timeout=None)
+            elif action == "land":
+                await vehicle.land(timeout=None)
+            elif action == "hold":
+                await vehicle.hold()
+        except CommandRejected as error:
+            # Without a position, for example, autopilots refuse to return. The vehicle must not simply fly on.
+            if action == "hold" or not self._check_control():
+                raise
+            self._print(f"{text} failed: {plain_text(error)}; {INTERRUPT_ACTIONS['hold']} instead")
             await vehicle.hold()
         if action in ("return", "land"):
             await self._wait_disarmed_on_ground()
