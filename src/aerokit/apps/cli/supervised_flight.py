@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit import events
-from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, can_print, emit, plain_text
+from aerokit.apps.cli.output import DONE, INTERRUPTED, MAX_UNPRINTED, MISSION_TEXT, can_print, emit, plain_text
 from aerokit.apps.readiness import arms_but_cannot_fly_text, readiness
 from aerokit.errors import (
     AerokitError,
@@ -60,7 +60,6 @@ _WARNING_SEVERITY = 4
 # If nothing was printed for this time, a status line is printed.
 _STATUS_INTERVAL_S = 5.0
 _MIN_STEP_M = 1.0
-_MAX_UNPRINTED = 1000  # lines that wait for a stopped terminal; further lines replace the oldest
 
 
 class SupervisedFlight(ABC):
@@ -278,7 +277,7 @@ class FlightReport:
         self._flown_m = 0.0
         self._previous_position: Position | None = None
         # Arguments of `emit` that wait until the output accepts them, oldest first.
-        self._unprinted: deque[tuple[str, Mapping[str, object], str]] = deque(maxlen=_MAX_UNPRINTED)
+        self._unprinted: deque[tuple[str, Mapping[str, object], str]] = deque(maxlen=MAX_UNPRINTED)
         self.prints_status: bool = True
         """True if status lines are printed when there is no other output. Set it to False during questions."""
 
