@@ -38,6 +38,8 @@ _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
 # Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
+# If a record is earlier than the previous one by more than this, the recording's clock was set back.
+_MAX_DISORDER_S = 1.0
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
@@ -131,11 +133,23 @@ class _Reader:
         begins_at, ends_at = 0.0, 0.0
         new_frames = 0  # the vehicle's frames since the last call of link.count()
         next_second_unix_s, expected_sequence = 0.0, -1
-        last_frame_at, last_frame_record = math.nan, 0  # time and number of the record with the vehicle's last frame
+        last_frame_at = math.nan  # time of the record with the vehicle's last frame
+        previous_unix_s = math.nan
+        paused_s = 0.0  # seconds without any record since the vehicle's last frame
+        set_back_s = 0.0  # sum of the jumps by which the recording's clock was set back
         with flight.path.open("rb") as file:
-            for unix_s, raw in read_tlog(file):
+            for recorded_unix_s, raw in read_tlog(file):
+                unix_s = recorded_unix_s + set_back_s
                 if not records:
-                    begins_at = unix_s
+                    begins_at = previous_unix_s = unix_s
+                elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
+                    if unix_s > previous_unix_s:
+                        paused_s += unix_s - previous_unix_s
+                    else:
+                        self._note_clock(previous_unix_s - unix_s, previous_unix_s - begins_at)
+                        set_back_s += previous_unix_s - unix_s
+                        unix_s = previous_unix_s
+                previous_unix_s = unix_s
                 records += 1
                 if records % 16_384 == 0:
                     on_bytes(file.tell())
@@ -150,12 +164,11 @@ class _Reader:
                     # To save calls, frames are counted together until a frame is missing or a second ends.
                     if sequence != expected_sequence or unix_s >= next_second_unix_s:
                         if unix_s - last_frame_at >= MIN_SILENCE_S:
-                            link.add_silence(
-                                last_frame_at - begins_at, unix_s - begins_at, records - last_frame_record - 1
-                            )
+                            link.add_silence(last_frame_at - begins_at, unix_s - begins_at, paused_s)
+                            paused_s = 0.0
                         next_second_s = link.count(unix_s - begins_at, sequence, expected_sequence, new_frames)
                         next_second_unix_s, new_frames = begins_at + next_second_s, 0
-                    last_frame_at, last_frame_record = unix_s, records
+                    last_frame_at = unix_s
                     expected_sequence = (sequence + 1) & 0xFF
                     if message_id not in handlers_of_vehicle:
                         continue
@@ -173,8 +186,14 @@ class _Reader:
                     handle(unix_s - begins_at, message)
             on_bytes(file.tell())
         flight.begins_at, flight.ends_at = begins_at, ends_at
-        link.end(new_frames, last_frame_at - begins_at, flight.duration_s, records - last_frame_record)
+        link.end(new_frames, last_frame_at - begins_at, flight.duration_s, paused_s)
         self._finish(damaged)
+
+    def _note_clock(self, set_back_s: float, time_s: float) -> None:
+        self._flight.notes.append(
+            f"the recording's clock was set back by {set_back_s:.0f} s, {time_s:.0f} s after the log began: the times"
+            " in this report continue without this jump"
+        )
 
     def _finish(self, damaged: int) -> None:
         """Complete the flight after the last message. ``damaged`` is the number of damaged messages."""

@@ -77,17 +77,18 @@ class LinkCounter:
         self._lost += missing
         return self._second + 1
 
-    def add_silence(self, begins_s: float, ends_s: float, other_messages: int) -> None:
-        """Record a silence of the vehicle, in which this many messages of other systems were received."""
-        self._silences.append(Silence(begins_s, ends_s, is_recorded=other_messages > 0))
+    def add_silence(self, begins_s: float, ends_s: float, paused_s: float) -> None:
+        """Record a silence of the vehicle, with the seconds in which no message of any system was recorded."""
+        is_recorded = ends_s - begins_s - paused_s >= MIN_SILENCE_S
+        self._silences.append(Silence(begins_s, ends_s, is_recorded))
 
-    def end(self, received: int, received_s: float, ends_s: float, other_messages: int) -> None:
+    def end(self, received: int, received_s: float, ends_s: float, paused_s: float) -> None:
         """Count the frames up to ``received_s``. A silence from then until the end of the log counts as 100 % loss."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
             return
-        self.add_silence(received_s, ends_s, other_messages)
+        self.add_silence(received_s, ends_s, paused_s)
         self._add_row(int(ends_s))
         if ends_s > self._second:
             self._series.add(ends_s, *_ALL_LOST)
