@@ -234,6 +234,18 @@ def test_csv_times_have_rounded_microseconds(unix_s: float, tmp_path: Path) -> N
     assert (tmp_path / "times.csv").read_text().splitlines()[1] == expected
 
 
+def test_damaged_message_changes_no_time_of_later_ones(tmp_path: Path) -> None:
+    """Its end looks like the start of a longer message."""
+    encoder = FrameEncoder(1, 1)
+    damaged = encoder.encode(m.Attitude(0, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0))[:-7] + b"\xfd\x3c\x00\x99\x3e\x47\xf1"
+    with TlogWriter(tmp_path / "in.tlog") as writer:
+        writer.write(damaged, BEGIN)
+        for second in (1, 2):
+            writer.write(encoder.encode(m.Statustext(4, "x" * 41)), BEGIN + second)
+    records = TlogReader(tmp_path / "in.tlog").entries(lambda _: None)
+    assert [record.unix_s - BEGIN for record in records] == [1, 2]
+
+
 def test_gpx_has_times_elevations_and_mission(log: Path, tmp_path: Path) -> None:
     gpxpy = pytest.importorskip("gpxpy")
     convert(log, tmp_path / "out.gpx")

@@ -11,6 +11,7 @@ from typing import Any
 import log_files
 import pytest
 
+from aerokit.logs.convert import convert
 from aerokit.logs.flights import FlightLog, read_flight
 from aerokit.logs.flights.flight_controllers import UlogReader
 from aerokit.mavlink.enums import MavCmd, MavFrame
@@ -149,3 +150,28 @@ def test_missing_pyulog_raises_module_not_found(logs: Logs, monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "pyulog", None)
     with pytest.raises(ModuleNotFoundError):
         next(UlogReader(path).entries(lambda _: None))
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".ulg"])
+def test_parquet_has_largest_integers(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    largest = (1 << 64) - 1
+    logs = Logs(tmp_path, monkeypatch)
+    if suffix == ".bin":
+        monkeypatch.setitem(log_files.TABLES, "LONG", (0x95, "QQ", "TimeUS,value"))
+        logs.read_bin((2.0, "LONG", (largest,)), without="")
+    else:
+        logs.write_ulog((2.0, "LONG", (largest,)), LONG="Q:timestamp Q:value")
+    convert(tmp_path / f"flight{suffix}", tmp_path / "out", tables="parquet")
+    assert parquet.read_table(tmp_path / "out" / "LONG.parquet")["value"].to_pylist() == [largest]
+
+
+def test_tables_of_similar_names_lose_no_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("3_A_", "A_", "A!")  # "!" is not allowed in the name of a file
+    for number, name in enumerate(names, 0x95):
+        monkeypatch.setitem(log_files.TABLES, name, (number, "QB", "TimeUS,value"))
+    rows = [(0.5 + number / 10, name, (1,)) for number, name in enumerate(names)]
+    Logs(tmp_path, monkeypatch).read_bin((0.1, "MSG", (b"ArduCopter V4.6.1",)), *rows, (0.9, "3_A_", (2,)), without="")
+    convert(tmp_path / "flight.bin", tmp_path / "out")
+    lines = [line for path in (tmp_path / "out").glob("*A_.csv") for line in path.read_text().splitlines()[1:]]
+    assert len(lines) == 4
