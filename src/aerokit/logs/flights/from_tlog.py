@@ -40,6 +40,8 @@ _HEARTBEAT_ID = b"\0\0\0"
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 # If a record is earlier than the previous one by more than this, the recording's clock was set back.
 _MAX_DISORDER_S = 1.0
+# Older positions are not used to convert local set-points to global ones.
+_POSITION_MAX_AGE_S = 2.0
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
@@ -95,6 +97,7 @@ class _Reader:
         self._charge_states: dict[int, int] = {}  # MAV_BATTERY_CHARGE_STATE by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
         self._local_position = (NAN, NAN, NAN)  # metres north, east and down of the estimator's origin
+        self._position_at = self._local_position_at = -math.inf
         self._relative_m = NAN
         self._clocks = ClockComparison()
         self._is_breached = False
@@ -349,11 +352,13 @@ class _Reader:
             return
         self._position = message.lat / _E7, message.lon / _E7, message.alt / 1e3
         self._relative_m = message.relative_alt / 1e3
+        self._position_at = time_s
         self._flight.track.add(time_s, *self._position, self._relative_m)
         self._flight.velocity.add(time_s, message.vx / 100, message.vy / 100, message.vz / 100)
 
     def _on_local_position(self, time_s: float, message: m.LocalPositionNed) -> None:
         self._local_position = message.x, message.y, message.z
+        self._local_position_at = time_s
 
     def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
@@ -381,18 +386,19 @@ class _Reader:
         self._add_velocity_target(time_s, message)
 
     def _on_local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
-        """Add a local set-point, converted with the newest local and global positions of the vehicle."""
+        """Add a local set-point, converted with the newest local and global positions of the vehicle, if recent."""
         if message.type_mask & _NO_POSITION != _NO_POSITION:
             local_north, local_east, local_down = self._local_position
             north, east, down = message.x - local_north, message.y - local_east, message.z - local_down
-            latitude, longitude, amsl = self._position
+            is_recent = time_s - min(self._position_at, self._local_position_at) <= _POSITION_MAX_AGE_S
+            latitude, longitude, amsl = self._position if is_recent else (NAN, NAN, NAN)
             east_per_degree = _METRES_PER_DEGREE * math.cos(math.radians(latitude))
             self._flight.position_target.add(
                 time_s,
                 latitude + north / _METRES_PER_DEGREE,
                 longitude + east / east_per_degree,
                 amsl - down,
-                self._relative_m - down,
+                self._relative_m - down if is_recent else NAN,
             )
         self._add_velocity_target(time_s, message)
 
