@@ -17,7 +17,7 @@ from cli_harness import HOME, run_on, run_with
 
 from aerokit.apps.cli import main
 from aerokit.apps.cli import terminal as asking
-from aerokit.apps.cli.output import emit, nonblocking_stderr, plain_warnings
+from aerokit.apps.cli.output import can_print, emit, nonblocking_stderr, plain_warnings
 from aerokit.parameters.renames import ParameterRenamedWarning
 from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4
@@ -101,6 +101,13 @@ def test_stopped_terminal_delays_warnings_and_progress_bars(monkeypatch: pytest.
                 printed += reading.read(10_000)
             assert b"one" in printed
         monkeypatch.undo()
+
+
+def test_can_print_without_stdout_is_true(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like ``aerokit fly … >&-``."""
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", None)
+        assert can_print()
 
 
 def test_warning_on_closed_terminal_raises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,7 +72,8 @@ def can_print(stream: TextIO | None = None) -> bool:
     """
     try:
         _, writable, _ = select.select([], [sys.stdout if stream is None else stream], [], 0)
-    except (OSError, ValueError):  # the stream is no file, or this is Windows, where only sockets can be checked
+    except (OSError, ValueError, TypeError):
+        # The stream is closed or no file, or this is Windows, where only sockets can be checked.
         return True
     return bool(writable)
 
