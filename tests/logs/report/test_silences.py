@@ -240,3 +240,16 @@ def test_clippings_are_counted_across_reboot() -> None:
     for time_s, clips in enumerate([40.0, 42.0, 0.0, 0.0, 3.0]):
         flight.vibration.add(time_s, 1.0, 1.0, 1.0, clips)
     assert statistics_of(flight).clips == 5
+
+
+def test_sleep_of_recording_computer_is_no_simulation(tmp_path: Path) -> None:
+    """aerokit's clock stands still while the computer sleeps, the vehicle's does not."""
+    path, encoder = tmp_path / "log.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for second in range(120):
+            boot_s = second + (600 if second >= 60 else 0)
+            writer.write(encoder.encode(m.Heartbeat(2, 3, 209, 4, 4, 3)), 1.7e9 + second)
+            writer.write(encoder.encode(m.Attitude(boot_s * 1000, 0, 0, 0, 0, 0, 0)), 1.7e9 + second)
+    flight = read_flight(path)
+    assert flight.speed == 1.0
+    assert "by the vehicle's clock, 600 s are missing in this recording" in " ".join(flight.notes)

@@ -11,7 +11,7 @@ from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import clean_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries
-from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, use_simulated_time
+from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, is_real_time, use_simulated_time
 from aerokit.logs.flights.tlog_missions import RecordedMission
 from aerokit.logs.flights.tlog_modes import RecordedModeCommands
 from aerokit.mavlink import messages as m
@@ -214,6 +214,11 @@ class _Reader:
         if not self._mode_commands.has_commands:
             flight.notes.append(
                 "the log contains no commands to the vehicle, so the causes of mode changes are unknown"
+            )
+        if self._clocks.missing_s >= 1.0 and is_real_time(self._clocks.speed):
+            flight.notes.append(
+                f"by the vehicle's clock, {self._clocks.missing_s:.0f} s are missing in this recording, as if its"
+                " computer had slept: the durations in this report do not contain them"
             )
         self._mode_commands.attribute_modes(self._clocks.speed)
         use_simulated_time(flight, self._clocks.speed)

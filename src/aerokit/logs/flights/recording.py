@@ -29,21 +29,42 @@ class ClockComparison:
         self._previous: tuple[float, int] = (-math.inf, 0)
         self._recorded_s = 0.0
         self._vehicle_s = 0.0
+        # The same of intervals that are long by the vehicle's clock: the computer slept, or the simulation is fast.
+        self._long_recorded_s = 0.0
+        self._long_vehicle_s = 0.0
 
     def compare(self, time_s: float, boot_ms: int) -> None:
         previous_s, previous_ms = self._previous
         self._previous = time_s, boot_ms
+        recorded_s, vehicle_s = time_s - previous_s, (boot_ms - previous_ms) / 1e3
         # Ignore an interval if the vehicle rebooted, the recording paused, or the recording's clock was set back.
-        if boot_ms >= previous_ms and 0 <= time_s - previous_s < _MAX_CLOCK_GAP_S:
-            self._recorded_s += time_s - previous_s
-            self._vehicle_s += (boot_ms - previous_ms) / 1e3
+        if vehicle_s < 0 or not 0 <= recorded_s < _MAX_CLOCK_GAP_S:
+            return
+        if vehicle_s >= _MAX_CLOCK_GAP_S:
+            self._long_recorded_s += recorded_s
+            self._long_vehicle_s += vehicle_s
+            return
+        self._recorded_s += recorded_s
+        self._vehicle_s += vehicle_s
 
     @property
     def speed(self) -> float:
         """Seconds by which the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
-        if min(self._recorded_s, self._vehicle_s) < _MIN_CLOCK_COMPARISON_S:
+        recorded_s, vehicle_s = self._recorded_s, self._vehicle_s
+        if not self._is_comparable:
+            recorded_s, vehicle_s = recorded_s + self._long_recorded_s, vehicle_s + self._long_vehicle_s
+        if min(recorded_s, vehicle_s) < _MIN_CLOCK_COMPARISON_S:
             return 1.0
-        return self._vehicle_s / self._recorded_s
+        return vehicle_s / recorded_s
+
+    @property
+    def missing_s(self) -> float:
+        """Seconds by which the clock of the recording stood still while the vehicle's advanced."""
+        return self._long_vehicle_s - self._long_recorded_s if self._is_comparable else 0.0
+
+    @property
+    def _is_comparable(self) -> bool:
+        return min(self._recorded_s, self._vehicle_s) >= _MIN_CLOCK_COMPARISON_S
 
 
 class LinkCounter:
