@@ -195,3 +195,15 @@ def test_row_with_impossible_time_changes_nothing_else(row: Row, logs: Logs, tmp
     assert flight.track.at("altitude_relative_m", 30.0) == pytest.approx(log_files.height_m(31.0), abs=0.35)
     assert list(flight.attitude.times) == sorted(flight.attitude.times)
     assert "1 damaged rows with an impossible time were skipped" in flight.notes
+
+
+@pytest.mark.parametrize("wrong_us", [10**15, 0])
+def test_ulog_row_with_impossible_time_changes_nothing_else(wrong_us: int, logs: Logs, tmp_path: Path) -> None:
+    path = logs.write_ulog((20.05, "vehicle_status", (2, 3, 3, False)))
+    right, wrong = (time_us.to_bytes(8, "little") + b"\2\3\3" for time_us in (20_050_000, wrong_us))
+    assert path.read_bytes().count(right) == 1
+    path.write_bytes(path.read_bytes().replace(right, wrong))
+    flight = read_flight(path)
+    assert flight.duration_s == pytest.approx(43.9, abs=0.2)
+    assert [change.time_s for change in flight.modes] == sorted(change.time_s for change in flight.modes)
+    assert "1 damaged rows with an impossible time were skipped" in flight.notes
