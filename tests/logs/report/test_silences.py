@@ -253,3 +253,13 @@ def test_sleep_of_recording_computer_is_no_simulation(tmp_path: Path) -> None:
     flight = read_flight(path)
     assert flight.speed == 1.0
     assert "by the vehicle's clock, 600 s are missing in this recording" in " ".join(flight.notes)
+
+
+@pytest.mark.parametrize(("later", "duration_s"), [(range(30, 60), 59.0), (range(7200, 7300, 10), 7290.0)])
+def test_one_record_of_far_future_changes_no_times(later: range, duration_s: float, tmp_path: Path) -> None:
+    """A clock that was set forward, and a long pause, have several later records."""
+    times = [*range(29), 7200 if later.start == 7200 else 2e9, *later]
+    flight = heartbeats(tmp_path / "log.tlog", [(float(time_s), 1) for time_s in times])
+    assert flight.duration_s == pytest.approx(duration_s, abs=0.1)
+    assert flight.armed == [(0.0, flight.duration_s)]
+    assert ("1 messages are damaged and were skipped" in flight.notes) == (later.start == 30)

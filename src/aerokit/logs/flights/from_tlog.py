@@ -40,6 +40,8 @@ _HEARTBEAT_ID = b"\0\0\0"
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 # If a record is earlier than the previous one by more than this, the recording's clock was set back.
 _MAX_DISORDER_S = 1.0
+# If a record is later than the previous one by more than this, it is damaged, unless the next record has that time too.
+_DOUBTFUL_JUMP_S = 3600.0
 # Older positions are not used to convert local set-points to global ones.
 _POSITION_MAX_AGE_S = 2.0
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
@@ -139,6 +141,7 @@ class _Reader:
         last_frame_at = math.nan  # time of the record with the vehicle's last frame
         previous_unix_s = math.nan
         paused_s = 0.0  # seconds without any record since the vehicle's last frame
+        doubtful_unix_s = math.nan  # time of the last record that was skipped because of _DOUBTFUL_JUMP_S
         set_back_s = 0.0  # sum of the jumps by which the recording's clock was set back
         with flight.path.open("rb") as file:
             for recorded_unix_s, raw in read_tlog(file):
@@ -146,6 +149,12 @@ class _Reader:
                 if not records:
                     begins_at = previous_unix_s = unix_s
                 elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
+                    if unix_s - previous_unix_s > _DOUBTFUL_JUMP_S:
+                        if not abs(unix_s - doubtful_unix_s) <= _DOUBTFUL_JUMP_S:
+                            doubtful_unix_s = unix_s
+                            damaged += 1
+                            continue
+                        damaged -= 1  # the skipped record was right
                     if unix_s > previous_unix_s:
                         paused_s += unix_s - previous_unix_s
                     else:
