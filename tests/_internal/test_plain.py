@@ -8,8 +8,10 @@ import math
 from datetime import datetime, timedelta, timezone
 from pathlib import PurePosixPath
 
+import pytest
+
 from aerokit import Position
-from aerokit._internal.formatting import to_jsonable
+from aerokit._internal.formatting import format_value, to_jsonable
 from aerokit.errors import AerokitError
 from aerokit.mavlink.enums import MavModeFlag, MavState
 from aerokit.mavlink.messages import Heartbeat
@@ -56,3 +58,10 @@ def test_to_jsonable_objects_and_messages() -> None:
     heartbeat = to_jsonable(Heartbeat(2, 3, 81, 4, 3))
     assert (heartbeat["message"], heartbeat["custom_mode"]) == ("HEARTBEAT", 4)
     assert to_jsonable(Heartbeat) == str(Heartbeat)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.1354, "0.135"), (999.4, "999"), (999.6, "1000"), (-999.6, "-1000"), (1234.5, "1234")]
+)
+def test_format_value_never_has_exponents_near_thousand(value: float, text: str) -> None:
+    assert format_value(value) == text

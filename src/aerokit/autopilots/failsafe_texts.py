@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 _NO_EVIDENCE_PATTERN = re.compile(
-    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|(?<!dis)arming|re-?gained|recovered|restored"
+    r"clear|resolved|\boff$|prearm|pre-arm|preflight|^arm\b|\barming|re-?gained|recovered|restored"
     r"|compensation off|connection .*established|fence enabled|fence disabled",
     re.I,
 )
@@ -15,7 +15,7 @@ _TEXT_PATTERNS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
         (r"battery.*(failsafe|is low|critical|unhealthy|emergency)", "battery"),
         (r"low battery|(critical|emergency|dangerous).*batter", "battery"),
         (r"fence.*(breach|violat)|breach.*fence|outside.*fence", "fence"),
-        (r"(radio|rc|throttle|manual control).*(failsafe|lost)|no rc\b|(short|long) failsafe", "radio"),
+        (r"(radio|\brc|throttle|manual control).*(failsafe|lost)|no rc\b|(short|long) failsafe", "radio"),
         (r"gcs.*(failsafe|lost)|data ?link lost", "ground station"),
         (r"(connection|link) to ground.*lost|ground (control )?station.*lost", "ground station"),
         (r"ekf.*(failsafe|variance)|dead ?reckon|position estimate|navigation failure|estimator.*fail", "estimator"),
@@ -24,7 +24,7 @@ _TEXT_PATTERNS: tuple[tuple[re.Pattern[str], str], ...] = tuple(
         (r"vibration", "vibration"),
         (r"crash|loss of control|attitude fail", "crash"),
         (r"thrust loss", "thrust"),
-        (r"(motor|esc).*fail", "motor"),
+        (r"(motor|\besc).*fail", "motor"),
         (r"terrain data missing|failsafe.*terrain", "terrain"),
         (r"avoid.*perform", "avoidance"),
         (r"offboard.*lost|no offboard", "offboard"),

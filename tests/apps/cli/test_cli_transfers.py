@@ -307,6 +307,8 @@ def test_files_actions_round_trip(run: Run) -> None:
     assert run("files", "ls", "/box")[1].split() == ["10", "b.txt"]
     assert run("files", "get", "/box/b.txt")[0] == 0
     assert Path("b.txt").read_bytes() == b"some bytes"
+    assert run("files", "get", "/box/b.txt")[0] == 6
+    assert run("files", "get", "/box/b.txt", "--force")[0] == 0
     assert len(run("files", "crc", "/box/b.txt")[1].strip()) == 8
     assert run("files", "rm", "/box/b.txt")[0] == 0
     assert run("files", "rmdir", "/box")[0] == 0
@@ -328,6 +330,17 @@ def test_logs_get_downloads_newest_log_without_flight(run: Run, capsys: pytest.C
     assert run("logs", "get", "4711")[0] == 2
     assert main(["report", str(log)]) == 6
     assert "is a sample of aerokit's simulator and contains no flight" in capsys.readouterr().err
+
+
+def test_logs_get_keeps_file_of_same_name(run: Run) -> None:
+    """The vehicle counts from 1 again after its logs were erased."""
+    newest = int(run("logs", "list")[1].splitlines()[-1].split()[0])
+    other = Path(f"log{newest:05}.bin")
+    other.write_bytes(b"another flight")
+    code, _, err = run("logs", "get")
+    assert code == 0
+    assert f"{other} existed and was kept as log{newest:05}.1.bin" in err
+    assert Path(f"log{newest:05}.1.bin").read_bytes() == b"another flight"
 
 
 def test_logs_erase_without_yes_erases_nothing(run_elsewhere: Run, monkeypatch: pytest.MonkeyPatch) -> None:

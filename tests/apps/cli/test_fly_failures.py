@@ -33,11 +33,12 @@ from aerokit.autopilots.modes import Mode
 from aerokit.errors import OperationRejected
 from aerokit.logs.flights import read_flight
 from aerokit.logs.report.statistics import statistics_of, summary
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState
+from aerokit.mavlink.enums import CopterMode, MavCmd, MavLandedState, MavResult
 from aerokit.mavlink.messages import ParamValue, VfrHud
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions import read_waypoint_file
 from aerokit.position import Position
+from aerokit.protocols.servers.commands import ReceivedCommand
 from aerokit.sim import SimulatedCopter, SimulatorServer, simulated_link
 from aerokit.testing import run_virtual
 from aerokit.transport.link import memory_link_pair
@@ -191,6 +192,34 @@ def test_fly_disarmed_in_air_prints_reasons_once(copter: SimulatedCopter, capsys
     assert "Reached command" not in err
 
 
+@pytest.mark.parametrize(
+    ("refused", "mode"),
+    [({CopterMode.RTL}, CopterMode.BRAKE), ({CopterMode.RTL, CopterMode.BRAKE}, CopterMode.AUTO)],
+)
+def test_fly_ctrl_c_with_refused_return_holds(
+    refused: set[int], mode: CopterMode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class RefusingCopter(SimulatedCopter):
+        def refusal_of_command(self, command: ReceivedCommand) -> int | None:
+            is_refused = command.command == MavCmd.DO_SET_MODE and command.param2 in refused
+            return MavResult.FAILED if is_refused else super().refusal_of_command(command)
+
+    copter = RefusingCopter(boot_time_s=0.0, home=HOME)
+
+    async def scenario() -> int:
+        async with simulated_link(copter) as link:
+            flight = asyncio.create_task(run_on(link, "fly", "m.waypoints", "--yes"))
+            await wait_until(lambda: copter.altitude_m > 8)
+            ctrl_c()
+            return await flight
+
+    assert run_virtual(scenario()) == 130
+    assert copter.mode.number == mode
+    printed = capsys.readouterr().out
+    assert "; holding here instead" in printed
+    assert ("take over, or command it from another ground station" in printed) == (mode == CopterMode.AUTO)
+
+
 class FullDisk(io.StringIO):
     def write(self, text: str) -> int:
         raise OSError(28, "No space left on device")
@@ -306,6 +335,11 @@ def test_fly_explains_wait_after_failsafe_mode(capsys: pytest.CaptureFixture[str
         )
     )
     assert changed < waiting < failed
+
+
+def test_fly_prints_long_wait_without_exponent(capsys: pytest.CaptureFixture[str]) -> None:
+    run_virtual(run_on(None, "fly", SURVEY, "--sim", "--fault", "gps_lost@25", "--speedup", "70"))
+    assert "waiting 105 s for the end of LAND" in capsys.readouterr().out
 
 
 @pytest.mark.exhaustive

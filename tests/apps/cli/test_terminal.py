@@ -7,8 +7,10 @@ import asyncio
 import io
 import json
 import os
+import struct
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,9 @@ from cli_harness import HOME, run_on, run_with
 
 from aerokit.apps.cli import main
 from aerokit.apps.cli import terminal as asking
+from aerokit.apps.cli.output import can_print, emit, nonblocking_stderr, plain_warnings
+from aerokit.parameters.renames import ParameterRenamedWarning
+from aerokit.protocols.exchange import TransferProgress
 from aerokit.sim import SimulatedCopter, SimulatedPx4
 from aerokit.testing import run_virtual
 from aerokit.transport.link import memory_link_pair
@@ -71,6 +76,47 @@ def test_countdown_error_does_not_replace_error_of_block(monkeypatch: pytest.Mon
     with monkeypatch.context() as patch, pytest.raises(LookupError):
         patch.setattr(sys, "stderr", FullTerminal())
         run_virtual(wait())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals")
+def test_stopped_terminal_delays_warnings_and_progress_bars(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After Ctrl-S, printing would block the event loop, and with it the heartbeats."""
+    import fcntl
+    import termios
+
+    ours, theirs = os.openpty()
+    with os.fdopen(ours, "rb", buffering=0) as reading, os.fdopen(theirs, "w") as terminal:
+        os.set_blocking(theirs, False)
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        termios.tcflow(theirs, termios.TCOOFF)
+        monkeypatch.setattr(sys, "stderr", terminal)
+        with plain_warnings(), nonblocking_stderr():
+            warnings.simplefilter("always")
+            warnings.warn("one", ParameterRenamedWarning, stacklevel=1)
+            with asking.progress_bar("two", "B") as show:
+                show(TransferProgress(10, 10, 1.0))
+            termios.tcflow(theirs, termios.TCOON)
+            emit(argparse.Namespace(json=False), "line", {}, None)
+            printed = b""
+            while b"two" not in printed:
+                printed += reading.read(10_000)
+            assert b"one" in printed
+        monkeypatch.undo()
+
+
+def test_can_print_without_stdout_is_true(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like ``aerokit fly … >&-``."""
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", None)
+        assert can_print()
+
+
+def test_warning_on_closed_terminal_raises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", FullTerminal())
+        with plain_warnings(), nonblocking_stderr():
+            warnings.simplefilter("always")
+            warnings.warn("one", ParameterRenamedWarning, stacklevel=1)
 
 
 # ------------------------------------------------------------------------------------ question

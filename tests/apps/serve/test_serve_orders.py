@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 import anyio
+import anyio.lowlevel
 import httpx
 import pytest
 from flight_harness import open_flight, suspend_computer
@@ -342,6 +343,18 @@ async def test_server_shutdown_holds_vehicle() -> None:
         assert given.state == "failed"
         await anyio.sleep(3)
         assert flight.vehicle.mode_name == "BRAKE"
+
+
+@pytest.mark.parametrize(("name", "text"), [("land", "may continue it"), ("mission/resume", "commanded to hold")])
+async def test_shutdown_says_what_vehicle_does(name: str, text: str) -> None:
+    async with open_flight() as flight:
+        await flight.take_off()
+        async with make_app(flight.vehicle, token=TOKEN) as app:
+            order = next(each for each in ORDERS if each.name == name)
+            record = app._orders.submit(flight.vehicle, order, {}, "12345678", None)
+            await anyio.lowlevel.checkpoint()
+        assert record.problem is not None
+        assert text in record.problem["detail"]
 
 
 async def test_order_after_shutdown_is_refused() -> None:

@@ -234,6 +234,18 @@ def test_csv_times_have_rounded_microseconds(unix_s: float, tmp_path: Path) -> N
     assert (tmp_path / "times.csv").read_text().splitlines()[1] == expected
 
 
+def test_damaged_message_changes_no_time_of_later_ones(tmp_path: Path) -> None:
+    """Its end looks like the start of a longer message."""
+    encoder = FrameEncoder(1, 1)
+    damaged = encoder.encode(m.Attitude(0, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0))[:-7] + b"\xfd\x3c\x00\x99\x3e\x47\xf1"
+    with TlogWriter(tmp_path / "in.tlog") as writer:
+        writer.write(damaged, BEGIN)
+        for second in (1, 2):
+            writer.write(encoder.encode(m.Statustext(4, "x" * 41)), BEGIN + second)
+    records = TlogReader(tmp_path / "in.tlog").entries(lambda _: None)
+    assert [record.unix_s - BEGIN for record in records] == [1, 2]
+
+
 def test_gpx_has_times_elevations_and_mission(log: Path, tmp_path: Path) -> None:
     gpxpy = pytest.importorskip("gpxpy")
     convert(log, tmp_path / "out.gpx")
@@ -247,6 +259,24 @@ def test_gpx_has_times_elevations_and_mission(log: Path, tmp_path: Path) -> None
         ("2 NAV_WAYPOINT", 555.0),
         ("3 NAV_WAYPOINT", None),
     ]
+
+
+def test_gpx_has_last_mission_although_sent_before_positions(tmp_path: Path) -> None:
+    gpxpy = pytest.importorskip("gpxpy")
+    encoder = FrameEncoder(1, 1)
+
+    def item(number: int, command: int = 16) -> Message:
+        return m.MissionItemInt(255, 0, number, 3, command, 0, 1, 0, 0, 0, 0, 474010000, 85010000, 30.0)
+
+    jump = 177  # DO_JUMP has no position
+    mission = [item(0), item(1), item(2), item(3), m.MissionCount(255, 0, 3), item(0), item(1, jump), item(2)]
+    place = m.GlobalPositionInt(0, 474000000, 85000000, 500000, 0, 0, 0, 0, 0)
+    with TlogWriter(tmp_path / "in.tlog") as writer:
+        for second, message in enumerate([m.Heartbeat(2, 3, 81, 4, 4, 3), *mission, place]):
+            writer.write(encoder.encode(message), BEGIN + second)
+    convert(tmp_path / "in.tlog", tmp_path / "out.gpx")
+    read = gpxpy.parse((tmp_path / "out.gpx").read_text())
+    assert [waypoint.name for waypoint in read.waypoints] == ["0 NAV_WAYPOINT", "2 NAV_WAYPOINT"]
 
 
 def test_kml_has_altitude_modes(log: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import log_files
 import pytest
 
+from aerokit.logs.convert import convert
 from aerokit.logs.flights import FlightLog, read_flight
 from aerokit.logs.flights.flight_controllers import UlogReader
 from aerokit.mavlink.enums import MavCmd, MavFrame
@@ -149,3 +150,60 @@ def test_missing_pyulog_raises_module_not_found(logs: Logs, monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "pyulog", None)
     with pytest.raises(ModuleNotFoundError):
         next(UlogReader(path).entries(lambda _: None))
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".ulg"])
+def test_parquet_has_largest_integers(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    largest = (1 << 64) - 1
+    logs = Logs(tmp_path, monkeypatch)
+    if suffix == ".bin":
+        monkeypatch.setitem(log_files.TABLES, "LONG", (0x95, "QQ", "TimeUS,value"))
+        logs.read_bin((2.0, "LONG", (largest,)), without="")
+    else:
+        logs.write_ulog((2.0, "LONG", (largest,)), LONG="Q:timestamp Q:value")
+    convert(tmp_path / f"flight{suffix}", tmp_path / "out", tables="parquet")
+    assert parquet.read_table(tmp_path / "out" / "LONG.parquet")["value"].to_pylist() == [largest]
+
+
+def test_tables_of_similar_names_lose_no_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("3_A_", "A_", "A!")  # "!" is not allowed in the name of a file
+    for number, name in enumerate(names, 0x95):
+        monkeypatch.setitem(log_files.TABLES, name, (number, "QB", "TimeUS,value"))
+    rows = [(0.5 + number / 10, name, (1,)) for number, name in enumerate(names)]
+    Logs(tmp_path, monkeypatch).read_bin((0.1, "MSG", (b"ArduCopter V4.6.1",)), *rows, (0.9, "3_A_", (2,)), without="")
+    convert(tmp_path / "flight.bin", tmp_path / "out")
+    lines = [line for path in (tmp_path / "out").glob("*A_.csv") for line in path.read_text().splitlines()[1:]]
+    assert len(lines) == 4
+
+
+@pytest.mark.parametrize("row", [(20.05, "POS", 0x83), (20.05, "ATT", 0x84), (38.0, "ARM", 0x87)])
+def test_row_with_impossible_time_changes_nothing_else(row: Row, logs: Logs, tmp_path: Path) -> None:
+    """A row has no checksum, so the time of a damaged row may be any number."""
+    time_s, table, number = row
+    values = {"POS": (0, 0, 0.0, 0.0), "ATT": (0.0,) * 6, "ARM": (1,)}[table]
+    logs.read_bin((time_s, table, values), without="")
+    path = tmp_path / "flight.bin"
+    begin = b"\xa3\x95" + bytes((int(number),)) + round(time_s * 1e6).to_bytes(8, "little")
+    wrong = begin[:3] + (10**15).to_bytes(8, "little")
+    assert path.read_bytes().count(begin) == 1
+    path.write_bytes(path.read_bytes().replace(begin, wrong))
+    flight = read_flight(path)
+    ((armed_s, disarmed_s),) = flight.armed
+    assert (armed_s, disarmed_s) == pytest.approx((4.0, 39.0), abs=0.1)
+    assert flight.duration_s == pytest.approx(43.9, abs=0.1)
+    assert flight.track.at("altitude_relative_m", 30.0) == pytest.approx(log_files.height_m(31.0), abs=0.35)
+    assert list(flight.attitude.times) == sorted(flight.attitude.times)
+    assert "1 damaged rows with an impossible time were skipped" in flight.notes
+
+
+@pytest.mark.parametrize("wrong_us", [10**15, 0])
+def test_ulog_row_with_impossible_time_changes_nothing_else(wrong_us: int, logs: Logs, tmp_path: Path) -> None:
+    path = logs.write_ulog((20.05, "vehicle_status", (2, 3, 3, False)))
+    right, wrong = (time_us.to_bytes(8, "little") + b"\2\3\3" for time_us in (20_050_000, wrong_us))
+    assert path.read_bytes().count(right) == 1
+    path.write_bytes(path.read_bytes().replace(right, wrong))
+    flight = read_flight(path)
+    assert flight.duration_s == pytest.approx(43.9, abs=0.2)
+    assert [change.time_s for change in flight.modes] == sorted(change.time_s for change in flight.modes)
+    assert "1 damaged rows with an impossible time were skipped" in flight.notes

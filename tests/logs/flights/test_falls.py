@@ -233,9 +233,14 @@ def test_report_of_crash_begins_and_ends_with_fall(
         ("Radio Failsafe - Disarming", "radio"),
         ("Arming: Radio failsafe on", None),
         ("PreArm: Battery failsafe", None),
+        ("Battery 1 is low, warming up", "battery"),
+        ("Descent failed", None),
+        ("ESC 2 failure", "motor"),
+        ("Yaw source lost", None),
+        ("RC1 lost", "radio"),
     ],
 )
-def test_disarming_texts_are_evidence_arming_texts_are_not(text: str, kind: str | None) -> None:
+def test_failsafe_texts_have_their_kind_arming_texts_none(text: str, kind: str | None) -> None:
     evidence = evidence_in_texts([LoggedText(1.0, 2, text)])
     assert [item.kind for item in evidence] == ([] if kind is None else [kind])
 

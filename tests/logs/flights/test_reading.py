@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable
 from contextlib import suppress
@@ -243,3 +244,18 @@ def test_bin_entries_have_same_battery_states(tmp_path: Path) -> None:
     said = [state["status_text"] for state in states if "status_text" in state]
     assert [(text.severity, text.text[:10]) for text in said] == [(None, "ArduCopter"), (None, "Battery 1 ")]
     assert log_entry(0.0, 1, said[0])["level"] == 0
+
+
+def test_local_setpoints_without_recent_position_are_unknown(tmp_path: Path) -> None:
+    path, encoder = tmp_path / "log.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for second in range(10):
+            messages = [m.Heartbeat(2, 12, 209, 4, 4, 3), m.LocalPositionNed(0, 10.0 * second, 0, 0, 0, 0, 0)]
+            if second < 5:
+                messages.append(m.GlobalPositionInt(0, 470_000_000, 80_000_000, 500_000, 20_000, 0, 0, 0, 0))
+            messages.append(m.PositionTargetLocalNed(0, 1, 0xFF8, 10.0 * second, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
+            for message in messages:
+                writer.write(encoder.encode(message), 1.7e9 + second)
+    target = read_flight(path).position_target
+    for name in ("latitude_deg", "altitude_relative_m"):
+        assert [math.isnan(value) for value in target[name]] == [False] * 7 + [True] * 3

@@ -38,7 +38,7 @@ def test_changes_by_autopilot_do_not_contradict_the_sentence_before() -> None:
     flight.set_parameter(1.0, "STAT_RUNTIME", 2.0)
     paragraphs = [part for part in section_of(flight, "Parameters").parts if isinstance(part, Paragraphs)]
     sentences = [text for part in paragraphs for text in part.lines]
-    assert sentences[0] == "The pilot and programs changed no parameter during the log."
+    assert sentences[0] == "The log contains no change of a parameter by the pilot or a program."
     assert sentences[1].startswith("1 changes by the autopilot itself")
 
 

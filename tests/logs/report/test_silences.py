@@ -98,8 +98,8 @@ def test_pauses_of_recording_are_no_certain_silences() -> None:
     flight = FlightLog(Path("pause.tlog"), ends_at=60.0, armed=[(0.0, 60.0)])
     flight.silences = [Silence(5.0, 9.0, False), Silence(10.0, 20.0, False)]
     assert summary_of(flight).startswith(
-        "The log contains no message at all for 10 s from 0:10.0 on, and in 1 shorter gap: the vehicle was silent, or"
-        " the recording paused."
+        "The log contains no message of the vehicle for 10 s from 0:10.0 on, and in 1 shorter gap: the vehicle was"
+        " silent, the recording paused, or its clock was set forward."
     )
     assert "lost ground station" not in summary_of(flight)
 
@@ -197,3 +197,69 @@ def test_sped_up_recording_has_simulated_times(tmp_path: Path) -> None:
     assert "at 0:32.9 (descent since 0:30." in text
     assert "60 s armed" in text.replace("1 min armed", "60 s armed")
     assert "all times and durations in this report are simulated; the recording took 3 s" in text
+
+
+def heartbeats(path: Path, rows: list[tuple[float, int]], armed: bool = True) -> FlightLog:
+    """Write a log of heartbeats at these times: of the vehicle (1) and of a ground station (255)."""
+    vehicle, station = FrameEncoder(1, 1), FrameEncoder(255, 190)
+    with TlogWriter(path) as writer:
+        for time_s, system_id in rows:
+            raw = (
+                vehicle.encode(m.Heartbeat(2, 3, 209 if armed else 81, 4, 4, 3))
+                if system_id == 1
+                else station.encode(m.Heartbeat(6, 8, 0, 0, 4, 3))
+            )
+            writer.write(raw, 1.7e9 + time_s)
+    return read_flight(path)
+
+
+@pytest.mark.parametrize(
+    ("other_times", "is_recorded"), [([63.5], False), ([6.0, 7.0, 8.0, 63.5], True), (range(5, 64), True)]
+)
+def test_silence_is_recorded_only_while_others_are_received(
+    other_times: list[float], is_recorded: bool, tmp_path: Path
+) -> None:
+    """A recording that continues after a pause may begin with another system's message."""
+    rows = [(float(second), 1) for second in (*range(5), *range(64, 70))]
+    rows += [(float(time_s), 255) for time_s in other_times]
+    (silence,) = heartbeats(tmp_path / "log.tlog", sorted(rows)).silences
+    assert silence.is_recorded is is_recorded
+
+
+def test_clock_set_back_shortens_no_times(tmp_path: Path) -> None:
+    times = [*range(60), *range(30, 50)]
+    flight = heartbeats(tmp_path / "log.tlog", [(float(time_s), 1) for time_s in times])
+    ((begin_s, end_s),) = flight.armed
+    assert (begin_s, end_s) == pytest.approx((0.0, 78.0), abs=1.0)
+    assert flight.duration_s == pytest.approx(78.0, abs=1.0)
+    assert "the recording's clock was set back by 29 s, 59 s after the log began" in " ".join(flight.notes)
+
+
+def test_clippings_are_counted_across_reboot() -> None:
+    flight = FlightLog(Path("log.tlog"), ends_at=60.0, armed=[(0.0, 60.0)])
+    for time_s, clips in enumerate([40.0, 42.0, 0.0, 0.0, 3.0]):
+        flight.vibration.add(time_s, 1.0, 1.0, 1.0, clips)
+    assert statistics_of(flight).clips == 5
+
+
+def test_sleep_of_recording_computer_is_no_simulation(tmp_path: Path) -> None:
+    """aerokit's clock stands still while the computer sleeps, the vehicle's does not."""
+    path, encoder = tmp_path / "log.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for second in range(120):
+            boot_s = second + (600 if second >= 60 else 0)
+            writer.write(encoder.encode(m.Heartbeat(2, 3, 209, 4, 4, 3)), 1.7e9 + second)
+            writer.write(encoder.encode(m.Attitude(boot_s * 1000, 0, 0, 0, 0, 0, 0)), 1.7e9 + second)
+    flight = read_flight(path)
+    assert flight.speed == 1.0
+    assert "by the vehicle's clock, 600 s are missing in this recording" in " ".join(flight.notes)
+
+
+@pytest.mark.parametrize(("later", "duration_s"), [(range(30, 60), 59.0), (range(7200, 7300, 10), 7290.0)])
+def test_one_record_of_far_future_changes_no_times(later: range, duration_s: float, tmp_path: Path) -> None:
+    """A clock that was set forward, and a long pause, have several later records."""
+    times = [*range(29), 7200 if later.start == 7200 else 2e9, *later]
+    flight = heartbeats(tmp_path / "log.tlog", [(float(time_s), 1) for time_s in times])
+    assert flight.duration_s == pytest.approx(duration_s, abs=0.1)
+    assert flight.armed == [(0.0, flight.duration_s)]
+    assert ("1 messages are damaged and were skipped" in flight.notes) == (later.start == 30)

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import directory
 from aerokit.apps.cli.connecting import add_action, command_action, connected
-from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
+from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, emit_done
 from aerokit.apps.cli.terminal import confirm, is_interactive, progress_bar
+from aerokit.connection.frame_observers import keep_existing
 from aerokit.errors import InvalidArgument
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     get = add_action(actions, "get", _get, "Download a file; a partial download is resumed.")
     get.add_argument("path", help="path on the vehicle")
     get.add_argument("to", nargs="?", help="local file or directory (default: the same name in this directory)")
+    add_force(get)
     put = add_action(actions, "put", _put, "Upload a file.")
     put.add_argument("file", help="local file")
     put.add_argument("path", help="path on the vehicle")
@@ -71,6 +73,7 @@ async def _list(options: argparse.Namespace) -> int:
 
 async def _get(options: argparse.Namespace) -> int:
     target = _destination(options)
+    check_not_existing(target, options)
     async with connected(options) as vehicle:
         with progress_bar(target.name, "B") as on_progress:
             await vehicle.files.download(
@@ -140,6 +143,9 @@ async def _get_logs(options: argparse.Namespace) -> int:
         options.to.mkdir(parents=True, exist_ok=True)
         for entry in _chosen(entries, options):
             target = options.to / f"log{entry.id:05}{vehicle.autopilot.log_suffix}"
+            # The vehicle counts from 1 again after its logs were erased, so the file may be of another flight.
+            if target.exists() and (kept := keep_existing(target)) is not None:
+                print(f"aerokit: {target} existed and was kept as {kept}", file=sys.stderr)
             with progress_bar(target.name, "B") as on_progress:
                 await vehicle.logs.download(
                     entry, target, method=options.method, idle_timeout_s=options.patience, on_progress=on_progress

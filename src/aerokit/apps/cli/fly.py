@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 import anyio
 
 from aerokit import events
+from aerokit._internal.formatting import format_value
 from aerokit.apps.cli.arguments import add_conditions, add_record, conditions, number, vehicle_kind
 from aerokit.apps.cli.completion import kinds, set_completions
 from aerokit.apps.cli.connecting import add_vehicle, connect_to, default_address, signing_of
@@ -176,8 +177,8 @@ class PlanFlight(SupervisedFlight):
         is_unexplained = vehicle.mode_name == mode and not self._is_in_our_mode and not vehicle.mission.explains_mode
         if self._has_changed_mode and is_unexplained:
             # The grace period is real time, but the text has the vehicle's time, which a simulation speeds up.
-            seconds = self._report.speedup * (END_GRACE_S - delay_s)
-            self._print(f"waiting {seconds:.2g} s for the end of {mode} or a report that the mission has ended")
+            seconds = format_value(self._report.speedup * (END_GRACE_S - delay_s))
+            self._print(f"waiting {seconds} s for the end of {mode} or a report that the mission has ended")
 
     def _name_of(self, index: int) -> str:
         items = self._plan.mission.items

@@ -21,6 +21,7 @@ from aerokit.apps.cli.output import (
     exit_code,
     exit_codes_help,
     import_extra,
+    nonblocking_stderr,
     plain_warnings,
     suggestion,
 )
@@ -254,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     options = make_parser(arguments[0]).parse_args(arguments)
     try:
-        with plain_warnings():
+        with plain_warnings(), nonblocking_stderr():
             code: int = asyncio.run(options.run(options))
     except BrokenPipeError:
         # At exit, the interpreter flushes stdout. With the old stdout, it would report another BrokenPipeError.

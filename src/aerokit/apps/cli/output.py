@@ -9,10 +9,11 @@ import os
 import re
 import select
 import sys
-from contextlib import contextmanager
+from collections import deque
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from aerokit._internal.formatting import printable, to_jsonable
 from aerokit.errors import (
@@ -28,6 +29,9 @@ from aerokit.errors import (
 if TYPE_CHECKING:
     import logging
     from collections.abc import Iterable, Iterator, Mapping
+
+MAX_UNPRINTED = 1000
+"""Maximum number of lines that wait for a stopped terminal. Further lines replace the oldest."""
 
 
 def add_json(command: argparse._ActionsContainer) -> None:
@@ -50,6 +54,8 @@ def emit(options: argparse.Namespace, kind: str, record: Mapping[str, object], t
         _print_json({"type": kind, **to_jsonable(record)})
     elif text is not None:
         _print(printable(text))
+    if sys.stderr is not None:
+        sys.stderr.flush()  # prints what waits in `nonblocking_stderr`
 
 
 def _print_json(fields: Mapping[str, object]) -> None:
@@ -59,16 +65,55 @@ def _print_json(fields: Mapping[str, object]) -> None:
         print(json.dumps(fields), flush=True)
 
 
-def can_print() -> bool:
-    """Return False while printing to stdout would block: after Ctrl-S, or if a pipe is not read.
+def can_print(stream: TextIO | None = None) -> bool:
+    """Return False while printing to the stream (default: stdout) would block: after Ctrl-S, or if a pipe is not read.
 
     Commands on which vehicles depend must not print then, because heartbeats and forwarding would stop.
     """
     try:
-        _, writable, _ = select.select([], [sys.stdout], [], 0)
-    except (OSError, ValueError):  # stdout is no file, or this is Windows, where only sockets can be checked
+        _, writable, _ = select.select([], [sys.stdout if stream is None else stream], [], 0)
+    except (OSError, ValueError, TypeError):
+        # The stream is closed or no file, or this is Windows, where only sockets can be checked.
         return True
     return bool(writable)
+
+
+class _NonblockingStream:
+    """Wraps stderr. Texts wait while writing would block, and are lost if writing fails."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._unwritten: deque[str] = deque(maxlen=MAX_UNPRINTED)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        self._unwritten.append(text)
+        self.flush()
+        return len(text)
+
+    def flush(self, *, waits: bool = False) -> None:
+        with suppress(OSError):
+            while self._unwritten and (waits or can_print(self._stream)):
+                self._stream.write(self._unwritten.popleft())
+                self._stream.flush()
+
+
+@contextmanager
+def nonblocking_stderr() -> Iterator[None]:
+    """Within the block, warnings, progress bars and other output to stderr never block the event loop."""
+    original = sys.stderr
+    if original is None:
+        yield
+        return
+    stream: Any = _NonblockingStream(original)
+    sys.stderr = stream
+    try:
+        yield
+    finally:
+        sys.stderr = original
+        stream.flush(waits=True)
 
 
 def _print(text: str) -> None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit import events
-from aerokit.apps.cli.output import DONE, INTERRUPTED, MISSION_TEXT, can_print, emit, plain_text
+from aerokit.apps.cli.output import DONE, INTERRUPTED, MAX_UNPRINTED, MISSION_TEXT, can_print, emit, plain_text
 from aerokit.apps.readiness import arms_but_cannot_fly_text, readiness
 from aerokit.errors import (
     AerokitError,
@@ -60,7 +60,6 @@ _WARNING_SEVERITY = 4
 # If nothing was printed for this time, a status line is printed.
 _STATUS_INTERVAL_S = 5.0
 _MIN_STEP_M = 1.0
-_MAX_UNPRINTED = 1000  # lines that wait for a stopped terminal; further lines replace the oldest
 
 
 class SupervisedFlight(ABC):
@@ -154,7 +153,8 @@ class SupervisedFlight(ABC):
                 self._print(f"interrupted again; no further commands: vehicle {self._vehicle.describe_now()}")
         except AerokitError as error:
             self._print(f"failed again: {plain_text(error)}")
-            self._print(f"no further commands: vehicle {self._vehicle.describe_now()}")
+            advice = "; take over, or command it from another ground station" if self._vehicle.is_armed else ""
+            self._print(f"no further commands: vehicle {self._vehicle.describe_now()}{advice}")
 
     async def _after_failure(self, error: Exception) -> int:  # subclasses use the error
         """Make the vehicle safe after an error, which `fly` then raises again. `fly` ignores the exit code.
@@ -194,11 +194,18 @@ class SupervisedFlight(ABC):
             # The vehicle is still armed, so it gets the command for a flying vehicle.
         text = INTERRUPT_ACTIONS[action]
         self._print(text if action == "nothing" else f"{text}; Ctrl-C exits at once")
-        if action == "return":
-            await vehicle.return_to_launch(timeout=None)
-        elif action == "land":
-            await vehicle.land(timeout=None)
-        elif action == "hold":
+        try:
+            if action == "return":
+                await vehicle.return_to_launch(timeout=None)
+            elif action == "land":
+                await vehicle.land(timeout=None)
+            elif action == "hold":
+                await vehicle.hold()
+        except CommandRejected as error:
+            # Without a position, for example, autopilots refuse to return. The vehicle must not simply fly on.
+            if action == "hold" or not self._check_control():
+                raise
+            self._print(f"{text} failed: {plain_text(error)}; {INTERRUPT_ACTIONS['hold']} instead")
             await vehicle.hold()
         if action in ("return", "land"):
             await self._wait_disarmed_on_ground()
@@ -273,7 +280,7 @@ class FlightReport:
         self._flown_m = 0.0
         self._previous_position: Position | None = None
         # Arguments of `emit` that wait until the output accepts them, oldest first.
-        self._unprinted: deque[tuple[str, Mapping[str, object], str]] = deque(maxlen=_MAX_UNPRINTED)
+        self._unprinted: deque[tuple[str, Mapping[str, object], str]] = deque(maxlen=MAX_UNPRINTED)
         self.prints_status: bool = True
         """True if status lines are printed when there is no other output. Set it to False during questions."""
 
@@ -377,7 +384,8 @@ class FlightReport:
         if self.speedup != 1.0:
             notes.append(f"simulated in {_duration(self._armed_s)}, {speed:g}x")
         elif speed != 1.0:
-            notes.append(f"a simulation at {speed:.2g} times real speed: {_duration(self._armed_s)} on this clock")
+            factor = f"{round(speed, 1):g}"
+            notes.append(f"a simulation at {factor} times real speed: {_duration(self._armed_s)} on this clock")
         return f"armed for {_duration(speed * self._armed_s)}" + (f" ({'; '.join(notes)})" if notes else "")
 
     def _on_armed(self, _: bool | None, is_armed: bool) -> None:

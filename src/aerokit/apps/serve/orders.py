@@ -256,6 +256,13 @@ ORDERS = (
 SET_PARAMETER = OrderType("set_parameter", "Set a parameter", _set_parameter, _VALUE)
 
 
+def _end_note(order_type: OrderType) -> str:
+    """Return what happens to a running order when the server ends (docs/reliability.md)."""
+    if order_type.name in ("take_off", "go_to", "mission/start", "mission/resume"):
+        return "the vehicle is commanded to hold, unless it is silent or another party has taken over"
+    return "the vehicle may have executed it, or may continue it"
+
+
 _RECORD_FIELDS = (
     "key",
     "system_id",
@@ -422,7 +429,7 @@ class OrderRunner:
         except asyncio.CancelledError:
             record.state = "failed"
             record.problem = problem_of(
-                HttpProblem(503, "Ended", "the server ended; a vehicle that was moving is commanded to hold")
+                HttpProblem(503, "Ended", f"the server ended before {order_type.name} did; {_end_note(order_type)}")
             )
             raise
         except Exception as error:

@@ -220,7 +220,7 @@ class MessageTablesWriter:
         columns = self._log.columns(record)
         # The log is untrusted input, so all but letters, digits, "_" and "-" are replaced in the file name.
         name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
-        if (self._path / name).exists():
+        while (self._path / name).exists():
             name = f"{len(self._tables)}_{name}"
         table = self._kind(self._path / name, (*_SENDER_COLUMNS, *columns))
         self._tables.append(table)

@@ -7,15 +7,20 @@ from datetime import datetime, timezone
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from aerokit.logs.flights.flight import Waypoint
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionType
-from aerokit.missions.item import GLOBAL_FRAMES, canonical_frame, has_place
+from aerokit.logs.flights.flight import FlightLog
+from aerokit.logs.flights.tlog_missions import RecordedMission
+from aerokit.mavlink import messages as m
+from aerokit.mavlink.enums import MavCmd, MavFrame
+from aerokit.missions.item import canonical_frame
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from aerokit.logs.flights.flight import Waypoint
     from aerokit.logs.flights.records import LogReader, LogRecord
     from aerokit.position import Position
+
+_MISSION_MESSAGES = (m.MissionItemInt, m.MissionItem, m.MissionCount, m.FileTransferProtocol)
 
 
 def _waypoint_name(waypoint: Waypoint) -> str:
@@ -35,11 +40,10 @@ def _altitude_amsl_m(waypoint: Waypoint, home_amsl_m: float | None) -> float | N
 
 
 class _Track:
-    """The positions and the mission of one vehicle."""
+    """The positions of one vehicle."""
 
     def __init__(self) -> None:
         self.points: list[tuple[datetime, Position]] = []
-        self.waypoints: dict[int, Waypoint] = {}
         self.home_amsl_m: float | None = None
 
     def add(self, unix_s: float, position: Position) -> None:
@@ -54,6 +58,7 @@ class _TrackWriter:
     def __init__(self, path: Path, log: LogReader) -> None:
         self._path, self._log = path, log
         self._tracks: dict[int, _Track] = {}
+        self._missions: dict[int, RecordedMission] = {}  # by system id
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
@@ -61,8 +66,8 @@ class _TrackWriter:
             if state == "position":
                 self._tracks.setdefault(record.system_id, _Track()).add(record.unix_s, value)
                 self.written += 1
-        if record.table in _MISSION_ITEM_TABLES:
-            self._add_item(record)
+        if isinstance(record.message, _MISSION_MESSAGES):
+            self._record_mission(record)
 
     def discard(self) -> None:
         pass  # nothing to discard, because only `close` opens the file
@@ -72,34 +77,38 @@ class _TrackWriter:
             self._log.notes.append("the log contains no position; there is no track")
         self._path.write_text(self._text(), encoding="utf-8")
 
-    def _add_item(self, record: LogRecord) -> None:
-        """Add a mission item that has a position to the track of the vehicle that received or sent it."""
-        item: Any = record.message
-        if item is None or item.mission_type != MavMissionType.MISSION:
-            return
-        if item.frame not in GLOBAL_FRAMES or not has_place(item.command):
-            return
-        if item.target_system in self._tracks:  # sent to the vehicle
-            system_id = item.target_system
-        elif record.system_id in self._tracks:  # sent by the vehicle
-            system_id = record.system_id
-        else:
-            return
-        scale = 1e7 if item.NAME == "MISSION_ITEM_INT" else 1.0
-        latitude, longitude = item.x / scale, item.y / scale
-        # Items without valid coordinates are skipped: 0, 0 means the current position, and NaN fails both comparisons.
-        is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
-        if is_valid and math.isfinite(item.z):
-            self._tracks[system_id].waypoints[item.seq] = Waypoint(
-                item.seq, item.command, latitude, longitude, altitude_m=item.z, frame=item.frame
-            )
+    def _record_mission(self, record: LogRecord) -> None:
+        """Record a mission for the sender and the receiver, because only the end of the log shows all vehicles."""
+        message: Any = record.message
+        for system_id in {record.system_id, message.target_system}:
+            if system_id not in self._missions:
+                self._missions[system_id] = RecordedMission(FlightLog(self._path, system_id=system_id))
+            mission = self._missions[system_id]
+            if isinstance(message, m.MissionCount):
+                mission.on_count(record.unix_s, message)
+            elif isinstance(message, m.FileTransferProtocol):
+                mission.on_file_transfer(record.unix_s, message)
+            else:
+                mission.on_item(record.unix_s, message)
+
+    def _waypoints(self, system_id: int) -> list[Waypoint]:
+        """Return the last mission of a vehicle without the items that have no valid position. NaN is not valid."""
+        mission = self._missions.get(system_id)
+        return (
+            []
+            if mission is None
+            else [
+                waypoint
+                for waypoint in mission.waypoints
+                if abs(waypoint.latitude_deg) <= 90
+                and abs(waypoint.longitude_deg) <= 180
+                and math.isfinite(waypoint.altitude_m)
+            ]
+        )
 
     def _text(self) -> str:
         """Return the content of the file."""
         raise NotImplementedError
-
-
-_MISSION_ITEM_TABLES = frozenset(("MISSION_ITEM_INT", "MISSION_ITEM"))
 
 
 class GpxWriter(_TrackWriter):
@@ -121,7 +130,7 @@ class GpxWriter(_TrackWriter):
             gpx_track = gpx.GPXTrack(name=f"vehicle {system_id}")
             gpx_track.segments.append(segment)
             file.tracks.append(gpx_track)
-            for _, waypoint in sorted(track.waypoints.items()):
+            for waypoint in self._waypoints(system_id):
                 file.waypoints.append(
                     gpx.GPXWaypoint(
                         waypoint.latitude_deg,
@@ -157,7 +166,7 @@ class KmlWriter(_TrackWriter):
                     for _, position in track.points
                 ]
             )
-            for _, waypoint in sorted(track.waypoints.items()):
+            for waypoint in self._waypoints(system_id):
                 amsl_m = _altitude_amsl_m(waypoint, track.home_amsl_m)
                 is_known = amsl_m is not None
                 folder.newpoint(

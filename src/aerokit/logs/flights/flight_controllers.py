@@ -78,9 +78,16 @@ class _RowReader(LogReader):
     def columns(self, entry: LogRecord) -> list[TableColumn]:
         """Return the columns of a table from its first record, with units if the log has them."""
         return [
-            TableColumn(name_with_unit(name, self._unit(entry.table, name)), name, _column_kind(value))
+            TableColumn(
+                name_with_unit(name, self._unit(entry.table, name)),
+                name,
+                "uint" if type(value) is int and self._is_uint64(entry.table, name) else _column_kind(value),
+            )
             for name, value in entry.fields.items()
         ]
+
+    def _is_uint64(self, table: str, field: str) -> bool:
+        raise NotImplementedError
 
     def _unit(self, table: str, field: str) -> str:
         return ""
@@ -174,6 +181,10 @@ class BinReader(_RowReader):
             return ""
         return str(row_format.get_unit(field) or "")
 
+    def _is_uint64(self, table: str, field: str) -> bool:
+        row_format = self._reader.formats[self._reader.name_to_id[table]]
+        return bool(row_format.format[row_format.columns.index(field)] == "Q")
+
 
 def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
     """Return the names and values of the states that a row changes."""
@@ -266,15 +277,23 @@ class UlogReader(_RowReader):
         self._note_skipped()
         on_bytes(size)
 
+    def _is_uint64(self, table: str, field: str) -> bool:
+        topic = next((data for data in self._log.data_list if _table_of(data) == table), None)
+        return topic is not None and bool(topic.data[field].dtype == "uint64")
+
 
 def _time_of(row: tuple[int, str, dict[str, Any]]) -> int:
     time_us, _, _ = row
     return time_us
 
 
+def _table_of(data: Any) -> str:
+    return f"{data.name}_{data.multi_id}" if data.multi_id else str(data.name)
+
+
 def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     """Yield the time in microseconds, the table and the fields of each row of a topic."""
-    table = f"{data.name}_{data.multi_id}" if data.multi_id else data.name
+    table = _table_of(data)
     names = list(data.data)
     for values in zip(*(data.data[name].tolist() for name in names), strict=True):
         fields = dict(zip(names, values, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import struct
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,9 @@ _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
 # A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
+# A row is damaged if it is later than the next row of its table by more than _MAX_DISORDER_S, or than the last but one
+# row of every table by more than _MAX_LATE_S.
+_MAX_DISORDER_S, _MAX_LATE_S = 1.0, 3600.0
 _SAME_SETPOINT_S = 0.005  # PSCN and PSCE rows with times that differ by at most this are one set-point
 _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the rows
 
@@ -69,6 +73,11 @@ class _Tables:
     def __init__(self, reader: Any) -> None:
         self._reader = reader
         self.began_us = self._first_time()
+        self._max_s = (
+            max((time_us for _, time_us in self._rows_at(-2)), default=math.inf) - self.began_us
+        ) / 1e6 + _MAX_LATE_S
+        self.damaged: set[int] = set()
+        """Offsets of the rows that were skipped because their time is impossible."""
 
     @property
     def unix_at_0(self) -> float:
@@ -123,30 +132,47 @@ class _Tables:
             unpacked = list(zip(*rows, strict=True))
             chunk = [_scaled(unpacked[position], scale) for position, scale in zip(positions, scales, strict=True)]
             times_us, *values = chunk
-            yield [[(time_us - self.began_us) / 1e6 for time_us in times_us], *values]
+            times = [(time_us - self.began_us) / 1e6 for time_us in times_us]
+            if times[-1] > self._max_s or not all(map(operator.le, times, times[1:])):
+                kept = [row for row, _ in enumerate(times) if self._is_plausible(times, row)]
+                self.damaged.update(offsets[begin + row] for row in set(range(len(times))).difference(kept))
+                times, *values = ([column[row] for row in kept] for column in (times, *values))
+            yield [times, *values]
+
+    def _is_plausible(self, times: Sequence[float], row: int) -> bool:
+        """Return False if a row is later than the whole log, or than the next row, which agrees with the one before.
+
+        Rows have no checksum. One wrong time would move all later rows of a `TimeSeries`.
+        """
+        before = times[row - 1] if row else 0.0
+        after = times[row + 1] if row + 1 < len(times) else math.inf
+        is_between = times[row] <= after + _MAX_DISORDER_S or not 0.0 <= before <= after + _MAX_DISORDER_S
+        return times[row] <= self._max_s and is_between
 
     def _first_time(self) -> int:
         """Return the time of the first row in the file, which may be in any table."""
-        reader = self._reader
-        first_rows = []  # offset and time of the first row of each table
-        for number in reader.name_to_id.values():
-            offsets = reader.offsets[number]
-            if not len(offsets) or "TimeUS" not in reader.formats[number].columns:
-                continue
-            row_format = reader.formats[number]
-            index = row_format.columns.index("TimeUS")
-            # "Q" is a 64-bit integer. A row at the end of the file may be incomplete.
-            if row_format.format[index] == "Q" and offsets[0] + row_format.len <= len(reader.data_map):
-                pattern = _struct_pattern(row_format, [index])
-                (time_us,) = struct.unpack_from(pattern, reader.data_map, offsets[0] + _HEADER_SIZE)
-                first_rows.append((offsets[0], time_us))
+        # The order is that of the positions in the file. The lowest time could be that of a damaged row.
+        first_rows = list(self._rows_at(0))
         if not first_rows:
             raise FileFormatError(
-                f"{reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
+                f"{self._reader.filehandle.name} has no row with a time (TimeUS): it is empty, or from before 2015"
             )
-        # min() compares the positions in the file. The lowest time could be that of a damaged row.
         _, time_us = min(first_rows)
-        return int(time_us)
+        return time_us
+
+    def _rows_at(self, index: int) -> Iterator[tuple[int, int]]:
+        """Yield the offset and the time in microseconds of the row with this index of each table that has it."""
+        reader = self._reader
+        for number in reader.name_to_id.values():
+            offsets, row_format = reader.offsets[number], reader.formats[number]
+            if not -len(offsets) <= index < len(offsets) or "TimeUS" not in row_format.columns:
+                continue
+            column = row_format.columns.index("TimeUS")
+            # "Q" is a 64-bit integer. A row at the end of the file may be incomplete.
+            if row_format.format[column] == "Q" and offsets[index] + row_format.len <= len(reader.data_map):
+                pattern = _struct_pattern(row_format, [column])
+                (time_us,) = struct.unpack_from(pattern, reader.data_map, offsets[index] + _HEADER_SIZE)
+                yield int(offsets[index]), int(time_us)
 
 
 def _struct_pattern(row_format: Any, indices: Sequence[int]) -> str:
@@ -206,6 +232,8 @@ class _Reader:
         if flight.texts:
             ends.append(flight.texts[-1].time_s)
         flight.ends_at = flight.begins_at + max(ends, default=0.0)
+        if tables.damaged:
+            flight.notes.append(f"{len(tables.damaged)} damaged rows with an impossible time were skipped")
         if not tables.unix_at_0:
             flight.notes.append("no GNSS time in the log: times count from power-on")
 

@@ -11,7 +11,7 @@ from aerokit.connection.heartbeats import is_autopilot
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import clean_text
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TimeSeries
-from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, use_simulated_time
+from aerokit.logs.flights.recording import MIN_SILENCE_S, ClockComparison, LinkCounter, is_real_time, use_simulated_time
 from aerokit.logs.flights.tlog_missions import RecordedMission
 from aerokit.logs.flights.tlog_modes import RecordedModeCommands
 from aerokit.mavlink import messages as m
@@ -38,6 +38,12 @@ _NULL_ISLAND_E7 = 100_000
 _HEARTBEAT_ID = b"\0\0\0"
 # Bits of a set-point's type mask. If they are set, the position, velocity or attitude is ignored.
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
+# If a record is earlier than the previous one by more than this, the recording's clock was set back.
+_MAX_DISORDER_S = 1.0
+# If a record is later than the previous one by more than this, it is damaged, unless the next record has that time too.
+_DOUBTFUL_JUMP_S = 3600.0
+# Older positions are not used to convert local set-points to global ones.
+_POSITION_MAX_AGE_S = 2.0
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
 
 
@@ -93,6 +99,7 @@ class _Reader:
         self._charge_states: dict[int, int] = {}  # MAV_BATTERY_CHARGE_STATE by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
         self._local_position = (NAN, NAN, NAN)  # metres north, east and down of the estimator's origin
+        self._position_at = self._local_position_at = -math.inf
         self._relative_m = NAN
         self._clocks = ClockComparison()
         self._is_breached = False
@@ -131,11 +138,30 @@ class _Reader:
         begins_at, ends_at = 0.0, 0.0
         new_frames = 0  # the vehicle's frames since the last call of link.count()
         next_second_unix_s, expected_sequence = 0.0, -1
-        last_frame_at, last_frame_record = math.nan, 0  # time and number of the record with the vehicle's last frame
+        last_frame_at = math.nan  # time of the record with the vehicle's last frame
+        previous_unix_s = math.nan
+        paused_s = 0.0  # seconds without any record since the vehicle's last frame
+        doubtful_unix_s = math.nan  # time of the last record that was skipped because of _DOUBTFUL_JUMP_S
+        set_back_s = 0.0  # sum of the jumps by which the recording's clock was set back
         with flight.path.open("rb") as file:
-            for unix_s, raw in read_tlog(file):
+            for recorded_unix_s, raw in read_tlog(file):
+                unix_s = recorded_unix_s + set_back_s
                 if not records:
-                    begins_at = unix_s
+                    begins_at = previous_unix_s = unix_s
+                elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
+                    if unix_s - previous_unix_s > _DOUBTFUL_JUMP_S:
+                        if not abs(unix_s - doubtful_unix_s) <= _DOUBTFUL_JUMP_S:
+                            doubtful_unix_s = unix_s
+                            damaged += 1
+                            continue
+                        damaged -= 1  # the skipped record was right
+                    if unix_s > previous_unix_s:
+                        paused_s += unix_s - previous_unix_s
+                    else:
+                        self._note_clock(previous_unix_s - unix_s, previous_unix_s - begins_at)
+                        set_back_s += previous_unix_s - unix_s
+                        unix_s = previous_unix_s
+                previous_unix_s = unix_s
                 records += 1
                 if records % 16_384 == 0:
                     on_bytes(file.tell())
@@ -150,12 +176,11 @@ class _Reader:
                     # To save calls, frames are counted together until a frame is missing or a second ends.
                     if sequence != expected_sequence or unix_s >= next_second_unix_s:
                         if unix_s - last_frame_at >= MIN_SILENCE_S:
-                            link.add_silence(
-                                last_frame_at - begins_at, unix_s - begins_at, records - last_frame_record - 1
-                            )
+                            link.add_silence(last_frame_at - begins_at, unix_s - begins_at, paused_s)
+                            paused_s = 0.0
                         next_second_s = link.count(unix_s - begins_at, sequence, expected_sequence, new_frames)
                         next_second_unix_s, new_frames = begins_at + next_second_s, 0
-                    last_frame_at, last_frame_record = unix_s, records
+                    last_frame_at = unix_s
                     expected_sequence = (sequence + 1) & 0xFF
                     if message_id not in handlers_of_vehicle:
                         continue
@@ -173,8 +198,14 @@ class _Reader:
                     handle(unix_s - begins_at, message)
             on_bytes(file.tell())
         flight.begins_at, flight.ends_at = begins_at, ends_at
-        link.end(new_frames, last_frame_at - begins_at, flight.duration_s, records - last_frame_record)
+        link.end(new_frames, last_frame_at - begins_at, flight.duration_s, paused_s)
         self._finish(damaged)
+
+    def _note_clock(self, set_back_s: float, time_s: float) -> None:
+        self._flight.notes.append(
+            f"the recording's clock was set back by {set_back_s:.0f} s, {time_s:.0f} s after the log began: the times"
+            " in this report continue without this jump"
+        )
 
     def _finish(self, damaged: int) -> None:
         """Complete the flight after the last message. ``damaged`` is the number of damaged messages."""
@@ -192,6 +223,11 @@ class _Reader:
         if not self._mode_commands.has_commands:
             flight.notes.append(
                 "the log contains no commands to the vehicle, so the causes of mode changes are unknown"
+            )
+        if self._clocks.missing_s >= 1.0 and is_real_time(self._clocks.speed):
+            flight.notes.append(
+                f"by the vehicle's clock, {self._clocks.missing_s:.0f} s are missing in this recording, as if its"
+                " computer had slept: the durations in this report do not contain them"
             )
         self._mode_commands.attribute_modes(self._clocks.speed)
         use_simulated_time(flight, self._clocks.speed)
@@ -330,11 +366,13 @@ class _Reader:
             return
         self._position = message.lat / _E7, message.lon / _E7, message.alt / 1e3
         self._relative_m = message.relative_alt / 1e3
+        self._position_at = time_s
         self._flight.track.add(time_s, *self._position, self._relative_m)
         self._flight.velocity.add(time_s, message.vx / 100, message.vy / 100, message.vz / 100)
 
     def _on_local_position(self, time_s: float, message: m.LocalPositionNed) -> None:
         self._local_position = message.x, message.y, message.z
+        self._local_position_at = time_s
 
     def _on_nav_controller_output(self, time_s: float, message: m.NavControllerOutput) -> None:
         if self._autopilot.name == "ArduPilot":
@@ -362,18 +400,19 @@ class _Reader:
         self._add_velocity_target(time_s, message)
 
     def _on_local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
-        """Add a local set-point, converted with the newest local and global positions of the vehicle."""
+        """Add a local set-point, converted with the newest local and global positions of the vehicle, if recent."""
         if message.type_mask & _NO_POSITION != _NO_POSITION:
             local_north, local_east, local_down = self._local_position
             north, east, down = message.x - local_north, message.y - local_east, message.z - local_down
-            latitude, longitude, amsl = self._position
+            is_recent = time_s - min(self._position_at, self._local_position_at) <= _POSITION_MAX_AGE_S
+            latitude, longitude, amsl = self._position if is_recent else (NAN, NAN, NAN)
             east_per_degree = _METRES_PER_DEGREE * math.cos(math.radians(latitude))
             self._flight.position_target.add(
                 time_s,
                 latitude + north / _METRES_PER_DEGREE,
                 longitude + east / east_per_degree,
                 amsl - down,
-                self._relative_m - down,
+                self._relative_m - down if is_recent else NAN,
             )
         self._add_velocity_target(time_s, message)
 

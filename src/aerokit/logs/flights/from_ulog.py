@@ -74,6 +74,7 @@ _FAILSAFE_FLAGS = {
 _BATTERY_WARNINGS = {1: "low", 2: "critical", 3: "emergency", 4: "failed"}
 _LOADING_SHARE = 0.9  # the progress is 90 % when pyulog has loaded the file
 _BUFFER = 1 << 20
+_MAX_DISORDER_US, _MAX_LATE_US, _MAX_TIME_US = 10**6, 3600 * 10**6, 1 << 62
 
 
 def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
@@ -156,6 +157,7 @@ class _Reader:
     def __init__(self, flight: FlightLog, log: Any) -> None:
         self._flight, self._log = flight, log
         self._data = [data for data in log.data_list if len(data.data.get("timestamp", ()))]
+        self._damaged = _drop_damaged_rows(self._data)
         first_times = [int(data.data["timestamp"][0]) for data in self._data]
         self._began_us = min([int(log.start_timestamp), *first_times])
 
@@ -166,7 +168,11 @@ class _Reader:
         flight.vehicle = _version(log)
         booted_at = utc_at_boot(log)
         flight.begins_at = booted_at + self._began_us / 1e6
-        flight.ends_at = booted_at + log.last_timestamp / 1e6
+        last_us = log.last_timestamp
+        if self._damaged:
+            flight.notes.append(f"{self._damaged} damaged rows with an impossible time were skipped")
+            last_us = max([int(data.data["timestamp"][-1]) for data in self._data], default=self._began_us)
+        flight.ends_at = booted_at + last_us / 1e6
         if not booted_at:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
@@ -394,6 +400,27 @@ class _Reader:
                 noise=radio.array("noise"),
                 remote_noise=radio.array("remote_noise"),
             )
+
+
+def _drop_damaged_rows(topics: list[Any]) -> int:
+    """Drop the rows of topics whose time is impossible, as those of a ``.bin``. Return their number.
+
+    Rows have no checksum. The time of a row is impossible if it is far from those of both neighbours, or later than the
+    whole log.
+    """
+    numpy = import_module("numpy")
+    all_times = [topic.data["timestamp"].astype("int64") for topic in topics]
+    last_us = max((int(times[-2]) for times in all_times if len(times) > 1), default=_MAX_TIME_US)
+    damaged = 0
+    for topic, times in zip(topics, all_times, strict=True):
+        before, after = numpy.append(times[:1], times[:-1]), numpy.append(times[1:], times[-1:])
+        is_spike = (times > after + _MAX_DISORDER_US) | (times < before - _MAX_DISORDER_US)
+        is_damaged = is_spike & (before <= after + _MAX_DISORDER_US) | (times > last_us + _MAX_LATE_US)
+        if is_damaged.any():
+            damaged += int(is_damaged.sum())
+            topic.data = {name: values[~is_damaged] for name, values in topic.data.items()}
+    topics[:] = [topic for topic in topics if len(topic.data["timestamp"])]
+    return damaged
 
 
 def _extend(columns: TimeSeries, times: Sequence[float], **values: Any) -> None:

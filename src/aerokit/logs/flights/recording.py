@@ -29,21 +29,42 @@ class ClockComparison:
         self._previous: tuple[float, int] = (-math.inf, 0)
         self._recorded_s = 0.0
         self._vehicle_s = 0.0
+        # The same of intervals that are long by the vehicle's clock: the computer slept, or the simulation is fast.
+        self._long_recorded_s = 0.0
+        self._long_vehicle_s = 0.0
 
     def compare(self, time_s: float, boot_ms: int) -> None:
         previous_s, previous_ms = self._previous
         self._previous = time_s, boot_ms
+        recorded_s, vehicle_s = time_s - previous_s, (boot_ms - previous_ms) / 1e3
         # Ignore an interval if the vehicle rebooted, the recording paused, or the recording's clock was set back.
-        if boot_ms >= previous_ms and 0 <= time_s - previous_s < _MAX_CLOCK_GAP_S:
-            self._recorded_s += time_s - previous_s
-            self._vehicle_s += (boot_ms - previous_ms) / 1e3
+        if vehicle_s < 0 or not 0 <= recorded_s < _MAX_CLOCK_GAP_S:
+            return
+        if vehicle_s >= _MAX_CLOCK_GAP_S:
+            self._long_recorded_s += recorded_s
+            self._long_vehicle_s += vehicle_s
+            return
+        self._recorded_s += recorded_s
+        self._vehicle_s += vehicle_s
 
     @property
     def speed(self) -> float:
         """Seconds by which the vehicle's clock advances in a recorded second; 1 if the log is too short to compare."""
-        if min(self._recorded_s, self._vehicle_s) < _MIN_CLOCK_COMPARISON_S:
+        recorded_s, vehicle_s = self._recorded_s, self._vehicle_s
+        if not self._is_comparable:
+            recorded_s, vehicle_s = recorded_s + self._long_recorded_s, vehicle_s + self._long_vehicle_s
+        if min(recorded_s, vehicle_s) < _MIN_CLOCK_COMPARISON_S:
             return 1.0
-        return self._vehicle_s / self._recorded_s
+        return vehicle_s / recorded_s
+
+    @property
+    def missing_s(self) -> float:
+        """Seconds by which the clock of the recording stood still while the vehicle's advanced."""
+        return self._long_vehicle_s - self._long_recorded_s if self._is_comparable else 0.0
+
+    @property
+    def _is_comparable(self) -> bool:
+        return min(self._recorded_s, self._vehicle_s) >= _MIN_CLOCK_COMPARISON_S
 
 
 class LinkCounter:
@@ -77,17 +98,18 @@ class LinkCounter:
         self._lost += missing
         return self._second + 1
 
-    def add_silence(self, begins_s: float, ends_s: float, other_messages: int) -> None:
-        """Record a silence of the vehicle, in which this many messages of other systems were received."""
-        self._silences.append(Silence(begins_s, ends_s, is_recorded=other_messages > 0))
+    def add_silence(self, begins_s: float, ends_s: float, paused_s: float) -> None:
+        """Record a silence of the vehicle, with the seconds in which no message of any system was recorded."""
+        is_recorded = ends_s - begins_s - paused_s >= MIN_SILENCE_S
+        self._silences.append(Silence(begins_s, ends_s, is_recorded))
 
-    def end(self, received: int, received_s: float, ends_s: float, other_messages: int) -> None:
+    def end(self, received: int, received_s: float, ends_s: float, paused_s: float) -> None:
         """Count the last frames, up to ``received_s``. If the log ends `MIN_SILENCE_S` later or more, add a silence."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
             return
-        self.add_silence(received_s, ends_s, other_messages)
+        self.add_silence(received_s, ends_s, paused_s)
         self._add_row(int(ends_s))
         if ends_s > self._second:
             self._series.add(ends_s, *_ALL_LOST)

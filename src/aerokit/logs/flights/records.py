@@ -121,6 +121,7 @@ class TlogReader(LogReader):
                     if self.needs_states:
                         states = self._states(system_id, component_id, unix_s, message)
                     yield LogRecord(unix_s, system_id, component_id, message.NAME, _NO_FIELDS, states, message)
+                framer.reset()  # the rest of a damaged message must not delay the next one
             on_bytes(file.tell())
         self._check_and_note(count)
 

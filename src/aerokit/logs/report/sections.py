@@ -303,7 +303,7 @@ def _parameters(flight: FlightLog) -> Section:
         (clock(change.time_s), change.name, f"{change.before:g}", f"{change.after:g}")
         for change in changes[:_MAX_CHANGES]
     ]
-    parts: list[Part] = [Paragraphs(["The pilot and programs changed no parameter during the log."])]
+    parts: list[Part] = [Paragraphs(["The log contains no change of a parameter by the pilot or a program."])]
     if rows:
         parts = [Table(("time", "parameter", "before", "after"), rows, _title(len(rows), len(changes), "changes"))]
     hidden_count = len(flight.parameter_changes) - len(changes)

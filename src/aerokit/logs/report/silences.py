@@ -42,15 +42,16 @@ def silence_sentences(flight: FlightLog) -> list[str]:
 
 
 def _pauses(pauses: list[Silence]) -> list[str]:
-    """Return a list with one sentence about the times without any message; an empty list if there are none."""
+    """Return a list with one sentence about possible pauses of the recording; empty if there are none."""
     if not pauses:
         return []
     longest = max(pauses, key=lambda pause: pause.ends_s - pause.begins_s)
     others = len(pauses) - 1
     more = f", and in {others} shorter gap{'' if others == 1 else 's'}" if others else ""
     return [
-        f"The log contains no message at all for {span(longest.ends_s - longest.begins_s)} from"
-        f" {clock(longest.begins_s)} on{more}: the vehicle was silent, or the recording paused."
+        f"The log contains no message of the vehicle for {span(longest.ends_s - longest.begins_s)} from"
+        f" {clock(longest.begins_s)} on{more}: the vehicle was silent, the recording paused,"
+        " or its clock was set forward."
     ]
 
 

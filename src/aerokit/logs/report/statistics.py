@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from itertools import pairwise
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -110,7 +111,7 @@ def statistics_of(flight: FlightLog) -> FlightStatistics:
         min_satellites=min(satellites, default=None),
         max_hdop=_max(hdops),
         max_vibration_m_s2=_max(levels),
-        clips=clips[-1] - clips[0] if clips else None,
+        clips=sum(max(after - before, 0.0) for before, after in pairwise(clips)) if clips else None,
         max_estimator_ratio=_max(ratios),
         lost_percent=spans.mean(flight.link, "lost_percent"),
     )
