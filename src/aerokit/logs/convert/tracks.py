@@ -73,7 +73,7 @@ class _TrackWriter:
         self._path.write_text(self._text(), encoding="utf-8")
 
     def _add_item(self, record: LogRecord) -> None:
-        """Add a mission item that has a position to the track of the vehicle that received or sent it."""
+        """Add a mission item to the track of the vehicle that received or sent it. Skip items without a position."""
         item: Any = record.message
         if item is None or item.mission_type != MavMissionType.MISSION:
             return
