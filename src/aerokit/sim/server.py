@@ -102,7 +102,7 @@ class SimulatorServer:
         return self._now_at_start + (self._loop.time() - self._started_at) * self._speedup
 
     async def __aenter__(self) -> Self:
-        """Open the links and run the vehicles until the present time. The links are closed again if a step fails."""
+        """Open the links and process the events that are already due. If either fails, close the links again."""
         if self._loop is not None:
             raise BusyError("this SimulatorServer was already started once; create a new SimulatorServer")
         self._loop = asyncio.get_running_loop()

@@ -106,9 +106,9 @@ class MapFrame:
     def east_north_up_m(self, position: Position) -> tuple[float, float, float]:
         """Convert a position to metres east, north and up of the origin.
 
-        The first position becomes the origin. The origin's altitude is that of home, derived from the first position
-        with an altitude above sea level; if home is unknown then, it is the altitude of that position. A position
-        without an altitude above sea level is as far up as it is above home.
+        The origin has the latitude and longitude of the first position, and the altitude of home. The latter
+        is computed from the first position that has an altitude above sea level; an unknown height above home counts as
+        0. Without an altitude above sea level, the height above home is returned as the metres up.
         """
         altitude, relative_m = position.altitude_amsl_m, position.altitude_relative_m or 0.0
         if self._origin is None:

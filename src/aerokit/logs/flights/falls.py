@@ -61,11 +61,12 @@ def falls(flight: FlightLog) -> list[Fall]:
     A descent counts if the vehicle sank 2 m or more at 3 m/s or more, was stopped within 0.6 s (or 1.5 intervals of
     the logged velocities), and one of these is true:
 
-    - No height in the log shows that the vehicle left that height before it was disarmed.
-    - The same is true for 30 s, or until the log ends, and the vehicle was less than 3 m above home.
-    - The autopilot reported a crash.
+    - The vehicle was disarmed within 30 s, and no logged height shows that it had climbed or sunk again before.
+    - It stopped at most 3 m above home, and no logged height of the next 30 s shows that it climbed or sank again.
+    - The log has evidence of a fall: see `Fall.reasons`.
 
-    A descent near the ground also counts if the log ends during the descent.
+    A descent that is not over when the log ends counts with such evidence, or if the vehicle would have reached home's
+    height within 2 s.
     """
     if not flight.armed:
         return []
@@ -131,9 +132,9 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if the vehicle keeps this height until it is disarmed or, near home's height, for 30 s.
+    """Return True if all heights that are logged in the next 30 s, or until disarming, are about ``height_m``.
 
-    The log may end before. It is also True if the log has no heights of this time.
+    Return False if the vehicle was not disarmed in these 30 s and is higher than `_NEAR_HOME_HEIGHT_M`.
     """
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)

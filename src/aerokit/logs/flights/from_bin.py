@@ -108,7 +108,7 @@ class _Tables:
         return times_and_columns
 
     def _chunks(self, table: str, columns: Sequence[str]) -> Iterator[list[list[Any]]]:
-        """Yield the times and the columns of some hundred rows at a time. Yields nothing if a column is missing."""
+        """Yield the times and the columns of up to `_CHUNK_ROWS` rows at a time; nothing if a column is missing."""
         if not self.has(table, *columns):
             return
         reader = self._reader

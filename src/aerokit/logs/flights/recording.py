@@ -79,9 +79,10 @@ class LinkCounter:
     def count(self, time_s: float, sequence: int, expected: int, received: int) -> float:
         """Count received and lost frames, and return the start of the next second.
 
-        Called after a gap in the sequence numbers and at the start of a second. ``received`` frames have arrived since
-        the last call; the newest one has ``time_s`` and ``sequence``. ``expected`` is the sequence number that it would
-        have without a loss; negative for the first frame.
+        Called with the first frame after a gap in the sequence numbers, and with the first frame of a second.
+        ``time_s`` and ``sequence`` are those of this frame. ``expected`` is the sequence number after that of
+        the previous frame; negative if there was none. ``received`` is the number of frames since the last call,
+        including this frame.
         """
         if expected < 0:
             self._second = int(time_s)  # nothing is known to be lost before the first frame
@@ -117,7 +118,8 @@ class LinkCounter:
     def _add_row(self, second: int) -> None:
         """Add a row for the counted second, and start to count ``second``.
 
-        The seconds between, in which no frames arrived, get two rows: one for the first and one for the last of them.
+        If there are seconds between these two, no frames arrived in them: rows for the first and the last of them show
+        a loss of 100 %.
         """
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)

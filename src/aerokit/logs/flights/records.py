@@ -167,7 +167,7 @@ class TlogReader(LogReader):
     def _states(
         self, system_id: int, component_id: int, unix_s: float, message: Message
     ) -> tuple[tuple[str, Any], ...]:
-        """Return the states that a message changes. A system has states from its autopilot's first HEARTBEAT on."""
+        """Return the states that an autopilot's message changes: none before the autopilot's first HEARTBEAT."""
         vehicle = self._vehicles.get(system_id)
         if vehicle is None:
             if not isinstance(message, Heartbeat) or not is_autopilot(message):

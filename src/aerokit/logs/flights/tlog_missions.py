@@ -49,7 +49,7 @@ class RecordedMission:
             self._items = {number: item for number, item in self._items.items() if number < message.count}
 
     def on_file_transfer(self, time_s: float, message: m.FileTransferProtocol) -> None:
-        """Collect the blocks of ArduPilot's mission file, which a program writes or reads."""
+        """Collect the blocks of ArduPilot's mission file while a program uploads or downloads the file."""
         if not self._is_of_vehicle(message):
             return
         ftp = FtpMessage.decode(message.payload)
@@ -66,7 +66,7 @@ class RecordedMission:
                 self._read_file()
 
     def _read_file(self) -> None:
-        """Once the file is complete, replace the mission by its items, or only some items (NO_CLEAR)."""
+        """Once the file is complete, store its items as the mission. With NO_CLEAR, keep the other items too."""
         if len(self._file) < HEADER.size:
             return
         try:

@@ -57,10 +57,10 @@ class RecordedModeCommands:
             self._command_times[mode.name].append(time_s)
 
     def attribute_modes(self, speed: float) -> None:
-        """Mark the mode changes that were commanded. ``speed`` is that of a simulation, 1.0 for a real vehicle.
+        """Mark the mode changes that were commanded.
 
-        The age of a command is measured in the vehicle's seconds, because many of them pass in one recorded second of
-        a fast simulation.
+        ``speed`` is the number of the vehicle's seconds in a recorded second: 1.0 unless the vehicle is a simulation.
+        The maximum age of a command is in the vehicle's seconds.
         """
         for times in self._command_times.values():
             times.sort()

@@ -384,7 +384,7 @@ def _marker(
     size: int,
     texts: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Return a trace of markers. ``texts`` has a text for each place to show on hovering; by default, the name."""
+    """Return a trace of markers. Hovering over a marker shows its text in ``texts``, by default the name."""
     return {
         **_coordinates(places),
         "mode": "markers",

@@ -143,7 +143,7 @@ def _overlay_section(
     get_series: Callable[[FlightLog], TimeSeries | None],
     column: str,
 ) -> Section:
-    """Return a section with one column of both flights in one chart, over the time since arming."""
+    """Return a section with one chart of the same column of both flights, over the time since arming."""
     traces, names_without_data = [], []
     for number, flight in enumerate(flights):
         columns = get_series(flight)

@@ -24,14 +24,15 @@ def simplify(
 
     Args:
         places: coordinates; NaN interrupts the line.
-        max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. Only
-            the ends of gaps, the points of ``keep`` and about one point in a thousand are selected beyond it.
+        max_points: maximum number of selected points, even if omitted points are farther away than ``tolerance``. It
+            is exceeded only by points that are always selected: those of ``keep``, those next to a gap, the first, the
+            last, and every 1024th point.
         tolerance: maximum distance of an omitted point from the line through the selected points.
         keep: indices that are selected if their coordinates are known.
 
     Returns:
-        The selected indices, including one index for each gap, and the largest distance of an omitted point from the
-        line through the selected points.
+        The selected indices, including that of one NaN in each gap, and the largest distance of an omitted point from
+        the line through the selected points.
     """
     known = [abs(x) <= MAX_COORDINATE and abs(y) <= MAX_COORDINATE for x, y in places]
     if not any(known):

@@ -159,7 +159,7 @@ class _ArmedSpans:
         return known
 
     def mean(self, columns: TimeSeries, name: str) -> float | None:
-        """Return the average of the rows in the spans. A value counts until the next row, the last one for a second."""
+        """Return the time-weighted average of a column in the spans. The last value of the column counts for 1 s."""
         times, values = columns.times, columns[name]
         total, weight = 0.0, 0.0
         for begin, end in self._spans:
@@ -288,7 +288,10 @@ def _descent_values(series: TimeSeries, name: str, begin_s: float, end_s: float)
 
 
 def _motors_in_descent(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _DescentValues]:
-    """Return the pulses of the motors by number of output. Outputs that arming has raised count as motors."""
+    """Return the pulses of the motors in a descent, by output number.
+
+    An output counts as a motor if arming and flying raised its pulse by `_MOTOR_RAISED_US` or more.
+    """
     armings = [armed_at for armed_at, _ in flight.armed if armed_at < begin_s]
     motors: dict[str, _DescentValues] = {}
     if not armings:
@@ -426,9 +429,10 @@ def _failsafes_sentence(flight: FlightLog) -> str:
 
 
 def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
-    """Return the parameters that decide on the reaction, for each kind of failsafe of which the log has no parameter.
+    """Return the names of missing parameters that decide how the vehicle reacts to these kinds of failsafes.
 
-    These are the parameters of the kind whose names have ACT or ENABL, or all if no name has.
+    A kind is skipped if the log has any of its parameters. Otherwise, these are its parameters with ACT or ENABL in
+    the name or, if there are none, all its parameters.
     """
     unknown: list[str] = []
     for kind in dict.fromkeys(kinds):

@@ -97,7 +97,7 @@ def altitude_frame(frame: int) -> int | None:
 
 
 def as_stored(item: MissionItem, kind: Kind = "copter") -> MissionItem | int:
-    """Return the item as a download sends it after this upload, or the MAV_MISSION_RESULT of a refusal."""
+    """Return the uploaded item as a later download contains it, or the MAV_MISSION_RESULT that refuses the upload."""
     result = _check_numbers(item)
     if result != MavMissionResult.ACCEPTED:
         return result

@@ -284,9 +284,10 @@ class MissionRun:
             self._running_do = None
 
     def _start_next_navigation(self, start: int = 0) -> bool:
-        """Start the next navigation command, and the first of the "do" commands in front of that command.
+        """Start the next navigation command, and the first "do" command that is found before it.
 
-        ``start`` is the index to search from; 0 searches after the current navigation command.
+        The search begins at the index ``start``; 0: after the current navigation command. Return False if it finds no
+        navigation command.
         """
         index_after_current = self.nav_index + 1 if self.nav_index else _FIRST
         index = start or index_after_current

@@ -280,8 +280,9 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
     def return_place(self) -> Ned:
         """Return the place to which the plane returns after a breach.
 
-        With FENCE_RET_RALLY, this is where RTL would return. Otherwise it is the uploaded return point or home, at
-        FENCE_RET_ALT, half-way between the altitude limits or, if these leave no room, at RTL_ALTITUDE.
+        With FENCE_RET_RALLY, this is where RTL would return. Otherwise it is above the uploaded return point or,
+        without one, above home. Its height above home is FENCE_RET_ALT. If that is not positive, the height is half-way
+        between the altitude limits or, if these leave no room, RTL_ALTITUDE.
         """
         plane, parameters = self.vehicle, self.vehicle.parameters
         home_north, home_east, home_down = plane.home_or_ground

@@ -38,7 +38,11 @@ class SubHost(RoverSubVehicle):
         return math.dist(self._below_surface(place), self.motion.place)
 
     def travel(self, place: Ned, speed: float, *, looks_ahead: bool = True) -> None:
-        """Move towards a place at a speed in m/s. WPNAV_SPEED_UP and WPNAV_SPEED_DN limit the vertical speed."""
+        """Move straight to a place. With ``looks_ahead``, also turn the nose towards the place.
+
+        ``speed`` (m/s) applies to the longer one of the horizontal and the vertical distance. WPNAV_SPEED_UP and
+        WPNAV_SPEED_DN limit the vertical speed.
+        """
         motion, parameters = self.motion, self.parameters
         north, east, down = self._below_surface(place)
         max_climb = parameters["WPNAV_SPEED_UP"] / 100.0

@@ -301,7 +301,7 @@ class Px4Failsafes:
         return Action.LAND if MODES[px4.intended_mode].needs_position else Action.NONE
 
     def can_be_overridden(self, moved: float) -> bool:
-        """Return True if a stick movement ends the current mode. ``moved`` is its size: 2 is from end to end."""
+        """Return True if moving a stick by ``moved`` ends the current mode. The whole range of a stick is 2."""
         parameters, mode = self._px4.parameters, self._px4.mode
         mode_bit = 0  # Bit of COM_RC_OVERRIDE that allows an override in the present mode.
         main_mode, _ = mode
@@ -353,10 +353,11 @@ class Px4Failsafes:
         self._execute(self._choose())
 
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
-        """Update the active failures.
+        """Update the active failures. ``failing`` maps the present failures to their actions.
 
-        A new or more severe action starts the delay, and a new one also ends an override by the user. After the end of
-        its cause, an action more severe than WARN stays active until the user changes the mode.
+        The rules apply to actions more severe than WARN. A new failure, or a more severe action for an old one, starts
+        the delay COM_FAIL_ACT_T. A new failure also ends an override by the user. A failure that has ended stays active
+        until the user changes the mode.
         """
         for cause, action in failing.items():
             if cause not in self._active and action >= Action.HOLD:
@@ -390,7 +391,7 @@ class Px4Failsafes:
         return worst
 
     def _execute(self, action: FailsafeAction) -> None:
-        """Start an action that differs from the present one, or end the failsafe (NONE or WARN)."""
+        """Start an action, unless it is the present one. NONE and WARN end the failsafe."""
         if action == self.action:
             return
         px4, previous = self._px4, self.action

@@ -201,7 +201,7 @@ class Px4Flight:
             self.target = target
 
     def plan_take_off(self, down: float | None = None) -> None:
-        """Plan a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home, if the vehicle is not higher."""
+        """Plan a vertical climb to ``down``; None: to MIS_TAKEOFF_ALT above home, or no climb if already higher."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
         if down is None:

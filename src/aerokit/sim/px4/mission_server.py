@@ -200,9 +200,9 @@ class Px4MissionServer(MissionServer):
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        Like PX4, this treats an open transfer as finished if its item count equals the stored count, even if it is an
-        upload (mavlink_mission.cpp, handle_mission_request_list). PX4 still remembers such an upload as unfinished, so
-        it refuses other uploads until a download times out.
+        If an open transfer has transferred as many items as are stored, it is ended first, as in PX4
+        (mavlink_mission.cpp, handle_mission_request_list). PX4 does this even to an unfinished upload, and then refuses
+        other uploads until a download times out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):
@@ -236,7 +236,10 @@ class Px4MissionServer(MissionServer):
             self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End a download, or cancel an upload. On UNSUPPORTED, an upload goes on with the other request message."""
+        """End a download, or cancel an upload.
+
+        After UNSUPPORTED, an upload goes on with MISSION_REQUEST instead of MISSION_REQUEST_INT, or the reverse.
+        """
         link = self._link(channel)
         if sender_of(ack) != link.client:
             self._warn("REJ. WP CMD: partner id mismatch")
