@@ -249,6 +249,25 @@ def test_gpx_has_times_elevations_and_mission(log: Path, tmp_path: Path) -> None
     ]
 
 
+def test_gpx_has_newest_mission_even_from_before_first_position(tmp_path: Path) -> None:
+    gpxpy = pytest.importorskip("gpxpy")
+    path, encoder = tmp_path / "missions.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for count, latitude in ((4, 10), (3, 20)):
+            writer.write(encoder.encode(m.MissionCount(255, 0, count)), BEGIN)
+            for seq in range(1, count):
+                # The last item is a waypoint in the first mission, and RETURN_TO_LAUNCH in the second.
+                command = 20 if (count, seq) == (3, 2) else 16
+                item = m.MissionItemInt(255, 0, seq, 3, command, 0, 1, 0, 0, 0, 0, latitude * 10**7, 85010000, 30.0)
+                writer.write(encoder.encode(item), BEGIN)
+        for at, message in flight():
+            if isinstance(message, (m.Heartbeat, m.GlobalPositionInt)):
+                writer.write(encoder.encode(message), at)
+    convert(path, tmp_path / "out.gpx")
+    waypoints = gpxpy.parse((tmp_path / "out.gpx").read_text()).waypoints
+    assert [(waypoint.name, waypoint.latitude) for waypoint in waypoints] == [("1 NAV_WAYPOINT", 20.0)]
+
+
 def test_kml_has_altitude_modes(log: Path, tmp_path: Path) -> None:
     pytest.importorskip("simplekml")
     convert(log, tmp_path / "out.kml")

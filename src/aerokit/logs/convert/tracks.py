@@ -54,6 +54,8 @@ class _TrackWriter:
     def __init__(self, path: Path, log: LogReader) -> None:
         self._path, self._log = path, log
         self._tracks: dict[int, _Track] = {}
+        # Sender and message. They are evaluated at the end, because a mission may be older than the first position.
+        self._mission_messages: list[tuple[int, Any]] = []
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
@@ -61,8 +63,8 @@ class _TrackWriter:
             if state == "position":
                 self._tracks.setdefault(record.system_id, _Track()).add(record.unix_s, value)
                 self.written += 1
-        if record.table in _MISSION_ITEM_TABLES:
-            self._add_item(record)
+        if record.table in _MISSION_TABLES and record.message is not None:
+            self._mission_messages.append((record.system_id, record.message))
 
     def discard(self) -> None:
         pass  # nothing to discard, because only `close` opens the file
@@ -70,27 +72,26 @@ class _TrackWriter:
     def close(self) -> None:
         if not self.written:
             self._log.notes.append("the log contains no position; there is no track")
+        for sender, message in self._mission_messages:
+            system_id = message.target_system if message.target_system in self._tracks else sender
+            if message.mission_type == MavMissionType.MISSION and system_id in self._tracks:
+                self._update_mission(self._tracks[system_id], message)
         self._path.write_text(self._text(), encoding="utf-8")
 
-    def _add_item(self, record: LogRecord) -> None:
-        """Add a mission item to the track of the vehicle that received or sent it. Skip items without a position."""
-        item: Any = record.message
-        if item is None or item.mission_type != MavMissionType.MISSION:
+    def _update_mission(self, track: _Track, item: Any) -> None:
+        """Add a mission item to a track if it has a position. MISSION_COUNT removes the items of a longer mission."""
+        if item.NAME == "MISSION_COUNT":
+            track.waypoints = {number: old for number, old in track.waypoints.items() if number < item.count}
             return
+        track.waypoints.pop(item.seq, None)
         if item.frame not in GLOBAL_FRAMES or not has_place(item.command):
-            return
-        if item.target_system in self._tracks:  # sent to the vehicle
-            system_id = item.target_system
-        elif record.system_id in self._tracks:  # sent by the vehicle
-            system_id = record.system_id
-        else:
             return
         scale = 1e7 if item.NAME == "MISSION_ITEM_INT" else 1.0
         latitude, longitude = item.x / scale, item.y / scale
         # Items without valid coordinates are skipped: 0, 0 means the current position, and NaN fails both comparisons.
         is_valid = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
         if is_valid and math.isfinite(item.z):
-            self._tracks[system_id].waypoints[item.seq] = Waypoint(
+            track.waypoints[item.seq] = Waypoint(
                 item.seq, item.command, latitude, longitude, altitude_m=item.z, frame=item.frame
             )
 
@@ -99,7 +100,7 @@ class _TrackWriter:
         raise NotImplementedError
 
 
-_MISSION_ITEM_TABLES = frozenset(("MISSION_ITEM_INT", "MISSION_ITEM"))
+_MISSION_TABLES = frozenset(("MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_ITEM"))
 
 
 class GpxWriter(_TrackWriter):
