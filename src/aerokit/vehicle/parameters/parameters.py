@@ -166,8 +166,8 @@ class Parameters(ReadOnly):
         Use it to find out which of several names a firmware has; for renamed ArduPilot parameters use :meth:`get`.
 
         Returns:
-            For each name the parameter, or the error that :meth:`get` would have raised. The ``code`` of a
-            ParameterRejected is None if the vehicle ignored this name although it answered other requests.
+            For each name the parameter, or the error that :meth:`get` would have raised. The error's ``code``
+            is None if the vehicle ignored this name although it answered other requests.
 
         Raises:
             InvalidArgument: a name is empty, or longer than 16 characters. Nothing was sent.
