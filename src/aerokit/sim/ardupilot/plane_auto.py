@@ -99,7 +99,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self._count_turns()
 
     def _count_turns(self) -> None:
-        """Add up the angle by which the plane has moved around the place since it reached the circle."""
+        """Once the plane has reached the circle, add the angle by which it has moved around the center in this tick."""
         wing = self.vehicle.wing
         if self._place is None:
             return
@@ -184,7 +184,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self._report_if(dot_product > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
-        """Start a leg. Zero coordinates mean the plane's coordinates, a zero altitude that of the previous leg."""
+        """Start a leg. Coordinates of 0 are replaced by the plane's, and an altitude of 0 by that of the last leg."""
         self._leg_start = self.vehicle.wing.place
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
         north, east, down = point
@@ -282,9 +282,9 @@ class PlaneGuided(PlaneNavigatingMode):
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
-        """Follow those of bank, pitch and throttle that the mask selects.
+        """Set the bank, the pitch and the throttle, except those that the mask excludes.
 
-        ArduPlane has no rate control here: if the mask selects the roll rate alone, the bank angle is followed.
+        ArduPlane has no rate control here: if the mask excludes all but the roll rate, the bank angle is followed.
         """
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)

@@ -138,10 +138,10 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         self._update_link(_GCS, is_lost=self.is_ground_station_lost)
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
-        """Record whether a link is lost, and start or end the common failsafe of both links.
+        """Record whether a link is lost, and start or end the failsafe that both links share.
 
-        Like the firmware (failsafe.cpp, failsafe_trigger), text and parameter are those of the link that is checked
-        when the timeout ends, and a link whose check is disabled while it is lost stays lost.
+        Like the firmware (failsafe.cpp, failsafe_trigger), use the text and the parameter of ``name`` when the timeout
+        ends, even if only the other link is lost. A link whose check is disabled while it is lost stays lost.
         """
         rover = self.vehicle
         was_any_link_lost = bool(self._lost)
