@@ -135,7 +135,10 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start a calibration. Param 1 is a mask of compasses (0: all). With param 3, it needs no DO_ACCEPT_MAG_CAL."""
+        """Start a calibration of the compasses in the mask param 1 (0: all).
+
+        If param 3 is set, the result is saved without DO_ACCEPT_MAG_CAL.
+        """
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED

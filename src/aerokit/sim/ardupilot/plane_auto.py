@@ -23,6 +23,7 @@ from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, t
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
+_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 _REACHED_HEIGHT_M = 5.0
 _ON_CIRCLE_SHARE = 1.3
 
@@ -184,14 +185,19 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self._report_if(dot_product > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
-        """Start a leg. Coordinates of 0 are replaced by the plane's, and an altitude of 0 by that of the last leg."""
+        """Start a leg to a command's position. If both coordinates are 0, use those of the plane."""
         self._leg_start = self.vehicle.wing.place
+        own_north, own_east, own_down = self._leg_start
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
         north, east, down = point
-        if (item.x, item.y) == (0, 0):
-            north, east, _ = self._leg_start
-        if item.z == 0:
-            _, _, down = self._place or self._leg_start
+        has_no_place = (item.x, item.y) == (0, 0)
+        if has_no_place:
+            north, east = own_north, own_east
+        # To loiter, a relative altitude of 0 means the altitude of the plane (Location.cpp, sanitize). For other
+        # commands, this requires that the coordinates are 0, but holds in any frame (commands.cpp, set_next_WP).
+        may_omit_altitude = item.frame not in _ABSOLUTE if manoeuvre == _LOITER else has_no_place
+        if item.z == 0 and may_omit_altitude:
+            down = own_down
         self._place = (north, east, down)
         self._manoeuvre = manoeuvre
         self._on_circle_since = math.nan
