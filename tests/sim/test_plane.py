@@ -157,6 +157,31 @@ async def test_plane_flies_mission_and_lands() -> None:
         assert abs(plane.wing.north) < 60.0
 
 
+@pytest.mark.parametrize(
+    ("command", "keeps_place", "keeps_altitude"),
+    [
+        (MavCmd.NAV_WAYPOINT, False, False),
+        (MavCmd.NAV_WAYPOINT, True, True),
+        (MavCmd.NAV_LOITER_UNLIM, False, True),
+        (MavCmd.NAV_LOITER_UNLIM, True, True),
+    ],
+)
+async def test_mission_item_with_zero_altitude(command: int, keeps_place: bool, keeps_altitude: bool) -> None:
+    """Match ArduPlane's set_next_WP (commands.cpp) and Location::sanitize."""
+    plane = SimulatedPlane(boot_time_s=1.0)
+    async with flown(plane) as vehicle:
+        await take_off(vehicle)
+        zero = MissionItem(command=command, frame=3) if keeps_place else item(plane, command, 9000, 0, 0)
+        await vehicle.mission.upload(Mission([item(plane, MavCmd.NAV_WAYPOINT, 9000, 0, 300), zero]))
+        await vehicle.set_mode("AUTO")
+        await asyncio.sleep(5.0)
+        down = plane.wing.down
+        assert plane.mission.set_current(2)
+        destination = plane.mode.destination
+        assert destination is not None
+        assert destination[2] == pytest.approx(down if keeps_altitude else 0.0)
+
+
 async def test_arming_sends_throttle_armed_text() -> None:
     async with flown(SimulatedPlane(boot_time_s=1.0)) as vehicle:
         with vehicle.subscribe(StatusTextReceived, capacity=10) as texts:

@@ -98,7 +98,7 @@ class SimParameters:
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
 
-        Raises InvalidArgument, with similar names, for an unknown name. Nothing was set then.
+        Raises InvalidArgument if a name is unknown. The error lists similar names, and no parameter is set.
         """
         for name in values:
             if name not in self:
@@ -196,9 +196,9 @@ def _lines_and_switches(
 
 
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return the lines of the parameters named in ``used``.
+    """Return the lines of the parameters named in ``used``, and other lines to reach ``count`` lines.
 
-    If these are fewer than ``count``, the first other lines without a switch are added.
+    The other lines are the first of the table, but none of a parameter that another parameter enables.
     """
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))
@@ -269,7 +269,7 @@ class _Reader(FileHandle):
         return self._content
 
     def _packed(self) -> bytes:
-        """Encode the file, as far as the path requests it."""
+        """Encode the file as the options in its path (``start``, ``count`` and ``withdefaults``) request."""
         try:
             return pack_for_download(
                 (self._parameters.row(name).as_parameter() for name in self._parameters.names),

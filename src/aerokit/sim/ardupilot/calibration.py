@@ -135,7 +135,10 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start a calibration. Param 1 is a mask of compasses (0: all). Param 3 saves without acceptance."""
+        """Start a calibration of the compasses in the mask param 1 (0: all).
+
+        If param 3 is set, the result is saved without DO_ACCEPT_MAG_CAL.
+        """
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
@@ -161,7 +164,7 @@ class CompassCalibration:
         return MavResult.ACCEPTED
 
     def progress(self) -> m.MagCalProgress | None:
-        """Return the progress of one compass, each compass in turn; None if no calibration runs."""
+        """Return MAG_CAL_PROGRESS of the next compass in the calibration, or None if no calibration runs."""
         if not self.is_running:
             return None
         self._progress_compass = self._next_compass(self._progress_compass)
@@ -177,7 +180,7 @@ class CompassCalibration:
         )  # fmt: skip
 
     def report(self) -> m.MagCalReport | None:
-        """Return the result of one compass, each compass in turn; None if no result waits to be accepted."""
+        """Return MAG_CAL_REPORT of the next compass in the calibration, or None if there is no result."""
         if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
@@ -252,9 +255,9 @@ class Calibrations:
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
-        """Calibrate the accelerometers as param 5 (``command.x``) selects.
+        """Calibrate the accelerometers. Param 5 (``command.x``) selects the kind of calibration.
 
-        Param 5 or 2 can instead accept the present calibration of the accelerometers or the compasses.
+        The value 76 in param 5 (accelerometers) or param 2 (compasses) accepts the present calibration instead.
         """
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:

@@ -227,7 +227,7 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """Set the region of interest, also without a gimbal. A position of zeros clears it, like DO_SET_ROI_NONE."""
+        """Set the region of interest. DO_SET_ROI_NONE or a position of zeros clears it. No gimbal is needed."""
         point = None
         if command.command != Cmd.DO_SET_ROI_NONE:
             point = self._vehicle.world_point(*command.place(), command.z, command.altitude_frame)

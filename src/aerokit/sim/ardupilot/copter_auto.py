@@ -280,7 +280,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.update()
 
     def _update_upcoming(self) -> bool:
-        """Record the current and the next commands. Return True if an upload, not the progress, has changed them."""
+        """Record the current and the next commands. Return True if an upload has changed them."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0].seq == run.nav_index
         if commands.version == self._list_version and has_same_index:
@@ -358,7 +358,10 @@ class CopterAuto(MissionMode):
         return True
 
     def _land_or_continue(self, index: int) -> bool:
-        """Land; then disarm, or return True if MIS_OPTIONS lets the mission continue with a take-off."""
+        """Land and then disarm. Called at each tick.
+
+        Instead of disarming, return True if MIS_OPTIONS lets the mission continue with a take-off.
+        """
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
             if self._leg.is_complete:
@@ -397,7 +400,7 @@ class CopterAuto(MissionMode):
     def _fly(self, item: MissionItem) -> None:
         """Start a leg to the place of an item.
 
-        The copter stops there, except at a waypoint with no delay that one of `_NO_STOP_IF_FOLLOWED_BY` follows.
+        If a waypoint has no delay and the next command is in `_NO_STOP_IF_FOLLOWED_BY`, the copter does not stop there.
         """
         run = self.vehicle.mission
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0

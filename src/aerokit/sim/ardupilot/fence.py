@@ -323,7 +323,7 @@ class ArduPilotFence(Generic[HostT]):
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
     def _record_breach(self, kind: int) -> None:
-        """Count a new breach of this kind of fence. Only the first of several sends FENCE_STATUS at once."""
+        """Count a new breach of this kind. If none existed before, send FENCE_STATUS, at most once a second."""
         vehicle = self.vehicle
         self.breach_count += 1
         was_any_breached = self.breached != 0

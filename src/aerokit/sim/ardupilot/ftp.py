@@ -189,7 +189,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, block_number: int) -> None:
         """Send a block of a burst, and schedule the next block. Other requests wait until the end of the burst.
 
-        A short block is followed by a refusal, the last of `_BURST_BLOCKS` by nothing.
+        The burst ends after `_BURST_BLOCKS` blocks, or earlier with a refusal if no more data can be read.
         """
         block_size = request.size or DATA_SIZE
         offset = request.offset + block_number * block_size

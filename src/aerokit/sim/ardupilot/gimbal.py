@@ -121,7 +121,7 @@ class ArduPilotGimbal:
         return self._moved_by_rates(self._target)
 
     def _moved_by_rates(self, target: MountTarget) -> MountTarget:
-        """Return the target as its rates have moved it until now. All angles but a yaw from north are limited."""
+        """Return the target, moved by its rates since it was set. Limit each angle except a yaw from north."""
         if not any(target.rates):
             return target
         seconds = self._vehicle.now - target.set_at

@@ -249,7 +249,7 @@ class MissionRun:
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Let a stopped mission resume at the next navigation command from ``index`` on. Return False without one.
+        """Let a stopped mission resume at the next navigation command from ``index`` on. Return False if there is none.
 
         If "do" commands precede the navigation command, the mission resumes at the first of them.
         """

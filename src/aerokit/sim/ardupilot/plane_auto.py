@@ -23,6 +23,7 @@ from aerokit.sim.commands import CommandHandler, ReceivedCommand, constrained, t
 from aerokit.sim.motion import Ned, euler_from_quaternion, wrap_pi
 
 _FLY, _LOITER, _CLIMB, _LAND = range(4)
+_ABSOLUTE = frozenset({MavFrame.GLOBAL, MavFrame.GLOBAL_INT})
 _REACHED_HEIGHT_M = 5.0
 _ON_CIRCLE_SHARE = 1.3
 
@@ -99,7 +100,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self._count_turns()
 
     def _count_turns(self) -> None:
-        """Add up the angle by which the plane has moved around the place since it reached the circle."""
+        """Once the plane has reached the circle, add the angle by which it has moved around the center in this tick."""
         wing = self.vehicle.wing
         if self._place is None:
             return
@@ -184,14 +185,19 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self._report_if(dot_product > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
-        """Start a leg. Zero coordinates mean the plane's coordinates, a zero altitude that of the previous leg."""
+        """Start a leg to a command's position. If both coordinates are 0, use those of the plane."""
         self._leg_start = self.vehicle.wing.place
+        own_north, own_east, own_down = self._leg_start
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
         north, east, down = point
-        if (item.x, item.y) == (0, 0):
-            north, east, _ = self._leg_start
-        if item.z == 0:
-            _, _, down = self._place or self._leg_start
+        has_no_place = (item.x, item.y) == (0, 0)
+        if has_no_place:
+            north, east = own_north, own_east
+        # To loiter, a relative altitude of 0 means the altitude of the plane (Location.cpp, sanitize). For other
+        # commands, this requires that the coordinates are 0, but holds in any frame (commands.cpp, set_next_WP).
+        may_omit_altitude = item.frame not in _ABSOLUTE if manoeuvre == _LOITER else has_no_place
+        if item.z == 0 and may_omit_altitude:
+            down = own_down
         self._place = (north, east, down)
         self._manoeuvre = manoeuvre
         self._on_circle_since = math.nan
@@ -282,9 +288,9 @@ class PlaneGuided(PlaneNavigatingMode):
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
-        """Follow those of bank, pitch and throttle that the mask selects.
+        """Set the bank, the pitch and the throttle, except those that the mask excludes.
 
-        ArduPlane has no rate control here: if the mask selects the roll rate alone, the bank angle is followed.
+        ArduPlane has no rate control here: if the mask excludes all but the roll rate, the bank angle is followed.
         """
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)

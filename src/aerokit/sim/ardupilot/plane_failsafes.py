@@ -153,7 +153,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._start_long(_GCS)
 
     def _check_end_of_long(self) -> None:
-        """End the long failsafe once its link has returned: the ground station, or the radio."""
+        """End the long failsafe if the link that caused it (radio or ground station) has returned."""
         parameters = self.vehicle.parameters
         # Like the firmware (system.cpp, check_long_failsafe).
         is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
@@ -170,7 +170,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
-        """Execute FS_LONG_ACTN. Its effect depends on the mode: a piloted mode, RTL, or AUTO and GUIDED."""
+        """Execute FS_LONG_ACTN. The effect of a value differs between piloted modes, RTL, and AUTO or GUIDED."""
         plane = self.vehicle
         # The ground station may hang while its overrides are active, so the firmware gives control to the radio
         # (events.cpp).

@@ -197,7 +197,7 @@ class PlanePilotedMode(PlaneModeBase):
     has_manual_throttle = True
 
     def update(self, dt: float) -> None:
-        """Follow the sticks. A plane on the ground takes off, unless the throttle is low: then it rolls to a stop."""
+        """Follow the sticks. On the ground, the plane rolls to a stop while the throttle is low; else it takes off."""
         plane, wing = self.vehicle, self.vehicle.wing
         limits = wing.wing_limits
         throttle_pulse = plane.rc[RC_THROTTLE]

@@ -138,11 +138,10 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         self._update_link(_GCS, is_lost=self.is_ground_station_lost)
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
-        """Record whether a link is lost, and start or end the common failsafe of both links.
+        """Record whether a link is lost, and start or end the failsafe that both links share.
 
-        As in the firmware (failsafe.cpp, failsafe_trigger), the link that is checked when the timeout ends decides
-        about the status text, and about the parameter that selects the action. A lost link stays lost while its check
-        is disabled.
+        Like the firmware (failsafe.cpp, failsafe_trigger), use the text and the parameter of ``name`` when the timeout
+        ends, even if only the other link is lost. A link whose check is disabled while it is lost stays lost.
         """
         rover = self.vehicle
         was_any_link_lost = bool(self._lost)

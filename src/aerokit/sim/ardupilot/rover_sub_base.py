@@ -95,10 +95,10 @@ class GuidedSetpoints:
             self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
 
     def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
-        """Convert a set-point to a target of GUIDED. ``point`` is its position in the world frame.
+        """Follow a set-point in GUIDED. ``point`` is the position of the set-point in the world frame.
 
-        A set-point with an acceleration, with a position or velocity that is not finite, or that `is_complete` rejects
-        is ignored.
+        A set-point is ignored if it has an acceleration, if its position or velocity is not finite, or if `is_complete`
+        rejects it.
         """
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:

@@ -185,7 +185,7 @@ class _HullLimit:
         self._reported_at = 0.0
 
     def update(self, sub: SubHost, value: float) -> None:
-        """Compare a measured value with its maximum, which must be exceeded for `_HULL_TIMEOUT_S`; warn repeatedly."""
+        """Check a measured value. Warn repeatedly if it has reached or exceeded its maximum for `_HULL_TIMEOUT_S`."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:

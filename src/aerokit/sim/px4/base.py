@@ -279,7 +279,7 @@ class Px4Vehicle(Px4Host):
         self.switch_to(modes.TERMINATION)
 
     def change_mode(self, mode: Px4Mode) -> bool:
-        """Handle a mode request. Return False if the vehicle is armed and the mode, other than LAND, cannot run."""
+        """Handle a mode request. Return False if an armed vehicle cannot run the mode. LAND is never refused."""
         if self.is_armed and mode != modes.LAND and not self.can_run(mode):
             return False
         if mode not in _MODES_ENDED_BY_LANDING:

@@ -268,7 +268,7 @@ class _Flight:
     def _destination(self, command: ReceivedCommand) -> tuple[float, float, float]:
         """Return the position in a command.
 
-        The place stays if latitude or longitude is NaN or INT32_MAX, and the height stays if the altitude is NaN.
+        If latitude or longitude is NaN or INT32_MAX, use the vehicle's place; if the altitude is NaN, use its height.
         """
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
@@ -322,7 +322,7 @@ class _Flight:
         return None
 
     def transition(self, command: ReceivedCommand) -> int | None:
-        """Change to the VTOL state in param 1, after a transition. A vehicle that is no VTOL does not answer."""
+        """Start the transition to the VTOL state in param 1. Send no answer (None) if the vehicle is not a VTOL."""
         px4 = self._px4
         requested_state = to_int(command.param1)
         if not px4.vtol_state:
@@ -433,7 +433,7 @@ class _Requests:
         return MavResult.ACCEPTED
 
     def request_message(self, command: ReceivedCommand) -> int:
-        """Handle REQUEST_MESSAGE. Some messages have a second parameter."""
+        """Handle REQUEST_MESSAGE. Param 2 is the id for MESSAGE_INTERVAL and the mode index for AVAILABLE_MODES."""
         message_id = _number(command.param1)
         if message_id == m.MessageInterval.ID:
             return self._send_interval(_number(command.param2), command)

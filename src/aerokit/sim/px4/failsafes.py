@@ -225,7 +225,7 @@ class Px4Failsafes:
     def _battery_action(self) -> FailsafeAction:
         """Return the action for the state of the battery.
 
-        COM_LOW_BAT_ACT is 0 to warn, 2 to land, and 3 to return (in an emergency, to land).
+        COM_LOW_BAT_ACT selects it: 0 warns, 2 lands, and 3 returns or, if the state is EMERGENCY, lands.
         """
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:

@@ -244,7 +244,10 @@ class Px4Flight:
         return slow + (fast - slow) * share
 
     def _plan_return(self) -> None:
-        """Plan a return at RTL_RETURN_ALT above the landing point or, within RTL_MIN_DIST of it, at RTL_DESCEND_ALT."""
+        """Plan a return to the landing point.
+
+        The minimum height above the point is RTL_RETURN_ALT, or RTL_DESCEND_ALT if the point is within RTL_MIN_DIST.
+        """
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.place

@@ -97,7 +97,10 @@ class Px4Gimbal:
         return (roll, pitch, yaw)
 
     def _angles_to(self, place: tuple[int, int, float]) -> Angles:
-        """Return the angles, yaw from north, to latitude and longitude (degrees times 1e7) and altitude AMSL."""
+        """Return the angles (yaw from north) with which the gimbal points at a place.
+
+        ``place`` contains latitude and longitude (degrees times 1e7) and altitude AMSL.
+        """
         latitude_e7, longitude_e7, altitude_m = place
         motion = self._px4.motion
         place_north, place_east = self._px4.frame.to_local(latitude_e7, longitude_e7)
