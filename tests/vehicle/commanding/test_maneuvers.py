@@ -14,7 +14,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Wire, in_the_air, now, open_flight
+from flight_harness import HeldHeartbeats, Wire, in_the_air, now, open_flight
 
 import aerokit
 from aerokit import messages as m
@@ -25,6 +25,7 @@ from aerokit.errors import (
     InvalidArgument,
     NotSupported,
     OperationRejected,
+    OperationTimeout,
     SetpointStreamStopped,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavSeverity, MavVtolState
@@ -397,6 +398,23 @@ async def test_follow_without_own_altitude_holds() -> None:
             async with flight.vehicle.follow(lambda: here):
                 pass
         assert flight.wire.mode_orders() == [CopterMode.BRAKE]
+
+
+async def test_follow_without_target_holds_after_unreported_go_to() -> None:
+    """HEARTBEAT reports GUIDED only after `follow` has replaced `go_to`."""
+    async with in_the_air() as flight:
+        await flight.vehicle.set_mode("LOITER")
+        heartbeats = HeldHeartbeats(flight.wire)
+        going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=300)))
+        await anyio.sleep(0.3)
+        following = asyncio.ensure_future(flight.vehicle.follow(lambda: None).__aenter__())
+        await anyio.sleep(0.3)
+        heartbeats.stop()
+        with pytest.raises(OperationTimeout, match="no position of the target"):
+            await following
+        with pytest.raises(OperationRejected, match="another order was given"):
+            await going
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "BRAKE", timeout=3.0)
 
 
 async def test_follow_takes_altitude_above_sea_level_of_positions() -> None:

@@ -71,6 +71,8 @@ class CommandArbiter:
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
+        # The last posted order whose effect was not reported when its block was left, and when that was.
+        self._last_posted: tuple[Order, float] | None = None
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
         # Number of `changing_mode` blocks that are open. Then the numbers of two mode changes: of the last one with an
@@ -173,6 +175,7 @@ class CommandArbiter:
         # Infinity makes `current` ignore all orders from before the reboot until the vehicle arms again.
         self._arming_order = None
         self._last_arming_at = math.inf
+        self._arming_accepted_at = -math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
 
@@ -235,6 +238,7 @@ class CommandArbiter:
             yield order
         finally:
             self._posted.remove(order)
+            self._last_posted = (order, self._now()) if order.is_effect_due else self._last_posted
             order.close()
 
     @contextmanager
@@ -263,7 +267,11 @@ class CommandArbiter:
         try:
             yield sent
             # The block has not raised, so the vehicle has accepted the command.
+            order.was_refused = False  # An older command may replace one that the firmware does not support.
             self._record_accepted(armed)
+        except CommandRejected:
+            order.was_refused = True
+            raise
         finally:
             self._sent.remove(sent)
 
@@ -376,7 +384,9 @@ class CommandArbiter:
         """Create an order that also accepts the modes that earlier orders may still lead to."""
         newest, present_mode = self.newest, self._telemetry.mode.latest
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
-        is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
+        is_effect_due = newest is not None and newest.is_effect_due
+        is_in_doubt = self.mode_is_in_doubt or self._now() < self.mode_settles_at
+        is_unsettled = is_under_way or is_effect_due or is_in_doubt
         newest_modes = newest.modes if is_unsettled and newest is not None else ()
         return self._build_order(
             modes,
@@ -414,6 +424,8 @@ class CommandArbiter:
     def _posted_modes(self) -> tuple[Mode, ...]:
         """Return the modes to which posted orders, including superseded ones, may still lead."""
         unconfirmed_orders = [order for order in self._posted if not order.is_confirmed]
+        if self._last_posted is not None and self._now() - self._last_posted[1] < MODE_GRACE_S:
+            unconfirmed_orders.append(self._last_posted[0])
         return tuple(mode for order in unconfirmed_orders for mode in order.modes)
 
     def _is_steering(self) -> bool:

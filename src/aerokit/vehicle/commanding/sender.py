@@ -155,7 +155,11 @@ class OrderSender:
             if was_in_doubt:
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
-            await self.await_mode(mode, order, refusals, remaining_s, reported_since)
+            try:
+                await self.await_mode(mode, order, refusals, remaining_s, reported_since)
+            except CommandRejected:  # PX4 may refuse a mode that it has accepted.
+                order.was_refused = True
+                raise
             # Once the new mode is reported, the modes of earlier orders can no longer follow.
             self._arbiter.mode_settles_at = -math.inf
 
@@ -193,6 +197,7 @@ class OrderSender:
             if not self._arbiter.is_state_recent:
                 raise
             self._session.send(request.legacy(self._session.system_id))
+            order.was_refused = False
 
     async def await_mode(
         self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
