@@ -301,6 +301,22 @@ async def test_pilot_mode_change_after_refused_pause_ends_wait_finished() -> Non
             await mission.wait_finished(timeout=30)
 
 
+async def test_refused_start_of_paused_mission_keeps_wait_finished() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        await mission.pause()
+        waiting = asyncio.ensure_future(mission.wait_finished(timeout=60))
+        flight.copter.faults.refuse(MavCmd.MISSION_START, times=1)
+        with pytest.raises(CommandRejected):
+            await mission.start(1)
+        await anyio.sleep(5.0)
+        await mission.resume()
+        await waiting
+
+
 async def test_pilot_after_resuming_paused_mission_ends_wait_finished() -> None:
     async with armed(open_flight) as flight:
         assert isinstance(flight, Flight)

@@ -295,7 +295,6 @@ class MissionControl(VehiclePlan["Mission"]):
             raise OperationRejected("mission.start: the vehicle is not armed: call arm() first; nothing was sent")
         order = vehicle_context.arbiter.order(mode)
         self._order = order
-        self._is_paused = False
         self._tracker.start()
         try:
             with vehicle_context.flight_cleanup.flying(order):
@@ -305,6 +304,8 @@ class MissionControl(VehiclePlan["Mission"]):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
             raise
+        if self._order is order:  # Otherwise, another task has paused the mission again.
+            self._is_paused = False
 
     async def pause(self) -> None:
         """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
