@@ -189,6 +189,19 @@ def test_accepted_mode_before_heartbeat_is_no_takeover(refused: bool, end: str) 
     assert (order.end, order.may_move) == (end, not refused)
 
 
+def test_late_modes_of_several_replaced_orders_are_no_takeover() -> None:
+    stage = Stage()
+    for mode in (GUIDED, RTL):
+        with stage.arbiter.sending(stage.arbiter.order(mode), modes=(mode,)):
+            pass
+    order = stage.arbiter.order(BRAKE)
+    for mode in (LOITER, GUIDED, RTL):
+        stage.report(mode, after=0.1)
+    assert (order.end, stage.arbiter.mode_is_in_doubt) == ("", True)
+    stage.arbiter.settle_mode()
+    assert not stage.arbiter.mode_is_in_doubt
+
+
 @pytest.mark.parametrize(("after_s", "end"), [(MODE_GRACE_S - 0.1, ""), (MODE_GRACE_S, "the mode changed to GUIDED")])
 def test_accepted_posted_mode_after_its_block_is_no_takeover(after_s: float, end: str) -> None:
     stage = Stage()

@@ -204,7 +204,8 @@ class Order:
         self._ends_on_mode_change = ends_on_mode_change
         self._ends_on_disarm = ends_on_disarm
         self._is_newest = is_newest
-        self._settles_at = settles_at
+        self.settles_at: float = settles_at
+        """Until this time, the modes of earlier orders may be reported in any sequence."""
         self._any_mode_until = any_until
         self._requires_mode_change = requires_mode_change
 
@@ -260,7 +261,7 @@ class Order:
         number = mode.custom_mode
         is_first_report = self._mode_now is None
         is_change = not is_first_report and number != self._mode_now
-        is_settled = reported_at >= self._settles_at
+        is_settled = reported_at >= self.settles_at
         is_expected = number in self._expected_modes and number in self._accepted_modes
         if is_change and (number in self._own_modes or is_expected):  # An effect of this or of an earlier order.
             self.may_move = True

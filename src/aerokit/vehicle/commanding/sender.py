@@ -160,8 +160,7 @@ class OrderSender:
             except CommandRejected:  # PX4 may refuse a mode that it has accepted.
                 order.was_refused = True
                 raise
-            # Once the new mode is reported, the modes of earlier orders can no longer follow.
-            self._arbiter.mode_settles_at = -math.inf
+            self._arbiter.settle_mode()
 
     async def request_mode(
         self,
@@ -280,7 +279,7 @@ class OrderSender:
         """
         impact = self.impact_failure(order)
         grace_until = self._session.connection.now() + MODE_GRACE_S
-        settles_at = self._arbiter.mode_settles_at
+        settles_at = max(order.settles_at, self._arbiter.mode_settles_at)
         was_in_mode = False
 
         def failure_reason() -> str | None:
