@@ -461,6 +461,25 @@ async def test_follow_positions_that_raise_cancellation_stop_it() -> None:
                 await following.fly(10)
 
 
+async def test_follow_closes_positions_after_invalid_one() -> None:
+    ends: list[str] = []
+
+    async def positions(first: aerokit.Position) -> AsyncIterator[Any]:
+        try:
+            yield first
+            await anyio.sleep(1)
+            yield "north"
+        finally:
+            ends.append("closed")
+
+    async with in_the_air() as flight:
+        target = positions(flight.vehicle.position.value)  # a reference, so that it is not collected
+        with pytest.raises(SetpointStreamStopped, match="must be a Position"):
+            async with flight.vehicle.follow(target) as following:
+                await following.fly(5)
+        assert ends == ["closed"]
+
+
 async def test_follow_position_out_of_range_stops_it() -> None:
     async with in_the_air() as flight:
         here = flight.vehicle.position.value
