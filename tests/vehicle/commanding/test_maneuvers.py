@@ -22,6 +22,7 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
+    ConnectionClosed,
     InvalidArgument,
     NotSupported,
     OperationRejected,
@@ -459,6 +460,14 @@ async def test_follow_positions_that_raise_cancellation_stop_it() -> None:
         with pytest.raises(SetpointStreamStopped, match="the reading of the target was cancelled"):
             async with flight.vehicle.follow(positions(place), valid_for_s=5.0) as following:
                 await following.fly(10)
+
+
+async def test_follow_without_target_ends_with_vehicle_block() -> None:
+    async with in_the_air() as flight:
+        entering = asyncio.ensure_future(flight.vehicle.follow(lambda: None, valid_for_s=30.0).__aenter__())
+        await anyio.sleep(0.1)
+    with pytest.raises(ConnectionClosed):
+        await entering
 
 
 async def test_follow_closes_positions_after_invalid_one() -> None:

@@ -285,6 +285,7 @@ class FollowStream(SteeringStream[TargetState]):
         """Wait for a position of the target that is not too old."""
         until = self._now() + self._valid_for_s
         while True:
+            self._session.end.raise_if_ended()
             state = self._tracker.read()
             if state is not None and self._now() - state.reported_at <= self._valid_for_s:
                 return state
