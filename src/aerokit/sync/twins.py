@@ -4645,6 +4645,7 @@ class Vehicle(VehicleTwin):
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
+                A flight by set-points ends after 3.5 s without a heartbeat in any case.
 
         Raises:
             NotSupported: this type of vehicle cannot circle a place. Nothing was sent.
@@ -4697,6 +4698,7 @@ class Vehicle(VehicleTwin):
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
+                A flight by set-points ends after 3.5 s without a heartbeat in any case.
         """
         self._loop.run(
             self.aio.figure_eight,

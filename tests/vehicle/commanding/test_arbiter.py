@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -172,6 +172,42 @@ def test_unreported_ordered_mode_in_doubt_is_no_takeover(in_doubt: bool, end: st
     stage.arbiter.order(GUIDED)
     if in_doubt:
         stage.open.enter_context(stage.arbiter.changing_mode())
+    order = stage.arbiter.order(BRAKE)
+    stage.report(GUIDED)
+    assert order.end == end
+
+
+@pytest.mark.parametrize(("refused", "end"), [(False, ""), (True, "the mode changed to GUIDED")])
+def test_accepted_mode_before_heartbeat_is_no_takeover(refused: bool, end: str) -> None:
+    stage = Stage()
+    first = stage.arbiter.order(GUIDED)
+    with suppress(CommandRejected), stage.arbiter.sending(first, modes=(GUIDED,)):
+        if refused:
+            raise CommandRejected("no", command=192, result=4)
+    order = stage.arbiter.order(BRAKE)
+    stage.report(GUIDED)
+    assert (order.end, order.may_move) == (end, not refused)
+
+
+def test_late_modes_of_several_replaced_orders_are_no_takeover() -> None:
+    stage = Stage()
+    for mode in (GUIDED, RTL):
+        with stage.arbiter.sending(stage.arbiter.order(mode), modes=(mode,)):
+            pass
+    order = stage.arbiter.order(BRAKE)
+    for mode in (LOITER, GUIDED, RTL):
+        stage.report(mode, after=0.1)
+    assert (order.end, stage.arbiter.mode_is_in_doubt) == ("", True)
+    stage.arbiter.settle_mode()
+    assert not stage.arbiter.mode_is_in_doubt
+
+
+@pytest.mark.parametrize(("after_s", "end"), [(MODE_GRACE_S - 0.1, ""), (MODE_GRACE_S, "the mode changed to GUIDED")])
+def test_accepted_posted_mode_after_its_block_is_no_takeover(after_s: float, end: str) -> None:
+    stage = Stage()
+    with stage.arbiter.post(("mode", "motion"), modes=(GUIDED,)) as posted, stage.arbiter.sending(posted):
+        pass
+    stage.now += after_s
     order = stage.arbiter.order(BRAKE)
     stage.report(GUIDED)
     assert order.end == end
@@ -458,6 +494,18 @@ def test_vehicle_armed_by_pilot_is_not_flown_by_program() -> None:
     for _ in range(4):
         stage.report(LOITER, False)  # the pilot disarms at once
     stage.report(LOITER, True)
+    assert not stage.arbiter.is_flown_by_program
+
+
+def test_vehicle_armed_after_reboot_is_not_flown_by_program() -> None:
+    """The link was silent after the reboot, so the first HEARTBEAT reports that the pilot has armed the vehicle."""
+    stage = Stage(armed=False)
+    arm(stage)
+    stage.report(LOITER, True, after=0.8)
+    for cell in (stage.mode, stage.armed, stage.state):
+        cell.forget()
+    stage.arbiter.on_reboot()
+    stage.report(LOITER, True, after=60.0)
     assert not stage.arbiter.is_flown_by_program
 
 

@@ -322,3 +322,14 @@ async def test_cancelled_arm_leaves_vehicle_to_newer_arm(grounded: Flight) -> No
     await anyio.sleep(ARM_WATCH_S)
     assert ordered(grounded) == [1, 1]
     assert grounded.copter.is_armed
+
+
+async def test_abandoned_arming_before_newer_mode_is_undone(grounded: Flight) -> None:
+    await grounded.vehicle.set_mode("GUIDED")
+    grounded.copter.faults.lose_ack(ARM)
+    with anyio.move_on_after(0.0):
+        await grounded.vehicle.arm()
+    await grounded.vehicle.set_mode("LOITER")
+    await anyio.sleep(5.0)
+    assert ordered(grounded) == [1, 0]
+    assert not grounded.copter.is_armed

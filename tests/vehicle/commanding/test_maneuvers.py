@@ -14,7 +14,7 @@ from typing import Any
 
 import anyio
 import pytest
-from flight_harness import Wire, in_the_air, now, open_flight
+from flight_harness import HeldHeartbeats, Wire, in_the_air, now, open_flight
 
 import aerokit
 from aerokit import messages as m
@@ -22,9 +22,11 @@ from aerokit.connection.cells import Source, StateCell
 from aerokit.errors import (
     CommandRejected,
     CommandTimeout,
+    ConnectionClosed,
     InvalidArgument,
     NotSupported,
     OperationRejected,
+    OperationTimeout,
     SetpointStreamStopped,
 )
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult, MavSeverity, MavVtolState
@@ -399,6 +401,23 @@ async def test_follow_without_own_altitude_holds() -> None:
         assert flight.wire.mode_orders() == [CopterMode.BRAKE]
 
 
+async def test_follow_without_target_holds_after_unreported_go_to() -> None:
+    """HEARTBEAT reports GUIDED only after `follow` has replaced `go_to`."""
+    async with in_the_air() as flight:
+        await flight.vehicle.set_mode("LOITER")
+        heartbeats = HeldHeartbeats(flight.wire)
+        going = asyncio.ensure_future(flight.vehicle.go_to(flight.vehicle.position.value.offset(north_m=300)))
+        await anyio.sleep(0.3)
+        following = asyncio.ensure_future(flight.vehicle.follow(lambda: None).__aenter__())
+        await anyio.sleep(0.3)
+        heartbeats.stop()
+        with pytest.raises(OperationTimeout, match="no position of the target"):
+            await following
+        with pytest.raises(OperationRejected, match="another order was given"):
+            await going
+        await flight.vehicle.mode.wait_until(lambda mode: mode.name == "BRAKE", timeout=3.0)
+
+
 async def test_follow_takes_altitude_above_sea_level_of_positions() -> None:
     """The leader's altitude above home refers to the leader's home, which may be lower."""
     async with in_the_air() as flight:
@@ -441,6 +460,33 @@ async def test_follow_positions_that_raise_cancellation_stop_it() -> None:
         with pytest.raises(SetpointStreamStopped, match="the reading of the target was cancelled"):
             async with flight.vehicle.follow(positions(place), valid_for_s=5.0) as following:
                 await following.fly(10)
+
+
+async def test_follow_without_target_ends_with_vehicle_block() -> None:
+    async with in_the_air() as flight:
+        entering = asyncio.ensure_future(flight.vehicle.follow(lambda: None, valid_for_s=30.0).__aenter__())
+        await anyio.sleep(0.1)
+    with pytest.raises(ConnectionClosed):
+        await entering
+
+
+async def test_follow_closes_positions_after_invalid_one() -> None:
+    ends: list[str] = []
+
+    async def positions(first: aerokit.Position) -> AsyncIterator[Any]:
+        try:
+            yield first
+            await anyio.sleep(1)
+            yield "north"
+        finally:
+            ends.append("closed")
+
+    async with in_the_air() as flight:
+        target = positions(flight.vehicle.position.value)  # a reference, so that it is not collected
+        with pytest.raises(SetpointStreamStopped, match="must be a Position"):
+            async with flight.vehicle.follow(target) as following:
+                await following.fly(5)
+        assert ends == ["closed"]
 
 
 async def test_follow_position_out_of_range_stops_it() -> None:

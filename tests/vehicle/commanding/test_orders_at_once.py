@@ -11,7 +11,7 @@ import pytest
 from disturbed_link import Disturbances, DisturbedLink
 
 import aerokit
-from aerokit.errors import AerokitError
+from aerokit.errors import AerokitError, SetpointStreamStopped
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
 from aerokit.mavlink.messages import (
     CommandInt,
@@ -22,6 +22,7 @@ from aerokit.mavlink.messages import (
 )
 from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing.track import true_point
+from aerokit.vehicle.commanding.setpoints import VelocitySetpoint
 
 pytestmark = pytest.mark.anyio
 
@@ -167,3 +168,20 @@ async def test_raw_command_supersedes_action() -> None:
         await anyio.sleep(2.0)
         assert len(_commands(path, MavCmd.DO_REPOSITION)) == 1
         assert _commands(path, MavCmd.DO_SET_MODE) == []
+
+
+async def test_order_right_after_raw_mode_message_changes_mode_again() -> None:
+    """HEARTBEAT reports GUIDED, although the vehicle has already received SET_MODE."""
+    async with _copter(flies=True) as (copter, vehicle, _):
+        vehicle.send(SetMode(copter.system_id, 1, CopterMode.BRAKE))
+        await vehicle.set_heading(90.0)
+        assert true_point(copter).mode == "GUIDED"
+
+
+async def test_stream_replaced_by_newer_order_names_the_order() -> None:
+    async with _copter(flies=True) as (_, vehicle, _path):
+        with pytest.raises(SetpointStreamStopped, match="has stopped: another order was given"):
+            async with vehicle.guided.velocity(rate_hz=2) as stream:
+                await vehicle.set_mode("LOITER")
+                stream.set(VelocitySetpoint())
+                await anyio.sleep(1)

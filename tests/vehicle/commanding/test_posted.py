@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any, cast
@@ -632,3 +633,21 @@ def test_mode_ordered_ten_seconds_ago_is_takeover(waited_s: float, end: str) -> 
     motion = stage.post("motion")
     stage.report(GUIDED)
     assert end_of(motion) == end
+
+
+@pytest.mark.anyio
+async def test_rejected_mode_that_waits_for_heartbeat_ends_with_vehicle_block() -> None:
+    async with open_flight() as flight:
+        vehicle = flight.vehicle
+        flight.copter.faults.refuse(SET_MODE, MavResult.TEMPORARILY_REJECTED)
+
+        async def change_mode() -> None:
+            with vehicle.posted("mode", modes=(GUIDED,)) as posted:
+                await posted.set_mode(GUIDED, timeout=30.0)
+
+        changing = asyncio.ensure_future(change_mode())
+        await anyio.sleep(0.1)
+        flight.copter.faults.heartbeats_stopped = True
+        await anyio.sleep(1.0)
+    with pytest.raises(ConnectionClosed):
+        await changing

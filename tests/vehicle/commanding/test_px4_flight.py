@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import AsyncIterator
 
@@ -253,3 +254,25 @@ async def test_second_ack_of_cancelled_mode_is_not_taken_for_next(
         await vehicle.land(timeout=60.0)
         modes = [command for command in flight.wire.commands(MavCmd.DO_SET_MODE) if isinstance(command, m.CommandLong)]
         assert [int(mode.param3) for mode in modes] == [5, 6, 6]
+
+
+async def test_landing_right_after_accepted_go_to_is_not_taken_over() -> None:
+    """The HEARTBEAT that reports the mode of `go_to` was sent before the vehicle received the order to land."""
+    async with open_px4(latency_s=0.3) as flight:
+        await flight.take_off()
+        await flight.vehicle.set_mode("RTL")
+        await flight.vehicle._session.wait_for_heartbeat()
+        going = asyncio.ensure_future(flight.vehicle.go_to(north_of_home(flight, 50.0)))
+        await anyio.sleep(0.75)
+        assert flight.vehicle.mode_name == "RTL"
+        await flight.vehicle.land(timeout=60.0)
+        with pytest.raises(OperationRejected, match="another order was given"):
+            await going
+
+
+async def test_mode_refused_after_acceptance_is_not_flown_by_program(flying: Px4Flight) -> None:
+    arbiter = flying.vehicle._arbiter
+    arbiter.newest = arbiter._arming_order = None  # as if another party had armed the vehicle
+    with pytest.raises(CommandRejected, match="accepted the command and then refused it"):
+        await flying.vehicle.set_mode("OFFBOARD")
+    assert not flying.vehicle.is_flown_by_program

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import anyio
 import pytest
-from flight_harness import Flight, now, open_flight, open_px4
+from flight_harness import Flight, in_the_air, now, open_flight, open_px4
 
 from aerokit import messages as m
 from aerokit.errors import (
@@ -180,3 +180,12 @@ async def test_refusal_after_acceptance_raises(grounded: Flight, result: MavResu
         tasks.start_soon(answer_again)
         with pytest.raises(OperationRejected, match="the vehicle accepted the command and then refused it"):
             await grounded.vehicle.set_mode("GUIDED")
+
+
+async def test_legacy_mode_counts_as_flown_by_program() -> None:
+    async with in_the_air() as flight:
+        arbiter = flight.vehicle._arbiter
+        arbiter.newest = arbiter._arming_order = None  # as if another party had armed the vehicle
+        flight.copter.faults.refuse(MavCmd.DO_SET_MODE, MavResult.UNSUPPORTED)
+        await flight.vehicle.set_mode("LOITER")
+        assert flight.vehicle.is_flown_by_program

@@ -201,6 +201,34 @@ async def test_without_mission_state_last_item_is_the_end(
         assert all_of(reached)[-1].seq == mission.count.value
 
 
+async def test_without_mission_state_second_flight_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MissionRun, "state", property(lambda _: MissionState.UNKNOWN))
+    async with armed(open_flight) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        await mission.start(1)
+        with flight.vehicle.subscribe(m.MissionItemReached, capacity=9) as reached:
+            await mission.wait_finished(timeout=60)
+        assert [report.seq for report in all_of(reached)] == [2, 3]
+
+
+async def test_px4_completion_reported_during_slow_start_is_ignored() -> None:
+    async with armed(open_px4) as flight:
+        mission = flight.vehicle.mission
+        await mission.start()
+        await mission.wait_finished(timeout=60)
+        flight.px4.faults.ignore(MavCmd.DO_SET_MODE, times=3)
+        starting = asyncio.ensure_future(mission.start(1))
+        with flight.vehicle.subscribe(m.CommandAck) as acks:
+            assert (await acks.get()).command == MavCmd.DO_SET_MODE
+        flight.px4.faults.lose(m.MissionCurrent, times=2)
+        await starting
+        started = now()
+        await mission.wait_finished(timeout=60)
+        assert now() - started > 2
+
+
 async def test_landed_state_from_before_take_off_ends_no_mission() -> None:
     """PX4 reports completion when it begins to return; EXTENDED_SYS_STATE is lost from the arming on."""
     async with armed(open_px4, return_to_launch()) as flight:
@@ -271,6 +299,22 @@ async def test_pilot_mode_change_after_refused_pause_ends_wait_finished() -> Non
         flight.pilot_takes_over(CopterMode.LOITER)
         with pytest.raises(OperationRejected, match="the mode changed to LOITER"):
             await mission.wait_finished(timeout=30)
+
+
+async def test_refused_start_of_paused_mission_keeps_wait_finished() -> None:
+    async with armed(open_flight) as flight:
+        assert isinstance(flight, Flight)
+        mission = flight.vehicle.mission
+        await mission.start()
+        await reaches(flight, 1)
+        await mission.pause()
+        waiting = asyncio.ensure_future(mission.wait_finished(timeout=60))
+        flight.copter.faults.refuse(MavCmd.MISSION_START, times=1)
+        with pytest.raises(CommandRejected):
+            await mission.start(1)
+        await anyio.sleep(5.0)
+        await mission.resume()
+        await waiting
 
 
 async def test_pilot_after_resuming_paused_mission_ends_wait_finished() -> None:

@@ -21,6 +21,7 @@ from aerokit.errors import (
     OperationTimeout,
     VerificationFailed,
 )
+from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import MavMissionResult as Result
 from aerokit.missions import Fence, FenceCircle, Mission, MissionItem
 from aerokit.missions.actions import jump
@@ -165,6 +166,22 @@ async def test_ardupilot_plan_changed_by_another_station() -> None:
         flight.copter.missions.replace(0, long_mission(7).to_items(home_is_item_0=True))
         await mission.upload(changed(long_mission(40), 4))
         assert holds(flight, changed(long_mission(40), 4))
+
+
+async def test_plan_replaced_by_another_station_during_upload_of_changes() -> None:
+    """The other station replaces the plan after the first of two items was sent."""
+    async with open_flight(latency_s=0.05) as flight:
+        mission = flight.vehicle.mission
+        await mission.upload(long_mission(60), method="items")
+
+        def on_ack(_: m.MissionAck) -> None:
+            detach()
+            flight.copter.missions.replace(0, long_mission(60).to_items(home_is_item_0=True))
+            flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(99, 190, Result.ACCEPTED)))
+
+        detach = flight.vehicle.connection.bus.attach(m.MissionAck, on_ack)
+        await mission.upload(changed(long_mission(60), 10, 30), method="items", verify=False)
+        assert holds(flight, changed(long_mission(60), 10, 30))
 
 
 async def test_px4_plan_changed_by_another_station() -> None:

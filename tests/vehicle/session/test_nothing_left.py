@@ -12,13 +12,14 @@ from flight_harness import Flight, attached_sinks, in_the_air, open_flight, wait
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import aerokit
 from aerokit import Position, Vehicle
 from aerokit import messages as m
 from aerokit._internal import geo
 from aerokit.errors import AerokitError
 from aerokit.events import ModeChanged
 from aerokit.mavlink.enums import CopterMode, MavCmd, MavResult
-from aerokit.sim import SimulatedCopter
+from aerokit.sim import SimulatedCopter, simulated_link
 from aerokit.testing.clock import run_virtual
 from aerokit.vehicle.commanding.setpoints import BodyVelocitySetpoint, VelocitySetpoint
 
@@ -242,3 +243,14 @@ async def test_thousand_calls_leak_nothing() -> None:
             attached_sinks(flight.vehicle.connection),
         )
         assert not flight.vehicle._session.commands._pending_acks
+
+
+@pytest.mark.anyio
+async def test_rates_requested_after_vehicle_block_attach_nothing() -> None:
+    async with simulated_link(SimulatedCopter()) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+            pass
+        before = attached_sinks(connection)
+        with vehicle.subscribe(m.ScaledImu2), vehicle.rate(m.RawImu, 3.0):
+            vehicle.message(m.ScaledImu3)
+        assert attached_sinks(connection) == before

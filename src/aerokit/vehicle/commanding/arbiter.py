@@ -71,6 +71,8 @@ class CommandArbiter:
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
+        # Modes of orders that were replaced, or whose block was left, before HEARTBEAT reported them, with that time.
+        self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
         # Number of `changing_mode` blocks that are open. Then the numbers of two mode changes: of the last one with an
@@ -138,6 +140,8 @@ class CommandArbiter:
         if self._posted_modes():  # A posted order may change the mode later than this order does.
             self.doubt_mode()
         was_flown = self.is_flown_by_program
+        if self.newest is not None:
+            self._record_unreported(self.newest)
         order = self._create_order(modes, (STEERING,), ends_flight or self._all_end_flight(modes))
         order.was_flown_before = was_flown
         # If this order replaces an order in progress, the vehicle may already be moving.
@@ -173,6 +177,7 @@ class CommandArbiter:
         # Infinity makes `current` ignore all orders from before the reboot until the vehicle arms again.
         self._arming_order = None
         self._last_arming_at = math.inf
+        self._arming_accepted_at = -math.inf
 
     # ------------------------------------------------------------------ other orders, in blocks
 
@@ -236,6 +241,7 @@ class CommandArbiter:
             yield order
         finally:
             self._posted.remove(order)
+            self._record_unreported(order)
             order.close()
 
     @contextmanager
@@ -264,7 +270,11 @@ class CommandArbiter:
         try:
             yield sent
             # The block has not raised, so the vehicle has accepted the command.
+            order.was_refused = False  # An older command may replace one that the firmware does not support.
             self._record_accepted(armed)
+        except CommandRejected:
+            order.was_refused = True
+            raise
         finally:
             self._sent.remove(sent)
 
@@ -337,7 +347,13 @@ class CommandArbiter:
     @property
     def mode_is_in_doubt(self) -> bool:
         """True while the result of a mode change is unknown, so that the reported mode may still change."""
-        return self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
+        is_in_doubt = self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
+        return is_in_doubt or bool(self._late_modes())
+
+    def settle_mode(self) -> None:
+        """Record that the mode that was ordered last is reported, so that the modes of earlier orders cannot follow."""
+        self.mode_settles_at = -math.inf
+        self._unreported_modes.clear()
 
     @contextmanager
     def changing_mode(self) -> Iterator[None]:
@@ -378,11 +394,12 @@ class CommandArbiter:
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
         newest_modes = newest.modes if is_unsettled and newest is not None else ()
+        late_modes = self._late_modes()
         return self._build_order(
             modes,
             ending_topics,
-            {mode.custom_mode for mode in (*newest_modes, *self._posted_modes())},
-            settles_at=self.mode_settles_at,
+            {mode.custom_mode for mode in (*newest_modes, *late_modes, *self._posted_modes())},
+            settles_at=max(self.mode_settles_at, self._now() + MODE_GRACE_S) if late_modes else self.mode_settles_at,
             any_until=self._any_mode_until,
             ends_flight=ends_flight,
         )
@@ -415,6 +432,19 @@ class CommandArbiter:
         """Return the modes to which posted orders, including superseded ones, may still lead."""
         unconfirmed_orders = [order for order in self._posted if not order.is_confirmed]
         return tuple(mode for order in unconfirmed_orders for mode in order.modes)
+
+    def _record_unreported(self, order: Order) -> None:
+        """Record the modes of an order that is replaced, or whose block is left, if they may be reported later."""
+        now, present_mode = self._now(), self._telemetry.mode.latest
+        is_reported = present_mode is not None and order.is_own(present_mode)
+        is_recent = now - order.given_at < MODE_GRACE_S  # An order with several modes may change the mode once more.
+        if order.is_effect_due and (is_recent or not is_reported):
+            self._unreported_modes.extend((now, mode) for mode in order.modes if mode != present_mode)
+
+    def _late_modes(self) -> tuple[Mode, ...]:
+        """Return the modes of orders that were replaced or left so shortly ago that HEARTBEAT may report them now."""
+        since = self._now() - MODE_GRACE_S
+        return tuple(mode for at, mode in self._unreported_modes if at > since)
 
     def _is_steering(self) -> bool:
         """Return True while the vehicle is in a mode of the newest order and no takeover or failsafe has followed."""

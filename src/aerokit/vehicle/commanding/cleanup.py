@@ -393,16 +393,19 @@ class ArmCleanup:
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
         acknowledgement, the order armed it if HEARTBEAT reported armed at most `ARM_HEARTBEAT_DELAY_S` after the order
-        was given, and the order has not ended. ``mode`` is the mode in which the order was abandoned. An abandoned
-        order does not notice a change of the mode, so it also counts as ended if the vehicle is no longer in ``mode``.
+        was given, and no other party has taken over since. ``mode`` is the mode in which the order was abandoned. An
+        abandoned order does not notice a change of the mode, so a change counts as a takeover, unless a newer order of
+        this program has changed the mode.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
         # While the computer slept, another party had time to arm the vehicle.
         if self._arbiter.slept_since(order.given_at) > 0:
             return False
-        has_ended = bool(order.end) or self._session.telemetry.mode.latest != mode
-        if not has_ended and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
+        mode_now, newest = self._session.telemetry.mode.latest, self._arbiter.newest
+        was_ordered = newest is not None and newest.number > order.number and newest.modes == (mode_now,)
+        was_taken_over = order.takeover_reason or order.failsafe or not (mode_now == mode or was_ordered)
+        if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterable, Callable
+from collections.abc import AsyncGenerator, AsyncIterable, Callable
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -258,8 +258,13 @@ class FollowStream(SteeringStream[TargetState]):
         async def read() -> None:
             with scope:
                 try:
-                    async for position in target:
-                        self._tracker.add(position)
+                    positions = aiter(target)
+                    try:
+                        async for position in positions:
+                            self._tracker.add(position)
+                    finally:
+                        if isinstance(positions, AsyncGenerator):  # An invalid position has stopped the loop.
+                            await positions.aclose()
                     self._end_reason = "the positions of the target ended"
                 except Exception as error:
                     self._end_reason = f"the positions of the target raised {error!r}"
@@ -280,6 +285,7 @@ class FollowStream(SteeringStream[TargetState]):
         """Wait for a position of the target that is not too old."""
         until = self._now() + self._valid_for_s
         while True:
+            self._session.end.raise_if_ended()
             state = self._tracker.read()
             if state is not None and self._now() - state.reported_at <= self._valid_for_s:
                 return state

@@ -74,6 +74,7 @@ class ManeuverActions(VehicleBase):
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
+                A flight by set-points ends after 3.5 s without a heartbeat in any case.
 
         Raises:
             NotSupported: this type of vehicle cannot circle a place. Nothing was sent.
@@ -133,6 +134,7 @@ class ManeuverActions(VehicleBase):
             max_distance_m: a center farther away than this many metres is refused.
             timeout: seconds. None: no limit, as long as heartbeats arrive, the mode stays and the vehicle moves.
             max_silence_s: seconds without a heartbeat after which HeartbeatTimeout is raised; None: no limit.
+                A flight by set-points ends after 3.5 s without a heartbeat in any case.
         """
         from aerokit.vehicle.commanding.closed_paths import Eight, LobeCounter
         from aerokit.vehicle.commanding.rounds import RoundFlight

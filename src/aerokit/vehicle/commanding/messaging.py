@@ -275,7 +275,7 @@ class MessagingActions(VehicleBase):
                 modes = self.autopilot.modes_of_command(message.command, params, names)
             elif message.base_mode & CUSTOM_MODE_ENABLED:
                 modes = (self.autopilot.mode(message.custom_mode, message.base_mode, names),)
-            self._arbiter.raw_order(subjects, modes=modes)
+            self._arbiter.raw_order(subjects, modes=modes).was_sent = True
         elif subjects:  # Any other message is a set-point, which ends posted orders, but not the action in progress.
             self._arbiter.supersede(subjects)
 

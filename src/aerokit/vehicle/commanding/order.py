@@ -204,7 +204,8 @@ class Order:
         self._ends_on_mode_change = ends_on_mode_change
         self._ends_on_disarm = ends_on_disarm
         self._is_newest = is_newest
-        self._settles_at = settles_at
+        self.settles_at: float = settles_at
+        """Until this time, the modes of earlier orders may be reported in any sequence."""
         self._any_mode_until = any_until
         self._requires_mode_change = requires_mode_change
 
@@ -219,6 +220,11 @@ class Order:
         if not self.is_newest:
             return SUPERSEDED
         return self.takeover_reason or ("" if self._ends_flight else self.failsafe)
+
+    @property
+    def is_effect_due(self) -> bool:
+        """True while the vehicle may have accepted the order, although HEARTBEAT does not report the effect yet."""
+        return self.was_sent and not (self.is_confirmed or self.was_refused or self.takeover_reason)
 
     def is_own(self, mode: Mode) -> bool:
         """Return True if this mode may be the effect of the order itself."""
@@ -255,8 +261,10 @@ class Order:
         number = mode.custom_mode
         is_first_report = self._mode_now is None
         is_change = not is_first_report and number != self._mode_now
-        is_settled = reported_at >= self._settles_at
+        is_settled = reported_at >= self.settles_at
         is_expected = number in self._expected_modes and number in self._accepted_modes
+        if is_change and (number in self._own_modes or is_expected):  # An effect of this or of an earlier order.
+            self.may_move = True
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
             # Orders with `requires_mode_change` are posted ones, which are always settled, so their change always gets

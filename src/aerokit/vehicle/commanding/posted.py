@@ -142,6 +142,7 @@ class PostedOrder:
             anyio.move_on_after(timeout),
         ):
             while armed.updated_at <= started_at or not self._arbiter.is_state_recent:
+                self._session.end.raise_if_ended()
                 await changes.next(POLL_INTERVAL_S)
             return not self.end
         return False  # No HEARTBEAT was received in time.

@@ -155,9 +155,12 @@ class OrderSender:
             if was_in_doubt:
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
-            await self.await_mode(mode, order, refusals, remaining_s, reported_since)
-            # Once the new mode is reported, the modes of earlier orders can no longer follow.
-            self._arbiter.mode_settles_at = -math.inf
+            try:
+                await self.await_mode(mode, order, refusals, remaining_s, reported_since)
+            except CommandRejected:  # PX4 may refuse a mode that it has accepted.
+                order.was_refused = True
+                raise
+            self._arbiter.settle_mode()
 
     async def request_mode(
         self,
@@ -193,6 +196,7 @@ class OrderSender:
             if not self._arbiter.is_state_recent:
                 raise
             self._session.send(request.legacy(self._session.system_id))
+            order.was_refused = False
 
     async def await_mode(
         self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
@@ -275,7 +279,7 @@ class OrderSender:
         """
         impact = self.impact_failure(order)
         grace_until = self._session.connection.now() + MODE_GRACE_S
-        settles_at = self._arbiter.mode_settles_at
+        settles_at = max(order.settles_at, self._arbiter.mode_settles_at)
         was_in_mode = False
 
         def failure_reason() -> str | None:

@@ -328,6 +328,8 @@ class SteeringStream(ValueStream[ValueT]):
         self._mode = mode
 
     def _takeover_reason(self) -> str | None:
+        if self._order is not None and not self._order.is_newest:
+            return SUPERSEDED  # The newer order may have changed the mode already.
         mode = self._session.telemetry.mode.latest
         if self._mode is not None and mode is not None and mode != self._mode:
             return f"the vehicle left {self._mode} for {mode}"

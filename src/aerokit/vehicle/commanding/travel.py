@@ -187,6 +187,7 @@ class TravelActions(VehicleBase):
                 **ignored,
             )
             self.connection.send(message)
+            order.was_refused = False
             return message
         return None
 

@@ -181,6 +181,8 @@ class MissionTracker:
         session.add_timeout_hint(self.current, self.count, self.progress)
         # The item that was reached last.
         self.reached: int | None = None
+        # The item that was reached last since the last start of the mission.
+        self._reached_since_start: int | None = None
         # True if the last mission was flown to its end.
         self.is_complete: bool = False
         # Time at which `reached` was reached, and time of the last report that the last item is the current one.
@@ -209,6 +211,11 @@ class MissionTracker:
         return count - 1 if count else None
 
     @property
+    def is_last_item_reached(self) -> bool:
+        """True if the last item was reached since the last start of the mission."""
+        return self.last_item is not None and self._reached_since_start == self.last_item
+
+    @property
     def is_at_last_item(self) -> bool:
         """True while the current item is the last item, and shortly afterwards."""
         return self._session.connection.now() - self._last_item_current_at <= FINAL_ITEM_MAX_AGE_S
@@ -219,14 +226,20 @@ class MissionTracker:
 
     def start(self) -> None:
         """Begin to track a new flight of the mission."""
-        self.is_complete = False
         self._was_active = False
-        self._stale_until = self._session.connection.now() + STALE_STATE_S
+        self._reached_since_start = None
+        self.discard_completion()
+
+    def discard_completion(self) -> None:
+        """Ignore reports of completion, which are about the previous flight, unless the vehicle flies its mission."""
+        if not self._was_active:
+            self.is_complete = False
+            self._stale_until = self._session.connection.now() + STALE_STATE_S
 
     def forget(self) -> None:
         for cell in (self.current, self.count, self.progress):
             cell.forget()
-        self.reached = None
+        self.reached = self._reached_since_start = None
         self.is_complete = False
         self._was_active = False
 
@@ -292,7 +305,7 @@ class MissionTracker:
             is_duplicate = item == self.reached and now - self._reached_at < DUPLICATE_WINDOW_S
         if item < 0 or is_duplicate:
             return
-        self.reached = item
+        self.reached = self._reached_since_start = item
         self._reached_at = now
         self._is_approached_again = False
         self._session.publish(MissionItemReached, item)

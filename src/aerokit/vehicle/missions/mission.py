@@ -107,9 +107,8 @@ class MissionEndDetector:
             return True
         progress = self._tracker.progress.latest
         reports_state = progress is not None and progress.state != MissionState.UNKNOWN
-        last = self._tracker.last_item
         # Without a mission state, the last item that was reached shows the end.
-        return not reports_state and last is not None and self._tracker.reached == last
+        return not reports_state and self._tracker.is_last_item_reached
 
     def _is_completion_final(self) -> bool:
         """Return True if a complete mission needs no further flight: no return, and no landing."""
@@ -299,7 +298,6 @@ class MissionControl(VehiclePlan["Mission"]):
             raise OperationRejected("mission.start: the vehicle is not armed: call arm() first; nothing was sent")
         order = vehicle_context.arbiter.order(mode)
         self._order = order
-        self._is_paused = False
         self._tracker.start()
         try:
             with vehicle_context.flight_cleanup.flying(order):
@@ -309,6 +307,8 @@ class MissionControl(VehiclePlan["Mission"]):
             # The vehicle may have received the order.
             vehicle_context.flight_cleanup.hold_in_background(order)
             raise
+        if self._order is order:  # Otherwise, another task has paused the mission again.
+            self._is_paused = False
 
     async def pause(self) -> None:
         """Hold; returns when HEARTBEAT reports the hold mode. The vehicle keeps its item for :meth:`resume`.
@@ -494,6 +494,10 @@ class MissionControl(VehiclePlan["Mission"]):
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         """Enter the mission mode by MISSION_START, or by a mode change if the vehicle does not support this command."""
+        await self._order_mode(mode, order, timeout)
+        self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
+
+    async def _order_mode(self, mode: Mode, order: Order, timeout: float) -> None:
         vehicle_context, session = self._vehicle_context, self._session
         if not session.autopilot.mission_starts_by_command:
             await vehicle_context.sender.change_mode(mode, order, timeout, reported_since=order.given_at)

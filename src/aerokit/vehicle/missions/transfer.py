@@ -355,8 +355,8 @@ class PlanTransfer(Generic[PlanT]):
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
         """Send only the differences; return True if the vehicle has the plan now.
 
-        Returns False if the vehicle's plan is unknown or differs in too many items, or if the vehicle does not support
-        partial uploads.
+        Returns False if the vehicle's plan is unknown or differs in too many items, if the vehicle does not support
+        partial uploads, or if another station replaces the plan meanwhile.
         """
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
@@ -377,10 +377,13 @@ class PlanTransfer(Generic[PlanT]):
         vehicle_items = list(self._cache.items or ())
         # The vehicle's plan is unknown until all parts are confirmed, because the call may fail or be cancelled.
         self._cache.forget(self._context.now())
+        changes = self._cache.changes
         for part in _consecutive_ranges(changed_seqs):
             if not await self._send_part(items[part.start : part.stop], part.start, verify=verify):
                 return False  # The vehicle does not support partial uploads.
             vehicle_items[part.start : part.stop] = items[part.start : part.stop]
+        if self._cache.changes != changes:  # Another station has replaced the plan meanwhile.
+            return False
         self._cache.set(vehicle_items, self._context.now())
         return True
 

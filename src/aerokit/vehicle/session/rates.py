@@ -138,6 +138,7 @@ class MessageRates:
         self._uses_groups = False
         # Number of calls of `request_again`.
         self._reset_count = 0
+        self._is_closed = False
 
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
         """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
@@ -195,6 +196,7 @@ class MessageRates:
 
     def close(self) -> None:
         """Stop counting messages."""
+        self._is_closed = True
         for stream in self._streams.values():
             if stream.detach is not None:
                 stream.detach()
@@ -204,7 +206,9 @@ class MessageRates:
 
     def _new_stream(self, message_type: type[Message]) -> _Stream:
         stream = _Stream(message_type, self._component_id)
-        stream.detach = self._connection.bus.attach_frames(message_type, stream.on_frame, system_id=self._system_id)
+        if not self._is_closed:
+            attach = self._connection.bus.attach_frames
+            stream.detach = attach(message_type, stream.on_frame, system_id=self._system_id)
         return stream
 
     async def _request_all_due(self) -> None:
