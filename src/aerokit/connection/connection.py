@@ -536,9 +536,9 @@ class Connection:
         """End the connection because of ``error``, which all waiters and later calls raise. Idempotent."""
         if not self.is_open:
             return
-        self._end_signal.error = error  # Set first, so that sinks of the following events find the connection closed.
+        self._end_signal.error = error  # Set first: sinks of the events below must find the connection closed.
         self._receiver.close()
-        self._observers.flush()  # The task that flushes ends, but the program may continue for long.
+        self._observers.flush()  # The task that flushes regularly ends below, and the program may run on for hours.
         # Only a lost link is published as an event: a program that closes the connection itself needs none.
         self._state_watch.mark_lost(self._clock(), publish=isinstance(error, LinkLost))
         self.link_state.close(error)

@@ -322,7 +322,7 @@ class Router(Generic[PortT]):
         return True
 
     def _record_new(self, node: RouterPort[PortT], source: int) -> None:
-        """Reduce the count of a sender's returning frames (`RouterPort.echoes`), because a frame was new."""
+        """Reduce `RouterPort.echoes` of a sender, because a new frame is no echo."""
         count = node.echoes.pop(source, 0) - 1
         if count > 0:
             node.echoes[source] = count

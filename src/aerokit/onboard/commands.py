@@ -157,7 +157,7 @@ class ComponentCommands:
         *,
         is_stop: Callable[[ReceivedCommand], bool] = lambda _: False,
     ) -> None:
-        """Register a handler. If it is running, a command for which ``is_stop`` returns True cancels it first.
+        """Register the handler of a MAV_CMD. If ``is_stop`` returns True for a command, a running handler is cancelled.
 
         Raises:
             InvalidArgument: the command already has a handler, or an annotation of the function is not supported.

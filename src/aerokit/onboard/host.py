@@ -28,7 +28,7 @@ MAX_TEXT_SIZE = 254
 MAX_COMMAND_AGE_S = 5.0
 """Maximum age in seconds of a command that is executed. Senders give up earlier."""
 _COMMAND_MESSAGE_IDS = (m.CommandLong.ID, m.CommandInt.ID)
-# Messages that change something, like commands, and are not executed late either.
+# Commands and other messages that change something. If they are older than `MAX_COMMAND_AGE_S`, they are ignored.
 _ORDER_MESSAGE_IDS = frozenset(
     message_type.ID
     for message_type in (

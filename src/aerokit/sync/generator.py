@@ -189,7 +189,7 @@ class Page:
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
         """Add imports of the names in an expression, for type checkers only unless ``at_run_time`` is True.
 
-        A name is imported from where one of ``modules`` imports it; if none does, from the first of them.
+        If one of ``modules`` imports a name itself, its import is copied. Others come from the first module.
         """
         if node is None:
             return

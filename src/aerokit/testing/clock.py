@@ -177,7 +177,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return has_run
 
     def _schedule_sources_before_timer(self) -> None:
-        """If a timer is due, schedule the event sources of the same instant, so that they run before the timer."""
+        """If a timer is due, schedule the event sources that are due at the same time, so that they run before it."""
         timers = self._scheduled  # type: ignore[attr-defined]
         end = self._now + self._clock_resolution
         if timers and timers[0]._when < end:

@@ -299,7 +299,7 @@ class FaultyLink(Link):
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
             return
         now = asyncio.get_running_loop().time()
-        if stalled_at is None:
+        if stalled_at is None:  # The stall begins.
             self._stalled_at = now
             self._incoming_path.link_stalled(self.unsent_bytes)
         else:

@@ -33,9 +33,10 @@ def is_address(word: str) -> bool:
 
 
 def misplaced_file(word: str) -> str | None:
-    """Return an error text if a word, given as an address, is a file; otherwise None. Recordings are valid addresses.
+    """Return an error text if the user gave a file name instead of an address; otherwise None.
 
-    A word with a known suffix, such as .plan, need not exist as a file. The text then has the right command.
+    A recording (.tlog) is a valid address. A name with a known suffix, such as .plan, counts as a file even if no such
+    file exists. Its error text has the command that takes such files.
     """
     path = Path(word)
     suffix = path.suffix.lower()

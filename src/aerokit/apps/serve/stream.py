@@ -115,7 +115,7 @@ class StateStream:
         loop = asyncio.get_running_loop()
         queue: deque[dict[str, Any]] = deque()
         changed = asyncio.Event()
-        missed = 0  # number of messages that were dropped since the last one from the queue was sent
+        missed = 0  # number of messages dropped since a queued message was last sent
 
         def enqueue(message: dict[str, Any]) -> None:
             nonlocal missed

@@ -220,8 +220,8 @@ def drawn_track(
 ) -> tuple[list[int], float]:
     """Choose the places of a track that are drawn. Places in ``keep`` are always drawn.
 
-    Return the indices of these places, and the largest distance of any place from the drawn line. If no place is known,
-    nothing is drawn.
+    Return the indices of these places, and the largest distance of any place from the drawn line. If all places are
+    NaN, nothing is drawn.
     """
     if len(places) <= MAX_POINTS:  # short lines are drawn completely
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)

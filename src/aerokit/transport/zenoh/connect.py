@@ -196,7 +196,7 @@ class ZenohConnect(NetworkLink):
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
         """Report that the vehicle side has refused messages of this client."""
         notice = RefusalNotice.decode(data)
-        # A notice with another nonce is for a program that uses the same client name.
+        # The nonce tells programs with the same client name apart. A notice without a nonce is for all of them.
         if notice is None or notice.nonce not in (None, self._nonce):
             return
         self._drop(notice.count)

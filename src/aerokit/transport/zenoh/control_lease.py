@@ -72,7 +72,7 @@ _TEXT_PREFIX = "network: "
 
 _MAX_TEXT_LENGTH = 50  # length of the text in STATUSTEXT
 
-_MAX_NOTICES = 64  # maximum number of message names whose last notice is remembered
+_MAX_NOTICES = 64  # The last notice is remembered for each message name, for at most this many names.
 
 _READ_IDS = frozenset(message_id for message_id, (class_name, *_) in INDEX.items() if class_name in READ_MESSAGES)
 

@@ -52,7 +52,7 @@ class UlogAssembler:
         """Time of the last message that was used."""
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
-        """Add a message of the stream; return the next data of the file, up to the last complete ULog message."""
+        """Add a message of the stream; return the bytes to append to the file. Incomplete messages are kept."""
         gap = 0 if self._next_sequence is None else (message.sequence - self._next_sequence) % SEQUENCE_RANGE
         if gap >= SEQUENCE_RANGE // 2:  # PX4 repeats a message if our acknowledgement was lost.
             return b""

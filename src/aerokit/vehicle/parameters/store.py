@@ -77,7 +77,7 @@ class ParameterStore:
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
     def unmark_replaced(self, name: str) -> None:
-        """Stop ignoring messages with the replaced value, because a new write may set this value again."""
+        """Accept messages with the old value given to `mark_replaced` again, because a new write may set this value."""
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
