@@ -103,6 +103,6 @@ async def test_stagger_with_corridors_is_refused() -> None:
 async def test_corridors_at_another_speed_are_refused() -> None:
     async with open_stage(3, spacing_m=30) as stage:
         targets = await crossing_targets(stage)
-        with pytest.raises(InvalidArgument, match="these corridors are for 5 m/s; nothing was sent"):
+        with pytest.raises(InvalidArgument, match="planned for 5 m/s; nothing was sent"):
             await stage.fleet.go_to(targets, separation=plan_corridors(stage, targets), speed_m_s=1.5)
         assert not any(map(stage.orders_to, stage.copters))

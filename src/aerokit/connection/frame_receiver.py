@@ -155,7 +155,7 @@ class FrameReceiver:
         self.observers: FrameObservers = FrameObservers(self._on_observers_changed)
         self._loop_watch = LoopWatch(self._on_blocked, self._on_slept, on_caught_up=self._on_caught_up)
         self._is_closed = False  # True once the connection has ended; frames are then dropped
-        bus.one_at_a_time = multilink is not None
+        bus.one_at_a_time = multilink is not None  # Frames of several links are checked one by one.
         gate.on_change = self._update_checks
         bus.require_frames(Heartbeat)  # Routes, and the diagnosis of failed connections, need all heartbeats.
 

@@ -180,7 +180,7 @@ class Travel(SelectionBase):
                 raise InvalidArgument(f"{action}: stagger_s would change the delays of corridors; nothing was sent")
             if speed_m_s != separation.speed_m_s:
                 raise InvalidArgument(
-                    f"{action}: speed_m_s = {speed_m_s} is not allowed: the delays of these corridors are for"
+                    f"{action}: speed_m_s = {speed_m_s} is not allowed: the separation by time was planned for"
                     f" {separation.speed_m_s} m/s; nothing was sent"
                 )
             return await self._fly_to(
@@ -482,7 +482,7 @@ class Missions(SelectionBase):
         return deconfliction
 
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
-        """Return the members with these names; raise if a name is unknown or a member is unavailable."""
+        """Return the members that get missions, by name; raise if a name is unknown or a member is unavailable."""
         members: dict[str, Member] = {}
         for name in missions:
             if name not in self.members:

@@ -213,7 +213,7 @@ class Message:
     Messages are equal if their classes and fields are; NaN equals NaN.
     """
 
-    if not TYPE_CHECKING:  # Type checkers take a slot for a class attribute of the same name.
+    if not TYPE_CHECKING:  # Type checkers would mistake the slot for a class attribute of this name.
         __slots__ = ("received_frame",)
         __match_args__ = ()  # The field names, for `match`. Each message class overrides this; type checkers infer it.
     __hash__: ClassVar[None]  # type: ignore[assignment]

@@ -90,7 +90,9 @@ def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
     arguments = []
     for number, parameter in enumerate(parameters[1:], start=1):
         if parameter.kind not in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD):
-            raise InvalidArgument(f"{name}(): argument {parameter.name} must be a positional argument")
+            raise InvalidArgument(
+                f"{name}(): declare {parameter.name} as a positional argument, because the values are passed in order"
+            )
         arguments.append(_argument(name, parameter.name, number, _hint(function, parameter)))
     return tuple(arguments)
 

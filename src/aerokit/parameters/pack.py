@@ -89,7 +89,9 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
     """
     magic, count, total = read_header(data)  # `total` also counts the parameters before `start`.
     if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
-        raise RemoteProtocolError(f"the file is not a param.pck: its header is {magic:#06x}, {count} of {total}")
+        raise RemoteProtocolError(
+            f"the file is not a param.pck: its header has {magic:#06x}, and {count} of {total} parameters"
+        )
     parameters = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
     if len(parameters) != count:
         raise RemoteProtocolError(f"param.pck has {len(parameters)} parameters, but its header says {count}")

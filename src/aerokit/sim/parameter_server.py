@@ -22,10 +22,15 @@ class ParameterServer(servers.ParameterProtocolServer):
     """Base of the parameter servers, which answer parameter requests. The `Faults` of the vehicle apply."""
 
     def __init__(
-        self, vehicle: SimulatedVehicle, parameters: SimParameters, *, list_rate_hz: float = 1000.0, errors: bool = True
+        self,
+        vehicle: SimulatedVehicle,
+        parameters: SimParameters,
+        *,
+        list_rate_hz: float = 1000.0,
+        sends_errors: bool = True,
     ) -> None:
         super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz)
-        self.errors = errors
+        self.sends_errors = sends_errors
         self._vehicle = vehicle
         self._parameters = parameters
 
@@ -52,9 +57,10 @@ _ROUNDING_OFFSET = 0.01
 class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
-    With ``errors``, as in the released version of 4.7, a request with an unknown name or a value of NaN or infinity is
-    answered by PARAM_ERROR, and PARAM_SET is confirmed on the sender's port in addition to the broadcast. Without
-    ``errors``, as in the development version of 4.7, such a request has no answer, and PARAM_SET only the broadcast.
+    With ``sends_errors``, as in the released version of 4.7, a request with an unknown name or a value of NaN or
+    infinity is answered by PARAM_ERROR, and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
+    Without ``sends_errors``, as in the development version of 4.7, such a request has no answer, and PARAM_SET only the
+    broadcast.
 
     One read request is served each millisecond. Up to 20 requests wait in a queue, and further requests are lost.
     The banner texts are sent before a list.
@@ -66,10 +72,10 @@ class ArduPilotParameterServer(ParameterServer):
         parameters: SimParameters,
         *,
         list_rate_hz: float = 2000.0,
-        errors: bool = False,
+        sends_errors: bool = False,
         send_banner: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz, errors=errors)
+        super().__init__(vehicle, parameters, list_rate_hz=list_rate_hz, sends_errors=sends_errors)
         self._send_banner = send_banner
         self._reads: deque[tuple[ParamRequestRead, Channel]] = deque()  # read requests that wait for their answer
         self._is_reading = False  # True while a call of `_read_next` is pending
@@ -104,7 +110,7 @@ class ArduPilotParameterServer(ParameterServer):
             name = names[index] if 0 <= index < len(names) else ""
         if name in self._parameters:
             self.send(name, index & 0xFFFF, channel)  # In a read by name, the index is -1, which becomes 65535.
-        elif self.errors:
+        elif self.sends_errors:
             self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
@@ -121,14 +127,14 @@ class ArduPilotParameterServer(ParameterServer):
         else:
             value = self.clamped(name, request.param_value)
             self._parameters[name] = rounded(value, self._parameters.type(name))
-            # The released firmware, which `errors` selects, confirms the value on the sender's port before the
+            # The released firmware, which `sends_errors` selects, confirms the value on the sender's port before the
             # broadcast.
-            if self.errors:
+            if self.sends_errors:
                 self.send(name, UNKNOWN_INDEX, channel)
             self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
 
     def _refuse(self, request: ParamSet, code: int, channel: Channel) -> None:
-        if self.errors:
+        if self.sends_errors:
             self.send_error(sender_of(request), request.param_id, -1, code, channel)
 
 
@@ -146,7 +152,7 @@ _UNUSED_INDEX = 24400
 
 
 class Px4ParameterServer(ParameterServer):
-    """Parameter protocol of PX4. With ``errors``, PARAM_ERROR is sent, as in PX4's main branch, but not in v1.16.
+    """Parameter protocol of PX4. With ``sends_errors``, it sends PARAM_ERROR, as PX4's main branch, but not v1.16.
 
     Values are stored without a check. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly
     after. Setting _HASH_CHECK stops a running list. A second list request restarts the list, without the hash.
@@ -218,5 +224,5 @@ class Px4ParameterServer(ParameterServer):
         return None if type_ == self._parameters.type(name) else MavParamError.TYPE_MISMATCH
 
     def _refuse(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
-        if self.errors:
+        if self.sends_errors:
             self.send_error(to, name, index, code, channel)

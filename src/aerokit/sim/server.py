@@ -296,7 +296,11 @@ class _Port:
                 channel.reader = self.reader
 
     def take_datagrams(self, *, together: bool) -> list[bytes]:
-        """Return the datagrams to send. With ``together``, more than ten vehicles share them, as behind a router."""
+        """Return the datagrams to send.
+
+        With ``together``, a datagram may have messages of several vehicles if there are more than ten, as behind a
+        router.
+        """
         active = [channel for channel in self.channels if channel.has_output]
         if not active:
             return []

@@ -167,9 +167,9 @@ class PlanFlight(SupervisedFlight):
             group.cancel_scope.cancel()
 
     async def _explain_wait(self, mode: str) -> None:
-        """Print what the program waits for before it fails because of a change to ``mode``.
+        """Print that a change to ``mode`` ends the flight soon, unless the vehicle reports the end of the mission.
 
-        Sleeps first. If the vehicle reports meanwhile that the mission has ended, nothing is printed.
+        Nothing is printed if it reports the end within the first quarter of this time.
         """
         delay_s = END_GRACE_S / 4
         await anyio.sleep(delay_s)

@@ -89,7 +89,7 @@ class LinkCounter:
         missing = (sequence - expected) & 0xFF if expected >= 0 else 0
         if missing > _MAX_SEQUENCE_GAP:  # not a loss, but a late frame or a frame of another link
             missing = 0
-        if time_s >= self._second + 1:  # the last frame is the first frame of a new second
+        if time_s >= self._second + 1:  # this frame is the first one of a new second
             self._received += received - 1
             received = 1
             if int(time_s) - self._second > 1:  # _add_row() records the seconds without frames as 100 % loss

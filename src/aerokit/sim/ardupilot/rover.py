@@ -150,7 +150,7 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self._lost_since = rover.now
         if self._triggered and not self._lost:
             self.warn(f"{name} Failsafe Cleared", MavSeverity.INFO)
-        self._triggered &= self._lost  # Remove the links that have returned, because their failsafe has ended.
+        self._triggered &= self._lost  # Links that have returned can trigger again.
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return

@@ -56,7 +56,7 @@ class ArduPilotStorage:
         self.files.mounts["@MISSION"] = MissionMount(vehicle.missions)
         banner = vehicle.send_banner
         self.parameters: ArduPilotParameterServer = ArduPilotParameterServer(
-            vehicle, vehicle.parameters, errors=parameter_errors, send_banner=banner
+            vehicle, vehicle.parameters, sends_errors=parameter_errors, send_banner=banner
         )
         self.ftp: ArduPilotFtp = ArduPilotFtp(vehicle, self.files, send_banner=banner)
         self.logs: ArduPilotLogServer = ArduPilotLogServer(

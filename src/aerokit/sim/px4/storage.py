@@ -163,7 +163,7 @@ class Px4Storage:
         if parameter_file:
             self.files.mounts["@PARAM"] = Px4ParameterMount(px4.parameters, self._apply)
         sends_param_error = not px4.version.startswith("1.16")
-        self.parameters: Px4ParameterServer = Px4ParameterServer(px4, px4.parameters, errors=sends_param_error)
+        self.parameters: Px4ParameterServer = Px4ParameterServer(px4, px4.parameters, sends_errors=sends_param_error)
         self.ftp: Px4Ftp = Px4Ftp(px4, self.files)
         self.logs: Px4LogServer = Px4LogServer(
             px4,

@@ -299,7 +299,8 @@ class FreshnessChecker:
         self.duplicates: int = 0
         """Datagrams refused because the same or a later datagram of the client was already received."""
         self._number = 0  # number of the last beacon
-        self._sent: deque[tuple[int, float]] = deque()  # (number, send time) of the beacons that stamps may refer to
+        # Number and send time of the beacons that datagrams may name in their stamps.
+        self._sent: deque[tuple[int, float]] = deque()
         self._sequences: OrderedDict[tuple[str, int], int] = OrderedDict()  # (client, nonce) → last sequence number
 
     def make_beacon(self, now: float, lease_holder: str | None = None) -> Beacon:

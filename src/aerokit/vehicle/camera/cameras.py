@@ -73,7 +73,7 @@ class Camera(ReadOnly, VideoMixin, LensMixin, TrackingMixin, StorageMixin):
         information: CameraInformation | None = None
         with anyio.move_on_after(timeout) as scope:
             information = await self._link.identify()
-        if information is None:  # If no time-out has expired, the autopilot has sent no information about its camera.
+        if information is None:  # Without a time-out, this is the answer of an autopilot that has no information.
             limit = f" within {timeout:g} s" if scope.cancelled_caught else ""
             raise self._link.timeout_error(f"did not identify itself{limit}")
         return information

@@ -133,7 +133,7 @@ class PostedOrder:
     async def _is_valid_at_next_heartbeat(self, timeout: float) -> bool:
         """Pause for `MODE_RETRY_INTERVAL_S`, then wait for a HEARTBEAT from after this call.
 
-        Return True if the order is still valid then; False if it is not, or after ``timeout`` seconds without one.
+        Return False if the order has ended by then, or if no HEARTBEAT arrives within ``timeout`` seconds.
         """
         started_at, armed = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(MODE_RETRY_INTERVAL_S)
