@@ -226,7 +226,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION after a new breach. Far beyond the limit, all except "report only" become HOLD."""
+        """Execute FENCE_ACTION after a new breach. Far beyond the limit, hold instead, unless it only reports."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if action == REPORT_ONLY:
