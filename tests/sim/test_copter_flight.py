@@ -294,6 +294,22 @@ def test_condition_yaw_direction_can_turn_long_way() -> None:
     assert math.degrees(copter.motion.yaw) == pytest.approx(90, abs=1)
 
 
+@pytest.mark.parametrize("direction", [-1, 0, 1])
+def test_condition_yaw_rate_applies_until_the_heading(direction: int) -> None:
+    copter, client = flying_copter(heading_deg=0.0)
+    client.command(MavCmd.CONDITION_YAW, 120, 20, direction, 0)
+    client.run(3.0 if direction >= 0 else 9.0)  # After 9 s, the shorter way remains of the longer way.
+    assert abs(math.degrees(copter.motion.yaw_rate)) == pytest.approx(20, abs=0.1)
+
+
+@pytest.mark.parametrize("rate", [-20, 0, math.nan])
+def test_condition_yaw_without_positive_rate_uses_default(rate: float) -> None:
+    copter, client = flying_copter(heading_deg=0.0)
+    client.command(MavCmd.CONDITION_YAW, 120, rate, -1, 0)
+    client.run(1.0)
+    assert math.degrees(copter.motion.yaw_rate) == pytest.approx(-60, abs=0.1)
+
+
 def test_relative_turn_over_180_degrees_keeps_direction() -> None:
     copter, client = flying_copter(heading_deg=0.0)
     client.command(MavCmd.CONDITION_YAW, 270, 30, 1, 1)

@@ -192,6 +192,7 @@ class Motion:
         self._target_lean: tuple[float, float] | None = None
         self._wanted_yaw: float | None = None  # None while the vehicle turns with `_wanted_yaw_rate`
         self._wanted_yaw_rate = 0.0
+        self._max_yaw_rate = math.inf  # limit of the rate towards `_wanted_yaw`
 
     @property
     def place(self) -> Ned:
@@ -232,9 +233,10 @@ class Motion:
         velocity_down = math.copysign(vertical, offset_down)
         self.seek_velocity(offset_north * speed_per_metre, offset_east * speed_per_metre, velocity_down)
 
-    def face(self, yaw: float) -> None:
-        """Turn to this heading (rad)."""
+    def face(self, yaw: float, max_rate: float = math.inf) -> None:
+        """Turn to this heading (rad), at no more than ``max_rate`` (rad/s)."""
         self._wanted_yaw = yaw
+        self._max_yaw_rate = max_rate
 
     def turn(self, rate: float) -> None:
         """Turn at this rate (rad/s)."""
@@ -384,7 +386,7 @@ class Motion:
         if powered and not self.is_on_ground:
             rate = self._wanted_yaw_rate
             if self._wanted_yaw is not None:  # A heading replaces the turn rate.
-                rate = _TURN_GAIN_PER_S * wrap_pi(self._wanted_yaw - self.yaw)
+                rate = _clamp(_TURN_GAIN_PER_S * wrap_pi(self._wanted_yaw - self.yaw), self._max_yaw_rate)
             rate = _clamp(rate, self.limits.turn_rate_rad_s)
         self.yaw_rate = rate
         if rate != 0.0:

@@ -319,7 +319,7 @@ class SimulatedVehicle:
                         self.send(message, channel)
 
     def _skip_to(self, now: float) -> None:
-        """Advance the time and delay all events by the same time, as in a program that has hung."""
+        """Set the time to ``now``. All events are delayed by the skipped time, as in a program that has hung."""
         delay = now - self.now
         if delay <= 0:
             return

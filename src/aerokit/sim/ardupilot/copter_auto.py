@@ -239,9 +239,9 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Enter AUTO, which requires a mission, unless ``force`` is set.
+        """Enter AUTO and return True. Without a mission, return False unless ``force`` is set.
 
-        While armed on the ground, even with ``force``, the mission must begin with a take-off.
+        Even with ``force``, an armed copter on the ground needs a mission that begins with a take-off.
         """
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
@@ -376,7 +376,7 @@ class CopterAuto(MissionMode):
         return False
 
     def _place(self, item: MissionItem) -> Ned:
-        """Return the place of an item. Zero latitude and longitude, or a zero altitude, keep the current values."""
+        """Return the place of an item. Latitude and longitude 0 mean the present point, z 0 the present height."""
         current: Ned = self.vehicle.motion.place
         if isinstance(self._leg, _FlyLeg) and self._leg.is_complete:
             current = self._leg.destination  # more exact than the copter's position, which differs a little

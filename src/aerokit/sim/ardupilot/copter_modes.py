@@ -27,6 +27,7 @@ class AutoYaw:
         self._heading = 0.0
         self._rate = 0.0
         """Turn rate (radians per second): set by `turn`, and by `turn_to` for a turn by the longer way; otherwise 0."""
+        self._max_rate = math.inf  # limit of the turn rate to `_heading`
 
     def hold(self) -> None:
         self._control = self._hold
@@ -46,18 +47,18 @@ class AutoYaw:
     def turn_to(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
         """Turn to a heading in radians. Positive ``direction``: clockwise; negative: anticlockwise; 0: the shorter way.
 
-        ``rate`` (radians per second; 0: the default rate) applies only to a turn by the longer way. A turn by the
-        shorter way has the default rate.
+        ``rate`` is the turn rate in radians per second. If it is not positive, the vehicle turns at its default rate.
         """
         motion = self._copter.motion
         self._heading = wrap_pi(heading)
         self._control = self._go_to_heading
         self._rate = 0.0
+        self._max_rate = rate if rate > 0 else motion.limits.turn_rate_rad_s  # also for NaN (autoyaw.cpp)
         offset = wrap_pi(self._heading - motion.yaw)
         is_longer_way = offset * direction < 0
         # `Motion.face` always turns the shorter way. `_go_to_heading` uses `_rate` to turn the longer way.
         if is_longer_way and abs(offset) > _HEADING_TOLERANCE_RAD:
-            self._rate = math.copysign(rate or motion.limits.turn_rate_rad_s, direction)
+            self._rate = math.copysign(self._max_rate, direction)
 
     def turn_to_last_heading(self, tolerance: float) -> bool:
         """Turn to the heading that `turn_to` set last. Return True once within ``tolerance`` radians of it."""
@@ -111,7 +112,7 @@ class AutoYaw:
             motion.turn(self._rate)  # The commanded direction is still the longer way to the heading.
             return
         self._rate = 0.0
-        motion.face(self._heading)
+        motion.face(self._heading, self._max_rate)
 
     def _look_at_roi(self) -> None:
         assert self._roi is not None

@@ -209,7 +209,7 @@ class ArduPilotArming(Generic[HostT]):
         return [*self.common_reasons(), *self.own_reasons()]
 
     def common_reasons(self) -> list[str]:
-        """Return the failures of the checks that all firmwares have, in the order of the firmware."""
+        """Return the texts of the failing checks that all vehicle types share, in ArduPilot's order."""
         vehicle, check = self.vehicle, ArmingCheck
         reasons = list(vehicle.faults.prearm_failures)
         if vehicle.calibrations.is_compass_running:

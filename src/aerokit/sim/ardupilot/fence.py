@@ -280,7 +280,7 @@ class ArduPilotFence(Generic[HostT]):
     def _update_breach(self, kind: int, beyond_m: float) -> bool:
         """Record whether a limit is breached. Return True for a new breach.
 
-        A breach of a circle or an altitude limit that has grown by the backup distance counts as new.
+        At a circle or an altitude limit, a breach is new again when the vehicle is the backup distance farther outside.
         """
         is_on_border_of_polygon = kind == _POLYGON and beyond_m == 0.0  # The border is still allowed.
         if beyond_m < 0.0 or is_on_border_of_polygon:

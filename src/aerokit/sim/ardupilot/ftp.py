@@ -165,7 +165,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._terminate(peer, request)
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Open a file. Refused while another file is open. To read a file, an idle session is closed first."""
+        """Open a file. To read a file, first close an idle session. Refuse if a session is still open."""
         is_reading = request.opcode == Op.OPENFILERO
         is_idle = self._host.now - self._sent_at > _SESSION_TIMEOUT_S
         if is_reading and is_idle:  # The client may have missed the reply to its previous request to open a file.

@@ -168,7 +168,7 @@ class ArduPilotGimbal:
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn at these rates in degrees per second, starting at the current direction."""
+        """Turn at these rates in degrees per second. With ``from_north``, yaw does not follow the vehicle."""
         current = self.target
         current_yaw = self._from_nose(current)
         if from_north and current.is_from_north:

@@ -71,10 +71,10 @@ class ArduPilotMissionServer(MissionServer):
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store a list of items, as the upload of a file does, and return the MAV_MISSION_RESULT.
+        """Store a list of items that was uploaded as a file, and return the MAV_MISSION_RESULT.
 
-        ``start`` is the index in the mission at which the first item is stored; other lists are replaced as a whole.
-        Without ``clear``, a mission keeps its other items; for other lists, the result is ERROR.
+        A mission is stored from index ``start`` on. Without ``clear``, its other items are kept. A fence and rally
+        points are always replaced as a whole: ``start`` is ignored, and without ``clear`` the result is ERROR.
         """
         if mission_type == MavMissionType.MISSION:
             if clear:  # Like the firmware, continue with a running mission, which cannot be cleared.

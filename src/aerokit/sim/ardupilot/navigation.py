@@ -221,7 +221,7 @@ class ArduPilotNavigation:
                 self._use_gps_when_possible()
 
     def _follow_gps_loss(self) -> None:
-        """Report no fix at once, and no position after 7 s. After 15 s, GPS stops aiding the estimator."""
+        """Set the fix type to NO_FIX. After 7 s, the position is lost; after 15 s, GPS stops aiding the estimator."""
         if math.isnan(self._gps_lost_at):
             self._gps_lost_at = self._vehicle.now
             self.fix_type = GpsFixType.NO_FIX
@@ -327,7 +327,7 @@ class SmartPath:
         self._cleaned_count = len(self._points)
 
     def update(self) -> None:
-        """Start the path or add the current position to it. Deactivate the path after 15 s in which this fails."""
+        """Start the path, or add the current position. After 15 s without a position or space, deactivate the path."""
         vehicle = self._vehicle
         if not self.is_active:
             if not self._is_started and vehicle.navigation.has_position:

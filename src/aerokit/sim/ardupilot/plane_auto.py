@@ -412,7 +412,7 @@ def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCom
 
 
 def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Fly a course of param 2 degrees. Param 1 is a HEADING_TYPE. Heading and course have the same effect."""
+    """Fly a course of param 2 degrees. The HEADING_TYPE (param 1) HEADING is treated like COURSE_OVER_GROUND."""
     if not 0.0 <= command.param2 < 360.0:
         return MavResult.DENIED
     if command.param1 == HeadingType.DEFAULT:

@@ -14,7 +14,7 @@ from aerokit.sim.ardupilot.plane_modes import PlaneHost
 from aerokit.sim.motion import Ned
 
 _NONE, _SHORT, _LONG, _GCS = range(4)
-# The throttle failsafe starts after `_RADIO_TIMEOUT_S` without pulses, or after the throttle was low for `_MIN_BAD_S`.
+# The radio is bad after `_RADIO_TIMEOUT_S` without pulses, or at a low throttle. `_MIN_BAD_S` later, it counts as lost.
 _RADIO_TIMEOUT_S, _MIN_BAD_S = 1.0, 0.2
 # Values of FS_SHORT_ACTN, FS_LONG_ACTN and FS_GCS_ENABL, and of the battery actions.
 _SHORT_BEST_GUESS, _SHORT_FBWA, _SHORT_DISABLED, _SHORT_FBWB = 0, 2, 3, 4
@@ -80,7 +80,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         return is_throttle_low or plane.now - self.radio_received_at > _RADIO_TIMEOUT_S
 
     def _check_radio(self) -> None:
-        """Detect the loss of the radio, which must last for a while."""
+        """Detect the loss of the radio: no pulses for 1 s, or a low throttle, and this for a further 0.2 s."""
         plane = self.vehicle
         if plane.rc.is_receiving:
             self.radio_received_at: float = plane.now

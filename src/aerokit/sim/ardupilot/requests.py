@@ -106,7 +106,7 @@ class ArduPilotMessageRequests:
         return MavResult.ACCEPTED if is_supported else MavResult.FAILED
 
     def request_message(self, command: ReceivedCommand) -> int:
-        """Send a message once, after the acknowledgement; MESSAGE_INTERVAL is sent before it."""
+        """Send a message once, after the acknowledgement. Only MESSAGE_INTERVAL is sent before the acknowledgement."""
         message_id = to_int(command.param1)
         if message_id == m.MessageInterval.ID:
             return self._send_interval(to_int(command.param2), command.channel)

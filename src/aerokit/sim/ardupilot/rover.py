@@ -225,7 +225,7 @@ class RoverFence(ArduPilotFence[RoverHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION after a new breach. Far beyond the limit, HOLD replaces every action but report only."""
+        """Execute FENCE_ACTION after a new breach. Far beyond the limit, hold instead, unless it only reports."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if action == REPORT_ONLY:

@@ -295,7 +295,7 @@ class RoverSubAuto(MissionMode):
         return now - self._reached_at >= delay_s
 
     def _go(self, item: MissionItem) -> None:
-        """Travel to the position of a command. The vehicle stops there to wait, or if no further waypoint follows."""
+        """Travel to the position of a command. The vehicle stops there if it must wait or if no waypoint is next."""
         vehicle = self.vehicle
         current: Ned = self._place or vehicle.motion.place
         self._reached_at = None

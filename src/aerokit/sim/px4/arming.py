@@ -27,7 +27,7 @@ _PERCENT_PER_SIDE = 17
 
 
 def _side_texts(sensor: str, sides_done: int) -> list[str]:
-    """Return the texts that PX4 sends before it measures a side, once ``sides_done`` are done."""
+    """Return the texts that PX4 sends before it measures the next side. ``sides_done`` sides are already measured."""
     side = _SIDES[-1 - sides_done]  # The simulated user rotates the vehicle to the last side first.
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",

@@ -49,7 +49,7 @@ _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000  # 
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    """Return handlers of commands with a fixed answer, and of failures, log stream, gripper, actuators and storage."""
+    """Return the handlers for failures, logs, the gripper, actuators and storage, and those with a fixed answer."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None sends no acknowledgement.
     handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED

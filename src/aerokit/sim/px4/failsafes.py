@@ -371,9 +371,9 @@ class Px4Failsafes:
         self._failing = frozenset(failing)
 
     def _choose(self) -> FailsafeAction:
-        """Return the action to execute: the most severe one of the active failures, or a reduced action.
+        """Return the action to execute: the most severe one of the active failures, or a milder action.
 
-        The action is reduced while the user has overridden it, while it is under way already, and during its delay.
+        After an override by the user, only warn. In LAND and RTL, warn instead of returning. During the delay, hold.
         """
         worst = max(self._active.values(), default=Action.NONE)
         can_hold = self._px4.has_position

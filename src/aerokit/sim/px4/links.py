@@ -48,7 +48,7 @@ class Px4Events:
         return CurrentEventSequence((self._next_sequence - 1) & 0xFFFF, 0)
 
     def send_for(self, text: str) -> None:
-        """Send the event with the content of a status text, if there is such an event."""
+        """Send the event that says the same as a status text. Send nothing if PX4 has no such event."""
         event = _event_of(text)
         if event is None:
             return
@@ -64,7 +64,7 @@ class Px4Events:
 
 
 def _event_of(text: str) -> tuple[int, bytes] | None:
-    """Return the id and the arguments of the event with the content of a status text; None if there is none."""
+    """Return the id and arguments of the event that says the same as a status text; None if PX4 has no such event."""
     if text in _EVENT_IDS:
         return _EVENT_IDS[text], b""
     if text.startswith("Armed by "):

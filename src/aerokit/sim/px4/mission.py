@@ -168,7 +168,7 @@ class Px4Mission:
 
     @property
     def state(self) -> int:
-        """MISSION_STATE. Outside mission mode, it is kept if no item was reached and ``current`` is above 0."""
+        """``mission_state`` of MISSION_CURRENT: a MISSION_STATE."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -179,6 +179,7 @@ class Px4Mission:
             self._state = MissionState.PAUSED
         elif self.current < 1:
             self._state = MissionState.NOT_STARTED
+        # Outside mission mode, the state does not change if no item was reached and `current` is above 0.
         return self._state
 
     @property
@@ -276,7 +277,7 @@ class Px4Mission:
     def _index_after_jump(self, item: MissionItem) -> int:
         """Return the index at which the mission continues after a DO_JUMP.
 
-        PX4 counts the jumps in the DO_JUMP, and sends the changed DO_JUMP to the last client.
+        PX4 stores in the DO_JUMP item how often it has jumped, and sends the changed item to the last client.
         """
         index = self.current
         jumps_done = self._jumps.get(index, 0)

@@ -185,7 +185,7 @@ class Px4Offboard:
             motion.turn(self._yaw_rate if math.isfinite(self._yaw_rate) else 0.0)
 
     def _fly_attitude(self, attitude: tuple[float, float, float], elapsed: float) -> None:
-        """Follow the target attitude, which the body rates have changed for ``elapsed`` seconds."""
+        """Turn the target attitude at the body rates for ``elapsed`` seconds, and then follow it."""
         motion = self._vehicle.motion
         if self._body_rates is not None:
             angles_and_rates = zip(attitude, self._body_rates, strict=True)
