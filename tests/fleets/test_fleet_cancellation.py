@@ -206,6 +206,34 @@ async def test_concurrent_actions_newest_order_wins() -> None:
         assert stage.fleet.members["north/1"].is_available
 
 
+@pytest.mark.parametrize(
+    ("policy", "action", "mode"), [("hold_others", "land", "LAND"), ("land_others", "hold", "BRAKE")]
+)
+async def test_policy_of_older_action_overrules_no_newer_action(policy: str, action: str, mode: str) -> None:
+    """A landing of the fleet ends a flight to targets. This is a failure of the flight, whose policy orders nothing."""
+    async with open_stage(3, on_error=policy) as stage:
+        await stage.take_off()
+        older = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(5)
+        assert (await getattr(stage.fleet, action)()).is_complete
+        assert not (await older).is_complete
+        assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: [mode] for name in stage.copters}
+
+
+async def test_cancelled_action_holds_no_member_with_newer_order() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        places = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        targets = {"north/1": places["north/1"], "north/2": places["north/2"].offset(north_m=300)}
+        older = asyncio.create_task(stage.fleet.go_to(targets))
+        await anyio.sleep(5)
+        landing = asyncio.create_task(stage.fleet["north/1"].land())
+        await anyio.sleep(2)
+        older.cancel()
+        assert (await landing).is_complete
+        assert stage.modes_ordered("north/1") == ["LAND"]
+
+
 async def test_following_entered_twice_raises() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()

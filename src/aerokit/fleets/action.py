@@ -74,6 +74,7 @@ class FleetAction:
         is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
         holds_if_cancelled: if the action is cancelled or a function passed by the program raises an error, members that
             have already finished the action are told to hold as well.
+        moves_members: the action overrules older actions: these send its members no orders of their policy.
     """
 
     def __init__(
@@ -87,11 +88,14 @@ class FleetAction:
         stagger_s: float | None = None,
         is_safe: bool = False,
         holds_if_cancelled: bool = True,
+        moves_members: bool = False,
     ) -> None:
         self.name: str = name
         self._context, self._execute, self._timeout = context, execute, timeout
         self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
+        self._moves_members = moves_members
+        self._newer_actions: list[FleetAction] = []  # actions that move members and began while this one was running
         requested = list(members)
         for member in requested:
             member.refresh()
@@ -118,6 +122,9 @@ class FleetAction:
         if not self._members:
             return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
+        if self._moves_members:
+            for action in self._context.actions:
+                action._newer_actions.append(self)
         self._context.actions.append(self)
         try:
             for index, member in enumerate(self._members):
@@ -203,6 +210,12 @@ class FleetAction:
     def _has_failed_or_stopped(self, member: Member) -> bool:
         return member.name in self._failed or member.name in self._stopped
 
+    def _has_newer_order(self, member: Member) -> bool:
+        """Return True if a newer action of the fleet, such as a landing, moves the member or has moved it."""
+        return any(
+            member in action._members and not action._has_failed_or_stopped(member) for action in self._newer_actions
+        )
+
     async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
             return await self._execute(member)
@@ -251,7 +264,9 @@ class FleetAction:
             order = orders.get(member.name)
             if order is None:
                 continue
-            if member.is_flown_by_program:
+            if self._has_newer_order(member):
+                skipped[member.name] = "it has a newer order"
+            elif member.is_flown_by_program:
                 self._policy_orders[member.name] = order
             elif member.vehicle.is_confirmed_disarmed:
                 skipped[member.name] = "it is disarmed"
@@ -338,7 +353,7 @@ class FleetAction:
         # cancelled. Failed and stopped members get no order.
         for member in self._members if self._holds_if_cancelled else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
-            if has_finished and member.is_flown_by_program:
+            if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:
@@ -426,6 +441,10 @@ FLIGHT_ENDING_ACTIONS = ("hold", "land", "return_to_launch", "disarm", "mission.
 ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
+# Besides those that end the flight, these actions overrule older ones.
+MOVING_ACTIONS = ("take_off", "go_to", "form", "show", "set_mode", "mission.start")
+
+
 class SelectionBase:
     """Base class of a selection: its members, and the execution of actions by all of them."""
 
@@ -475,4 +494,5 @@ class SelectionBase:
             stagger_s=stagger_s,
             is_safe=is_safe,
             holds_if_cancelled=not is_safe and built_in_action not in ACTIONS_ON_GROUND,
+            moves_members=is_safe or built_in_action in MOVING_ACTIONS,
         ).run()
