@@ -11,9 +11,9 @@ from fleet_stage import open_stage
 from flight_harness import attached_sinks, now, waiting_on_cells
 
 from aerokit.connection.opening import open_connection
-from aerokit.errors import LinkLost, OperationRejected
+from aerokit.errors import ConnectionClosed, LinkLost, OperationRejected, SetpointStreamStopped
 from aerokit.fleets.events import PolicyApplied, PolicyCompleted
-from aerokit.fleets.formation import Formation
+from aerokit.fleets.formation import Formation, Offset
 from aerokit.fleets.members import Member, MemberState
 from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
@@ -39,6 +39,27 @@ async def test_fleet_exit_during_action_makes_members_hold() -> None:
     result = await asyncio.wait_for(flying, 5)
     assert len(result.failed) == 3
     assert {copter.mode.name for copter in copters.values()} == {"BRAKE"}
+
+
+async def test_exit_of_fleet_of_vehicles_ends_actions() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        async with fleet(dict(zip("abc", stage.fleet.vehicles.values(), strict=True))) as inner:
+            flying = asyncio.create_task(inner["a"].go_to(north(300)))
+
+            async def follow() -> None:
+                async with inner.following(Formation({"c": Offset(-10)}, "north"), leader="b") as following:
+                    await following.wait_stopped()
+
+            followed = asyncio.create_task(follow())
+            await anyio.sleep(3)
+        assert list((await asyncio.wait_for(flying, 1)).failed) == ["a"]
+        with pytest.raises(SetpointStreamStopped, match="the fleet's block has ended"):
+            await asyncio.wait_for(followed, 1)
+        await anyio.sleep(2)
+        assert stage.modes == {"north/1": "BRAKE", "north/2": "GUIDED", "north/3": "BRAKE"}
+        with pytest.raises(ConnectionClosed):
+            await inner.land()
 
 
 async def test_fleet_exit_at_policy_ends_action() -> None:

@@ -59,6 +59,35 @@ async def test_staggered_members_start_apart_after_blocked_loop() -> None:
         assert all(later - earlier > 1.99 for earlier, later in pairwise(starts))
 
 
+async def test_staggered_member_that_was_lost_does_not_start() -> None:
+    """It has failed, even if it is back before its start."""
+    async with open_stage(3, on_error="continue_others") as stage:
+        await stage.take_off()
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        flight = asyncio.create_task(stage.fleet.go_to(targets, stagger_s=10))
+        await anyio.sleep(3)
+        stage.copters["north/3"].faults.silent = True
+        await anyio.sleep(6)
+        stage.copters["north/3"].faults.silent = False
+        assert list((await flight).failed) == ["north/3"]
+        assert stage.orders_to("north/3") == []
+        assert stage.fleet.members["north/3"].is_available
+
+
+async def test_corridor_member_reclaimed_before_start_does_not_start() -> None:
+    async with open_stage(3, min_distance_m=6.0, on_error="continue_others") as stage:
+        targets = await crossing_targets(stage)
+        plan = stage.fleet.plan_separation(targets, by="corridors", speed_m_s=5, slack_s=1)
+        flight = asyncio.create_task(stage.fleet.go_to(targets, speed_m_s=5, separation=plan))
+        delayed = max(plan.delays_s, key=lambda name: plan.delays_s[name])
+        await anyio.sleep(plan.delays_s[delayed] / 3)
+        stage.pilot_takes(delayed)
+        await anyio.sleep(plan.delays_s[delayed] / 3)
+        stage.fleet.reclaim(delayed)
+        assert list((await flight).failed) == [delayed]
+        assert stage.mode_of(delayed) == "LOITER"
+
+
 async def crossing_targets(stage: Stage) -> dict[str, Position]:
     """Return targets on three paths of the same length that cross at their middles."""
     await stage.take_off()

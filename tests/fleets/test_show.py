@@ -139,6 +139,17 @@ async def test_show_beside_member_without_track_is_refused() -> None:
         assert (await stage.fleet.fly_show(beside, ORIGIN)).result.is_complete
 
 
+async def test_show_with_member_released_before_start_does_not_start() -> None:
+    """The other tracks were compared with the track of this member, not with the place where it stays."""
+    async with open_stage(2, min_distance_m=4.0) as stage:
+        await stage.take_off(8)
+        show = Show.from_points({name: circle(0, 10.0 * number, 6) for number, name in enumerate(stage.copters)})
+        asyncio.get_running_loop().call_later(0.3, stage.fleet.release, "north/2")
+        with pytest.raises(OperationRejected, match=r"north/2 is released.* the show was not started"):
+            await stage.fleet.fly_show(show, ORIGIN)
+        assert stage.orders_to("north/2") == []
+
+
 @pytest.mark.parametrize(("block_s", "is_late"), [(4.0, False), (5.8, True)])
 async def test_show_member_that_would_join_late_holds(
     block_s: float, is_late: bool, monkeypatch: pytest.MonkeyPatch

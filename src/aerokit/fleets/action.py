@@ -16,6 +16,7 @@ from aerokit.connection.bus import Bus
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import (
     AerokitError,
+    ConnectionClosed,
     HeartbeatTimeout,
     InvalidArgument,
     OperationRejected,
@@ -36,21 +37,24 @@ if TYPE_CHECKING:
     from aerokit.vehicle.vehicle import Vehicle
 
 
+FLEET_CLOSED = "the fleet's block has ended"
+
 START_TOLERANCE_S = 0.001
 """By how much the delay between the starts of two members may be shorter than ``stagger_s``."""
 
 
-async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
+async def wait_to_start(member: Member, delay_s: float, action: str, *, is_safe: bool = False) -> float:
     """Wait ``delay_s`` before a member's order, and then for its next HEARTBEAT if the last one is not recent.
 
     Return the seconds by which the whole wait exceeds ``delay_s``.
 
     Raises:
-        OperationRejected: the computer slept during the wait, or the member is unavailable.
+        OperationRejected: the computer slept during the wait, or the member is unavailable. Unless the action is safe
+            (such as a landing), also if the member was unavailable during the wait, because it has then failed.
         HeartbeatTimeout: the member is silent.
     """
     connection = member.vehicle.connection
-    began_at = connection.now()
+    began_at, absences = connection.now(), member.absences
     await anyio.sleep(delay_s)
     await member.vehicle._sender.await_recent_state()
     if connection._slept_since(began_at) > 0:
@@ -58,6 +62,8 @@ async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
     member.refresh()
     if not member.is_available:
         raise OperationRejected(f"{action}: {member.name} is {member.status}")
+    if member.absences > absences and not is_safe:
+        raise OperationRejected(f"{action}: {member.name} was unavailable before it started; nothing was sent to it")
     return connection.now() - began_at - delay_s
 
 
@@ -119,6 +125,8 @@ class FleetAction:
 
     async def run(self) -> FleetResult:
         """Execute the action with all members concurrently, until every member has finished, failed or was stopped."""
+        if self._context.is_closed:
+            raise ConnectionClosed(f"{self.name}: {FLEET_CLOSED}")
         if not self._members:
             return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
@@ -165,6 +173,13 @@ class FleetAction:
         outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
         return FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
 
+    def close(self) -> None:
+        """Make the members that execute the action fail and cancel their tasks, because the fleet's block has ended."""
+        for member in self._members:
+            if member.name not in self._outcomes:
+                self._record_failure(member, ConnectionClosed(f"{self.name}: {FLEET_CLOSED}"))
+                self._cancel_tasks_of([member])
+
     def on_member_unavailable(self, member: Member) -> None:
         """Record that the member has failed because it was lost or taken over."""
         if member not in self._members or self._has_failed_or_stopped(member):
@@ -180,11 +195,11 @@ class FleetAction:
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if member.name in self._stopped:  # The policy stopped the member before this task began.
+            if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
             wait_s = delay_s
             while wait_s > START_TOLERANCE_S:
-                await wait_to_start(member, wait_s, self.name)
+                await wait_to_start(member, wait_s, self.name, is_safe=self._is_safe)
                 # After a blocked event loop, the delays of several members may end at once. Each of them then waits
                 # until `stagger_s` after the last start.
                 wait_s = self._last_start_at + self._stagger_s - self._context.now()
@@ -387,6 +402,7 @@ class FleetContext:
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
+        self.newest_upload: Mapping[str, Mission] = {}  # the missions of the upload that began last
         self.is_closed: bool = False
 
     def start(self) -> None:
@@ -397,6 +413,8 @@ class FleetContext:
         self.is_closed = True
         for member in self.members.values():
             member.stop_monitoring()
+        for action in tuple(self.actions):  # Vehicles that the program passed to the fleet stay connected.
+            action.close()
         await self.background.aclose()
 
     def publish(self, event: FleetEvent) -> None:

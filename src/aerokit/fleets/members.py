@@ -54,6 +54,8 @@ class Member:
         """The member's state in the fleet."""
         self.reason: str = ""
         """The reason for this state; empty in the state ACTIVE."""
+        self.absences: int = 0
+        """How often the member became unavailable."""
         self._lost_at = 0.0  # when the member was lost
         # The vehicle's newest order and its mode at the time of `reclaim`. The member does not count as taken over
         # until one of them changes.
@@ -218,6 +220,7 @@ class Member:
 
     def _set_state(self, state: MemberState, reason: str) -> None:
         self.state, self.reason = state, reason
+        self.absences += not self.is_available
 
     def _event_fields(self) -> tuple[float, int, str]:
         """Return the first fields of each FleetEvent: the time, and the member's system id and name."""

@@ -350,8 +350,8 @@ class Missions(SelectionBase):
     ) -> FleetResult:
         """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
 
-        :meth:`start_missions` starts the missions, but only if all uploads succeeded. A fleet with a
-        ``min_distance_m`` compares the missions first.
+        :meth:`start_missions` starts the missions, but only if all uploads succeeded, and no newer upload has begun. A
+        fleet with a ``min_distance_m`` compares the missions first.
 
         Args:
             missions: maps names of members to missions.
@@ -373,6 +373,7 @@ class Missions(SelectionBase):
             members[name].vehicle._position.check_reach(
                 f"missions[{name!r}]", positions, max_distance_m, are_items=True
             )
+        missions = self._context.newest_upload = dict(missions)
         self._context.missions.clear()
         if self._context.min_distance_m is not None:
             deconfliction = self.compare_missions(missions)
@@ -386,9 +387,15 @@ class Missions(SelectionBase):
                     missions[member.name], timeout=timeout, max_distance_m=max_distance_m
                 )
 
-        result = await self._run("upload", upload, names=tuple(missions))
+        try:
+            result = await self._run("upload", upload, names=tuple(missions))
+        finally:
+            newest = self._context.newest_upload
+            if newest is not missions and not newest.keys().isdisjoint(missions):
+                self._context.missions.clear()  # This upload may have replaced missions of the newer one.
         result.raise_for_errors()
-        self._context.missions.update(missions)
+        if self._context.newest_upload is missions:  # The missions of two uploads were not compared with each other.
+            self._context.missions.update(missions)
         return result
 
     async def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:

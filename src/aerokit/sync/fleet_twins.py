@@ -225,7 +225,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come too close to each other or to a member without a track, or a member is
-                unavailable. Nothing was sent.
+                unavailable; nothing was sent. Or a member became unavailable on the way to its first point; the show
+                was not started.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """
@@ -300,8 +301,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> FleetResult:
         """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
 
-        :meth:`start_missions` starts the missions, but only if all uploads succeeded. A fleet with a
-        ``min_distance_m`` compares the missions first.
+        :meth:`start_missions` starts the missions, but only if all uploads succeeded, and no newer upload has begun. A
+        fleet with a ``min_distance_m`` compares the missions first.
 
         Args:
             missions: maps names of members to missions.
