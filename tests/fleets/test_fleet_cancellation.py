@@ -241,6 +241,29 @@ async def test_policy_of_older_action_overrules_no_newer_action(policy: str, act
         assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: [mode] for name in stage.copters}
 
 
+async def test_policy_does_not_stop_landings_of_vehicles() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        older = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(5)
+        await asyncio.gather(*(vehicle.land() for vehicle in stage.fleet.vehicles.values()))
+        assert not (await older).is_complete
+        assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: ["LAND"] for name in stage.copters}
+
+
+async def test_failure_of_released_member_stops_no_others() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        flight = asyncio.create_task(stage.fleet.go_to(north(30), stagger_s=3))
+        await anyio.sleep(5)
+        for name in ("north/2", "north/3"):  # The first of them is on its way, the other one has not started.
+            stage.fleet.release(name)
+        await stage.fleet.vehicles["north/2"].hold()
+        result = await flight
+        assert (set(result.failed), set(result.stopped)) == ({"north/2", "north/3"}, set())
+        assert stage.modes_ordered("north/1") == stage.modes_ordered("north/3") == []
+
+
 async def test_cancelled_action_holds_no_member_with_newer_order() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()

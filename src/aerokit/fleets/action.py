@@ -225,8 +225,18 @@ class FleetAction:
     def _has_failed_or_stopped(self, member: Member) -> bool:
         return member.name in self._failed or member.name in self._stopped
 
-    def _has_newer_order(self, member: Member) -> bool:
-        """Return True if a newer action of the fleet, such as a landing, moves the member or has moved it."""
+    def _has_newer_order(self, member: Member, order: PolicyOrder) -> bool:
+        """Return True if the program has given the member a newer order, which this order of the policy must not end.
+
+        This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
+        vehicle to land or to return.
+        """
+        newest = member.vehicle._arbiter.newest
+        is_landing = newest is not None and newest.ends_flight and not newest.end
+        # The landing may also be a part of the action, if it is a function of the program that still runs.
+        is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
+        if is_landing and order != "land" and not is_ordered_by_action:
+            return True
         return any(
             member in action._members and not action._has_failed_or_stopped(member) for action in self._newer_actions
         )
@@ -248,7 +258,8 @@ class FleetAction:
         self._failed[member.name] = error
         self._outcomes[member.name] = error
         member.record_failure(self.name, error)
-        if self._is_safe or self._context.is_closed:
+        # The program flies a released member separately, so its failure does not concern the others.
+        if self._is_safe or self._context.is_closed or member.state is MemberState.RELEASED:
             return
         self._undecided.append((member, error))
         # This is a nested call from `_apply_policy` below, which refreshes the other members. The outer call handles
@@ -279,7 +290,7 @@ class FleetAction:
             order = orders.get(member.name)
             if order is None:
                 continue
-            if self._has_newer_order(member):
+            if self._has_newer_order(member, order):
                 skipped[member.name] = "it has a newer order"
             elif member.is_flown_by_program:
                 self._policy_orders[member.name] = order
@@ -368,7 +379,7 @@ class FleetAction:
         # cancelled. Failed and stopped members get no order.
         for member in self._members if self._holds_if_cancelled else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
-            if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
+            if has_finished and member.is_flown_by_program and not self._has_newer_order(member, "hold"):
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:
