@@ -162,6 +162,7 @@ class Member:
         if state not in FAILSAFE_STATES:
             self._ignored_failsafe = None  # The ignored failsafe has ended, so the next one counts again.
         if vehicle.is_confirmed_disarmed:  # a disarmed vehicle does not fly, so there is no control to take over
+            self._control_when_reclaimed = None  # If another party arms it next, this is a takeover.
             return ""
         if state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
