@@ -540,6 +540,19 @@ async def test_takeover_between_layers_stops_others_there() -> None:
             assert stage.mode_of(name) == "GUIDED"
 
 
+async def test_landing_between_layers_is_not_overruled_by_next_leg() -> None:
+    async with open_stage(2, spacing_m=30, min_distance_m=6.0) as stage:
+        await stage.take_off()
+        flight = asyncio.create_task(stage.fleet.go_to(swapped(stage)))
+        await anyio.sleep(2)  # One of them is in its layer already.
+        low = min(stage.copters, key=lambda name: stage.fleet.vehicles[name].position.value.altitude_relative_m or 0.0)
+        landing = asyncio.create_task(stage.fleet[low].land())
+        with pytest.raises(OperationRejected, match=f"{low} got a newer order .*; the others stay at"):
+            await flight
+        assert (await landing).is_complete
+        assert stage.modes_ordered(low) == ["LAND"]
+
+
 async def test_target_or_mission_too_far_away_is_rejected() -> None:
     far = Position(-47.0, -81.0, altitude_relative_m=20.0)
     async with open_stage(2) as stage:

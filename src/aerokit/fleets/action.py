@@ -109,6 +109,7 @@ class FleetAction:
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
+        self._final_orders: dict[str, object] = {}  # the vehicle's newest order when the member had finished
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -171,7 +172,9 @@ class FleetAction:
         names = [member.name for member in self._members]
         # The outcomes have the order of the members, not the order in which the members have finished.
         outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
-        return FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
+        result = FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
+        result._final_orders = dict(self._final_orders)
+        return result
 
     def close(self) -> None:
         """Make the members that execute the action fail and cancel their tasks, because the fleet's block has ended."""
@@ -217,6 +220,7 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
+                self._final_orders[member.name] = member.vehicle._arbiter.newest
                 member.record_success()
         finally:
             del self._tasks[member.name]
@@ -490,6 +494,12 @@ class SelectionBase:
     def vehicles(self) -> Mapping[str, Vehicle]:
         """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
+
+    def _check_not_ordered_since(self, result: FleetResult, action: str, consequence: str) -> None:
+        """Raise OperationRejected if the program has ordered a member, since it finished a part of the action."""
+        for name, order in result._final_orders.items():
+            if self._context.members[name].vehicle._arbiter.newest is not order:
+                raise OperationRejected(f"{action}: {name} got a newer order on the way; {consequence}")
 
     def __len__(self) -> int:
         return len(self.members)

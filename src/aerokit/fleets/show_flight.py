@@ -357,8 +357,8 @@ class Shows(Travel):
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come too close to each other or to a member without a track, or a member is
-                unavailable; nothing was sent. Or a member became unavailable on the way to its first point; the show
-                was not started.
+                unavailable; nothing was sent. Or a member became unavailable or got another order on the way to its
+                first point; the show was not started.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """
@@ -374,6 +374,7 @@ class Shows(Travel):
         arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         self._check_available(show, "the show was not started")
+        self._check_not_ordered_since(arrived, "fly_show", "the show was not started")
         begin_at = self._context.now() + start_in_s
         max_late_s = math.inf if self._context.min_distance_m is None else CONFLICT_SLACK_S
         recorders: dict[str, TrackRecorder] = {}

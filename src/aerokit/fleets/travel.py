@@ -74,8 +74,8 @@ class Travel(SelectionBase):
                 not fit the delays of corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
-                members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
-                Then the others stay in their layers.
+                members, targets or positions, and nothing was sent; or a member became unavailable or got another order
+                between two legs. Then the others stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -304,6 +304,8 @@ class Travel(SelectionBase):
                     f"{action}: {', '.join(missing)} became unavailable after the altitudes were assigned; "
                     + ("nothing was sent" if result is None else "the others stay at their assigned altitudes")
                 )
+            if result is not None:
+                self._check_not_ordered_since(result, action, "the others stay at their assigned altitudes")
             result = await self._fly_to(
                 action, leg, speed_m_s, timeout, max_distance_m=max_distance_m, stagger_s=stagger_s
             )

@@ -129,8 +129,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 not fit the delays of corridors. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
-                members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
-                Then the others stay in their layers.
+                members, targets or positions, and nothing was sent; or a member became unavailable or got another order
+                between two legs. Then the others stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -225,8 +225,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come too close to each other or to a member without a track, or a member is
-                unavailable; nothing was sent. Or a member became unavailable on the way to its first point; the show
-                was not started.
+                unavailable; nothing was sent. Or a member became unavailable or got another order on the way to its
+                first point; the show was not started.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """
