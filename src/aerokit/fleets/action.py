@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from aerokit.fleets.events import FleetEvent
     from aerokit.fleets.members import Member
     from aerokit.fleets.policy import PolicyOrder, PolicyRules
+    from aerokit.fleets.separation import Deconfliction
     from aerokit.missions.mission import Mission
     from aerokit.vehicle.vehicle import Vehicle
 
@@ -80,7 +81,9 @@ class FleetAction:
         is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
         holds_if_cancelled: if the action is cancelled or a function passed by the program raises an error, members that
             have already finished the action are told to hold as well.
-        moves_members: the action overrules older actions: these send its members no orders of their policy.
+        moves_members: the action overrules older actions: these send its members no orders of their policy, and do not
+            start members that still wait.
+        corridors: the delay of each member, and how late it may start.
     """
 
     def __init__(
@@ -95,12 +98,13 @@ class FleetAction:
         is_safe: bool = False,
         holds_if_cancelled: bool = True,
         moves_members: bool = False,
+        corridors: Deconfliction | None = None,
     ) -> None:
         self.name: str = name
         self._context, self._execute, self._timeout = context, execute, timeout
         self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
-        self._moves_members = moves_members
+        self._moves_members, self._corridors = moves_members, corridors
         self._newer_actions: list[FleetAction] = []  # actions that move members and began while this one was running
         requested = list(members)
         for member in requested:
@@ -136,10 +140,10 @@ class FleetAction:
                 action._newer_actions.append(self)
         self._context.actions.append(self)
         try:
+            delays_s = {} if self._corridors is None else self._corridors.delays_s
             for index, member in enumerate(self._members):
-                tasks.start(
-                    partial(self._run_member, member, index * self._stagger_s), f"aerokit {self.name} {member.name}"
-                )
+                delay_s = index * self._stagger_s + delays_s.get(member.name, 0.0)
+                tasks.start(partial(self._run_member, member, delay_s), f"aerokit {self.name} {member.name}")
             await self._finished.wait()
         except BaseException:
             self._hold_finished_members()
@@ -200,9 +204,20 @@ class FleetAction:
         try:
             if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
-            wait_s = delay_s
+            wait_s, arbiter = delay_s, member.vehicle._arbiter
+            arm_commands, order_before = arbiter.arm_commands_sent, arbiter.newest
             while wait_s > START_TOLERANCE_S:
-                await wait_to_start(member, wait_s, self.name, is_safe=self._is_safe)
+                late_s = await wait_to_start(member, wait_s, self.name, is_safe=self._is_safe)
+                if self._corridors is not None and late_s > self._corridors.slack_s:
+                    raise OperationRejected(
+                        f"{self.name}: {member.name} would start {late_s:.1f} s late, so it stays where it is"
+                    )
+                has_armed = self.name == "arm" and arbiter.arm_commands_sent > arm_commands
+                has_landed = arbiter.newest is not order_before and _is_ending_flight(member)
+                if not self._is_safe and (has_armed or has_landed or self._has_newer_action(member)):
+                    raise OperationRejected(
+                        f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
+                    )
                 # After a blocked event loop, the delays of several members may end at once. Each of them then waits
                 # until `stagger_s` after the last start.
                 wait_s = self._last_start_at + self._stagger_s - self._context.now()
@@ -235,12 +250,14 @@ class FleetAction:
         This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
         vehicle to land or to return.
         """
-        newest = member.vehicle._arbiter.newest
-        is_landing = newest is not None and newest.ends_flight and not newest.end
         # The landing may also be a part of the action, if it is a function of the program that still runs.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
-        if is_landing and order != "land" and not is_ordered_by_action:
+        if _is_ending_flight(member) and order != "land" and not is_ordered_by_action:
             return True
+        return self._has_newer_action(member)
+
+    def _has_newer_action(self, member: Member) -> bool:
+        """Return True if a newer action of the fleet moves the member or has moved it."""
         return any(
             member in action._members and not action._has_failed_or_stopped(member) for action in self._newer_actions
         )
@@ -396,6 +413,12 @@ class FleetAction:
         self._finished.set()
 
 
+def _is_ending_flight(member: Member) -> bool:
+    """Return True if the vehicle's newest order is one of this program to land, return or disarm, and still valid."""
+    newest = member.vehicle._arbiter.newest
+    return newest is not None and newest.ends_flight and not newest.end
+
+
 class FleetContext:
     """State that the parts of one fleet share, as long as the ``async with aerokit.fleet(...)`` block runs."""
 
@@ -516,6 +539,7 @@ class SelectionBase:
         stagger_s: float | None = None,
         names: tuple[str, ...] | None = None,
         is_function: bool = False,
+        corridors: Deconfliction | None = None,
     ) -> FleetResult:
         """Execute an action with all members of the selection, or with those in ``names``.
 
@@ -534,4 +558,5 @@ class SelectionBase:
             is_safe=is_safe,
             holds_if_cancelled=not is_safe and built_in_action not in ACTIONS_ON_GROUND,
             moves_members=is_safe or built_in_action in MOVING_ACTIONS,
+            corridors=corridors,
         ).run()

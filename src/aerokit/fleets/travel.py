@@ -11,7 +11,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument, OperationRejected, ValueUnknownError
-from aerokit.fleets.action import SelectionBase, wait_to_start
+from aerokit.fleets.action import SelectionBase
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl, position_of
 from aerokit.fleets.events import PathsCompared
 from aerokit.fleets.members import Member
@@ -268,17 +268,11 @@ class Travel(SelectionBase):
         """Fly members straight to their targets; in corridors, each member starts after its delay."""
 
         async def fly(member: Member) -> None:
-            if corridors is not None and corridors.delays_s.get(member.name):
-                late_s = await wait_to_start(member, corridors.delays_s[member.name], action)
-                if late_s > corridors.slack_s:
-                    raise OperationRejected(
-                        f"{action}: {member.name} would start {late_s:.1f} s late, so it stays where it is"
-                    )
             await member.vehicle.go_to(
                 targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
             )
 
-        return await self._run(action, fly, stagger_s=stagger_s, names=names or tuple(targets))
+        return await self._run(action, fly, stagger_s=stagger_s, names=names or tuple(targets), corridors=corridors)
 
     async def _fly_in_layers(
         self,
