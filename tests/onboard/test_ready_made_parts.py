@@ -430,7 +430,7 @@ async def test_turning_gimbal_stops_at_end_of_block(is_pointed: bool) -> None:
     assert (head.targets[-1].rates is None) == is_pointed
 
 
-async def test_turning_gimbal_that_refuses_to_point_stops_at_end_of_block() -> None:
+async def test_turning_gimbal_whose_pointing_fails_stops_at_block_end() -> None:
     class Jammed(Head):
         def point(self, target: GimbalTarget) -> None:
             if target.angles is not None:

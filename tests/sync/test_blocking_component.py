@@ -128,7 +128,7 @@ def test_parameters_and_missions_are_used_from_the_program() -> None:
         assert node.missions.items() == ()
 
 
-def test_mission_function_runs_in_thread_and_answer_is_sent_on_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mission_function_runs_in_thread_but_loop_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     threads: dict[str, str] = {}
 
     def send(self: ComponentHost, message: Message, *arguments: object) -> None:
@@ -149,7 +149,7 @@ def test_mission_function_runs_in_thread_and_answer_is_sent_on_loop(monkeypatch:
     assert threads["MISSION_CURRENT"] == threads["COMMAND_ACK"] != threads["function"]
 
 
-def test_winch_whose_thread_starts_it_at_end_of_block_is_stopped() -> None:
+def test_winch_started_by_thread_at_block_end_is_stopped() -> None:
     class Winch(WinchDriver):
         def set_rate(self, rate_m_s: float) -> None:  # type: ignore[override]
             has_begun.set()

@@ -44,7 +44,7 @@ TooCloseAction = Literal["hold", "report"]
 Source = str | Link | Connection | Vehicle
 
 DISCOVERY_S = 2.5  # long enough for two heartbeats at 1 Hz, because one may be lost
-KNOWN_MAX_AGE_S = 10.0  # a vehicle of an open connection that was silent for longer has left
+HEARTBEAT_MAX_AGE_S = 10.0  # a vehicle of an open connection that was silent for longer has left
 WAIT_WARNING_S = 5.0
 
 
@@ -293,7 +293,7 @@ async def find_systems(
             detachments.append(connection.bus.attach(Heartbeat, partial(on_heartbeat, name)))
             detachments.append(connection.on_end(lambda _: changed.set()))
             for source, heartbeat in connection.heartbeats.items():
-                if connection.now() - connection.last_heartbeat_at(*source) <= KNOWN_MAX_AGE_S:
+                if connection.now() - connection.last_heartbeat_at(*source) <= HEARTBEAT_MAX_AGE_S:
                     on_heartbeat(name, heartbeat)
         with anyio.move_on_after(timeout):
             with warn_while_waiting(timeout, describe_progress):
