@@ -285,6 +285,18 @@ async def test_unsent_data_of_a_stalled_link_is_discarded() -> None:
         assert not copter.is_armed, "the order was discarded and did not arrive late"
 
 
+async def test_system_found_while_link_stalls_uses_other_link() -> None:
+    radios, first, second = Radios(2), a_copter(), SimulatedCopter(system_id=2, boot_time_s=0.0)
+    second.faults.silent = True
+    async with over(radios, [first, second]) as connection:
+        await anyio.sleep(5)
+        radios.links[0].stall()
+        await anyio.sleep(3)
+        second.faults.silent = False
+        await anyio.sleep(3)
+        assert connection.links.value[1].used_for == (1, 2)  # type: ignore[union-attr]
+
+
 async def test_closed_link_is_left_and_all_closed_end_connection() -> None:
     radios = Radios(2)
     async with over(radios, a_copter()) as connection, aerokit.connect(connection):

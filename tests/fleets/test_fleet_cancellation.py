@@ -11,9 +11,9 @@ from fleet_stage import open_stage
 from flight_harness import attached_sinks, now, waiting_on_cells
 
 from aerokit.connection.opening import open_connection
-from aerokit.errors import LinkLost, OperationRejected
+from aerokit.errors import ConnectionClosed, LinkLost, OperationRejected, SetpointStreamStopped
 from aerokit.fleets.events import PolicyApplied, PolicyCompleted
-from aerokit.fleets.formation import Formation
+from aerokit.fleets.formation import Formation, Offset
 from aerokit.fleets.members import Member, MemberState
 from aerokit.fleets.opening import fleet
 from aerokit.mavlink.enums import MavCmd
@@ -39,6 +39,27 @@ async def test_fleet_exit_during_action_makes_members_hold() -> None:
     result = await asyncio.wait_for(flying, 5)
     assert len(result.failed) == 3
     assert {copter.mode.name for copter in copters.values()} == {"BRAKE"}
+
+
+async def test_exit_of_fleet_of_vehicles_ends_actions() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        async with fleet(dict(zip("abc", stage.fleet.vehicles.values(), strict=True))) as inner:
+            flying = asyncio.create_task(inner["a"].go_to(north(300)))
+
+            async def follow() -> None:
+                async with inner.following(Formation({"c": Offset(-10)}, "north"), leader="b") as following:
+                    await following.wait_stopped()
+
+            followed = asyncio.create_task(follow())
+            await anyio.sleep(3)
+        assert list((await asyncio.wait_for(flying, 1)).failed) == ["a"]
+        with pytest.raises(SetpointStreamStopped, match="the fleet's block has ended"):
+            await asyncio.wait_for(followed, 1)
+        await anyio.sleep(2)
+        assert stage.modes == {"north/1": "BRAKE", "north/2": "GUIDED", "north/3": "BRAKE"}
+        with pytest.raises(ConnectionClosed):
+            await inner.land()
 
 
 async def test_fleet_exit_at_policy_ends_action() -> None:
@@ -204,6 +225,57 @@ async def test_concurrent_actions_newest_order_wins() -> None:
         await anyio.sleep(2)
         assert stage.modes == {"north/1": "BRAKE", "north/2": "BRAKE"}
         assert stage.fleet.members["north/1"].is_available
+
+
+@pytest.mark.parametrize(
+    ("policy", "action", "mode"), [("hold_others", "land", "LAND"), ("land_others", "hold", "BRAKE")]
+)
+async def test_policy_of_older_action_overrules_no_newer_action(policy: str, action: str, mode: str) -> None:
+    """A landing of the fleet ends a flight to targets. This is a failure of the flight, whose policy orders nothing."""
+    async with open_stage(3, on_error=policy) as stage:
+        await stage.take_off()
+        older = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(5)
+        assert (await getattr(stage.fleet, action)()).is_complete
+        assert not (await older).is_complete
+        assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: [mode] for name in stage.copters}
+
+
+async def test_policy_does_not_stop_landings_of_vehicles() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        older = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(5)
+        await asyncio.gather(*(vehicle.land() for vehicle in stage.fleet.vehicles.values()))
+        assert not (await older).is_complete
+        assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: ["LAND"] for name in stage.copters}
+
+
+async def test_failure_of_released_member_stops_no_others() -> None:
+    async with open_stage(3) as stage:
+        await stage.take_off()
+        flight = asyncio.create_task(stage.fleet.go_to(north(30), stagger_s=3))
+        await anyio.sleep(5)
+        for name in ("north/2", "north/3"):  # The first of them is on its way, the other one has not started.
+            stage.fleet.release(name)
+        await stage.fleet.vehicles["north/2"].hold()
+        result = await flight
+        assert (set(result.failed), set(result.stopped)) == ({"north/2", "north/3"}, set())
+        assert stage.modes_ordered("north/1") == stage.modes_ordered("north/3") == []
+
+
+async def test_cancelled_action_holds_no_member_with_newer_order() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        places = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        targets = {"north/1": places["north/1"], "north/2": places["north/2"].offset(north_m=300)}
+        older = asyncio.create_task(stage.fleet.go_to(targets))
+        await anyio.sleep(5)
+        landing = asyncio.create_task(stage.fleet["north/1"].land())
+        await anyio.sleep(2)
+        older.cancel()
+        assert (await landing).is_complete
+        assert stage.modes_ordered("north/1") == ["LAND"]
 
 
 async def test_following_entered_twice_raises() -> None:

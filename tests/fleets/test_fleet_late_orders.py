@@ -59,6 +59,72 @@ async def test_staggered_members_start_apart_after_blocked_loop() -> None:
         assert all(later - earlier > 1.99 for earlier, later in pairwise(starts))
 
 
+async def test_staggered_member_that_was_lost_does_not_start() -> None:
+    """It has failed, even if it is back before its start."""
+    async with open_stage(3, on_error="continue_others") as stage:
+        await stage.take_off()
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        flight = asyncio.create_task(stage.fleet.go_to(targets, stagger_s=10))
+        await anyio.sleep(3)
+        stage.copters["north/3"].faults.silent = True
+        await anyio.sleep(6)
+        stage.copters["north/3"].faults.silent = False
+        assert list((await flight).failed) == ["north/3"]
+        assert stage.orders_to("north/3") == []
+        assert stage.fleet.members["north/3"].is_available
+
+
+@pytest.mark.parametrize("by_fleet", [True, False])
+async def test_staggered_arming_ends_when_program_disarms(by_fleet: bool) -> None:
+    async with open_stage(3) as stage:
+        await ready_in_guided(stage)
+        arming = asyncio.create_task(stage.fleet.arm(stagger_s=5))
+        await anyio.sleep(1)
+        if by_fleet:
+            await stage.fleet.disarm()
+        else:
+            await asyncio.gather(*(vehicle.disarm() for vehicle in stage.fleet.vehicles.values()))
+        assert not (await arming).is_complete
+        assert not any(copter.is_armed for copter in stage.copters.values())
+
+
+@pytest.mark.parametrize("action", ["land", "hold"])
+async def test_waiting_member_with_newer_order_does_not_start(action: str) -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
+        await stage.take_off()
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        flight = asyncio.create_task(stage.fleet.go_to(targets, stagger_s=3))
+        await anyio.sleep(1)
+        newer = asyncio.create_task(getattr(stage.fleet["north/2"], action)())
+        assert "got a newer order before it started" in str((await flight).failed["north/2"])
+        assert (await newer).is_complete
+        assert stage.modes_ordered("north/2") == ["LAND" if action == "land" else "BRAKE"]
+
+
+async def test_staggered_members_that_were_landing_before_start() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        with anyio.move_on_after(2):
+            await stage.fleet.land()
+        assert stage.modes == dict.fromkeys(stage.copters, "LAND")
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        assert (await stage.fleet.go_to(targets, stagger_s=2)).is_complete
+
+
+async def test_corridor_member_reclaimed_before_start_does_not_start() -> None:
+    async with open_stage(3, min_distance_m=6.0, on_error="continue_others") as stage:
+        targets = await crossing_targets(stage)
+        plan = stage.fleet.plan_separation(targets, by="corridors", speed_m_s=5, slack_s=1)
+        flight = asyncio.create_task(stage.fleet.go_to(targets, speed_m_s=5, separation=plan))
+        delayed = max(plan.delays_s, key=lambda name: plan.delays_s[name])
+        await anyio.sleep(plan.delays_s[delayed] / 3)
+        stage.pilot_takes(delayed)
+        await anyio.sleep(plan.delays_s[delayed] / 3)
+        stage.fleet.reclaim(delayed)
+        assert list((await flight).failed) == [delayed]
+        assert stage.mode_of(delayed) == "LOITER"
+
+
 async def crossing_targets(stage: Stage) -> dict[str, Position]:
     """Return targets on three paths of the same length that cross at their middles."""
     await stage.take_off()

@@ -97,6 +97,18 @@ async def test_fleet_vehicle_already_connected_is_not_duplicated() -> None:
                 raise AssertionError
 
 
+@pytest.mark.parametrize("returns", [False, True])
+async def test_fleet_of_connection_ignores_vehicle_that_has_left(returns: bool) -> None:
+    copters = [SimulatedCopter(system_id=number, boot_time_s=0.0) for number in (1, 2)]
+    async with simulated_link(copters) as link, aerokit.open_connection(link) as connection:
+        await anyio.sleep(5)
+        copters[1].faults.silent = True
+        await anyio.sleep(60)
+        copters[1].faults.silent = not returns
+        async with aerokit.fleet(connection) as fleet:
+            assert list(fleet.members) == ["1/1", "1/2"][: 1 + returns]
+
+
 async def test_fleet_missing_vehicles_are_listed_in_error() -> None:
     async with simulated_link(copters(1, 2)) as link:
         with pytest.raises(ConnectFailed, match=r"within 4 s 2 of 3 vehicles were found: north/1, north/2$"):

@@ -213,6 +213,29 @@ async def test_start_missions_after_failed_upload_starts_none() -> None:
         assert all(copter.motion.is_on_ground for copter in stage.copters.values())
 
 
+async def test_start_missions_after_concurrent_uploads_starts_newest_only() -> None:
+    """The missions of both uploads lead to the same place, and were not compared with each other."""
+    async with open_stage(2, min_distance_m=5.0) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.arm()).raise_for_errors()
+        uploads = [asyncio.create_task(stage.fleet.upload({name: mission_of(30)})) for name in stage.copters]
+        for upload in uploads:
+            await upload
+        assert list(await stage.fleet.start_missions()) == ["north/2"]
+
+
+async def test_upload_that_ends_after_newer_one_voids_it() -> None:
+    async with open_stage(2) as stage:
+        (climb, place, landing) = mission_of(10)
+        long = Mission([climb, *[place] * 50, landing])
+        older = asyncio.create_task(stage.fleet.upload(dict.fromkeys(stage.copters, long), max_concurrent=1))
+        await anyio.sleep(0.01)
+        await stage.fleet.upload({"north/2": mission_of(20)})
+        await older
+        with pytest.raises(OperationRejected, match="call upload"):
+            await stage.fleet.start_missions()
+
+
 async def test_upload_conflicting_missions_is_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()
@@ -515,6 +538,19 @@ async def test_takeover_between_layers_stops_others_there() -> None:
         for name in ("north/1", "north/2"):  # climbed, but not crossed
             assert stage.fleet.vehicles[name].distance_to(targets[name]) > 30
             assert stage.mode_of(name) == "GUIDED"
+
+
+async def test_landing_between_layers_is_not_overruled_by_next_leg() -> None:
+    async with open_stage(2, spacing_m=30, min_distance_m=6.0) as stage:
+        await stage.take_off()
+        flight = asyncio.create_task(stage.fleet.go_to(swapped(stage)))
+        await anyio.sleep(2)  # One of them is in its layer already.
+        low = min(stage.copters, key=lambda name: stage.fleet.vehicles[name].position.value.altitude_relative_m or 0.0)
+        landing = asyncio.create_task(stage.fleet[low].land())
+        with pytest.raises(OperationRejected, match=f"{low} got a newer order .*; the others stay at"):
+            await flight
+        assert (await landing).is_complete
+        assert stage.modes_ordered(low) == ["LAND"]
 
 
 async def test_target_or_mission_too_far_away_is_rejected() -> None:

@@ -109,6 +109,28 @@ async def test_member_armed_elsewhere_accepts_orders_after_reclaim() -> None:
         assert member.is_flown_by_program
 
 
+async def test_member_armed_elsewhere_again_after_reclaim_is_taken_over() -> None:
+    """The pilot has landed and disarmed, the program reclaims the vehicle, and the pilot arms in the same mode."""
+    async with open_stage(2, spacing_m=30.0) as stage:
+        await stage.fleet.wait_ready()
+        copter, wire, member = stage.copters[PILOTS], stage.wires["north"], stage.fleet.members[PILOTS]
+        copter.set_mode(CopterMode.GUIDED)
+
+        async def arm_elsewhere(armed: float) -> None:
+            wire._link.write(STATION.encode(command_long(2, 1, MavCmd.COMPONENT_ARM_DISARM, (armed,))))
+            await anyio.sleep(3)
+
+        await arm_elsewhere(1.0)
+        assert member.state is MemberState.TAKEN_OVER
+        await arm_elsewhere(0.0)
+        stage.fleet.reclaim(PILOTS)
+        await anyio.sleep(3)
+        await arm_elsewhere(1.0)
+        assert copter.is_armed
+        assert member.state is MemberState.TAKEN_OVER
+        assert (await stage.fleet.set_mode("GUIDED")).skipped == {PILOTS: "taken over: this program did not arm it"}
+
+
 async def test_disarmed_member_gets_no_orders_from_policy() -> None:
     """Two members fly, one is disarmed on the ground; one of the flying ones fails."""
     async with open_stage(3, on_error="land_others") as stage:

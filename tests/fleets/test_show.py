@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path as FilePath
 from typing import Any
 
+import anyio
 import pytest
 from fleet_stage import HOME, open_stage
 from flight_harness import block_loop
@@ -137,6 +138,30 @@ async def test_show_beside_member_without_track_is_refused() -> None:
         assert not any(map(stage.orders_to, stage.copters))
         beside = Show.from_points({"north/1": [(0, 0, 0, 10), (2, -4, 0, 10)]})
         assert (await stage.fleet.fly_show(beside, ORIGIN)).result.is_complete
+
+
+async def test_show_with_member_released_before_start_does_not_start() -> None:
+    """The other tracks were compared with the track of this member, not with the place where it stays."""
+    async with open_stage(2, min_distance_m=4.0) as stage:
+        await stage.take_off(8)
+        show = Show.from_points({name: circle(0, 10.0 * number, 6) for number, name in enumerate(stage.copters)})
+        asyncio.get_running_loop().call_later(0.3, stage.fleet.release, "north/2")
+        with pytest.raises(OperationRejected, match=r"north/2 is released.* the show was not started"):
+            await stage.fleet.fly_show(show, ORIGIN)
+        assert stage.orders_to("north/2") == []
+
+
+async def test_show_does_not_overrule_landing_of_member_that_waits() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off(8)
+        show = Show.from_points({"north/1": circle(0, 0, 6), "north/2": circle(100, 10, 6)})
+        flying = asyncio.create_task(stage.fleet.fly_show(show, ORIGIN))
+        await anyio.sleep(6)  # north/1 is at its first point, north/2 is not.
+        landing = asyncio.create_task(stage.fleet.vehicles["north/1"].land())
+        with pytest.raises(OperationRejected, match=r"north/1 got a newer order .*; the show was not started"):
+            await flying
+        await landing
+        assert stage.modes_ordered("north/1") == ["LAND"]
 
 
 @pytest.mark.parametrize(("block_s", "is_late"), [(4.0, False), (5.8, True)])

@@ -15,7 +15,7 @@ from onboard_peers import autopilot_and_client, payload_and_station
 from aerokit.errors import BusyError, CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.enums import MavCmd, MavFrame, MavParamType, MavResult, MavType
+from aerokit.mavlink.enums import MavCmd, MavFrame, MavMissionResult, MavParamType, MavResult, MavType
 from aerokit.missions import MissionItem
 from aerokit.onboard import CommandRequest, CommandResult, Param, Range
 from aerokit.protocols.servers.commands import MAX_RESULTS
@@ -279,6 +279,25 @@ async def test_position_of_command_int_is_in_degrees() -> None:
         await station.ask(command, m.CommandAck)
     position = found[0].position
     assert (position.latitude_deg, position.altitude_relative_m) == (47.397742, 30.0)
+
+
+async def test_function_that_raises_cancelled_error_has_failed() -> None:
+    cancelled: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+    cancelled.cancel()
+    async with payload_and_station() as (payload, station):
+
+        @payload.command(MavCmd.USER_1)
+        def read(_: CommandRequest) -> None:
+            cancelled.result()
+
+        @payload.missions.on_upload
+        def check(kind: str, items: tuple[MissionItem, ...]) -> None:
+            cancelled.result()
+
+        for _ in range(2):
+            assert (await station.command(MavCmd.USER_1)).result == MavResult.FAILED
+            ack = await station.ask(m.MissionClearAll(*station.target, mission_type=0), m.MissionAck)
+            assert ack.type == MavMissionResult.ERROR
 
 
 async def test_end_of_block_cancels_running_command() -> None:

@@ -430,6 +430,40 @@ async def test_turning_gimbal_stops_at_end_of_block(is_pointed: bool) -> None:
     assert (head.targets[-1].rates is None) == is_pointed
 
 
+async def test_turning_gimbal_whose_pointing_fails_stops_at_block_end() -> None:
+    class Jammed(Head):
+        def point(self, target: GimbalTarget) -> None:
+            if target.angles is not None:
+                raise RuntimeError("jammed")
+            super().point(target)
+
+    head = Jammed()
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(head)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, math.nan, math.nan, 5, 9, 0, 0, 154)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, -30, 0, math.nan, math.nan, 0, 0, 154)
+    assert [target.rates for target in head.targets][1:] == [(0.0, 0.0, 0.0)]
+
+
+async def test_gimbal_ignores_commands_while_component_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing would stop a gimbal that begins to turn while the parameters are written."""
+    head = Head()
+    async with payload_and_station(component_id=154, type=MavType.GIMBAL) as (component, station):
+        component.add_gimbal(head)
+        await station.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, 154)
+
+        async def write_slowly(_: object) -> None:
+            turn = station.command_long(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, math.nan, math.nan, 5, 9, 0, 0, 154)
+            if station.connection.is_open:
+                station.connection.send(turn)
+            await asyncio.sleep(1)
+
+        monkeypatch.setattr(type(component.parameters), "aclose", write_slowly)
+        await component._aclose()
+    assert head.targets == []
+
+
 async def test_error_of_gimbal_is_result_of_command() -> None:
     class Jammed(Head):
         def point(self, target: GimbalTarget) -> None:

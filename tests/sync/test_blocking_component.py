@@ -14,8 +14,11 @@ import pytest
 import aerokit.sync
 from aerokit.errors import CommandRejected, InvalidArgument
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType
-from aerokit.onboard import AutopilotDriver, CameraDriver, CommandRequest, OnboardComponent, Photo, Range
+from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType, WinchActions
+from aerokit.mavlink.message import Message
+from aerokit.missions import waypoint
+from aerokit.onboard import AutopilotDriver, CameraDriver, CommandRequest, OnboardComponent, Photo, Range, WinchDriver
+from aerokit.onboard.host import ComponentHost
 from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS
 
 
@@ -123,6 +126,48 @@ def test_parameters_and_missions_are_used_from_the_program() -> None:
         with pytest.raises(InvalidArgument):
             node.parameters.set("SPEED", 4.0)
         assert node.missions.items() == ()
+
+
+def test_mission_function_runs_in_thread_but_loop_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: dict[str, str] = {}
+
+    def send(self: ComponentHost, message: Message, *arguments: object) -> None:
+        threads[message.NAME] = threading.current_thread().name
+        send_on_loop(self, message, *arguments)  # type: ignore[arg-type]
+
+    send_on_loop = ComponentHost.send
+    with autopilot_and_client() as (node, vehicle):
+        node.missions.replace([waypoint(47.0, 8.0, altitude_relative_m=10)] * 2)
+
+        @node.missions.on_set_current
+        def go_on(_: int) -> None:
+            threads["function"] = threading.current_thread().name
+
+        monkeypatch.setattr(ComponentHost, "send", send)
+        vehicle.command(MavCmd.DO_SET_MISSION_CURRENT, 1)
+        assert node.missions.current == 1
+    assert threads["MISSION_CURRENT"] == threads["COMMAND_ACK"] != threads["function"]
+
+
+def test_winch_started_by_thread_at_block_end_is_stopped() -> None:
+    class Winch(WinchDriver):
+        def set_rate(self, rate_m_s: float) -> None:  # type: ignore[override]
+            has_begun.set()
+            assert may_start.wait(10)
+            calls.append("start")
+
+        def hold(self) -> None:  # type: ignore[override]
+            calls.append("stop")
+            may_start.set()
+
+    has_begun, may_start = threading.Event(), threading.Event()
+    calls: list[str] = []
+    with autopilot_and_client() as (node, vehicle):
+        node.add_winch(Winch())
+        ids = (vehicle.system_id, vehicle.component_id)
+        vehicle.send(m.CommandLong(*ids, MavCmd.DO_WINCH, 0, 1, WinchActions.RATE_CONTROL, 0, 1.0, 0, 0, 0))
+        assert has_begun.wait(10)
+    assert calls == ["stop", "start", "stop"]
 
 
 class Slow(CameraDriver):

@@ -16,6 +16,7 @@ from aerokit.connection.bus import Bus
 from aerokit.connection.tasks import BackgroundTasks
 from aerokit.errors import (
     AerokitError,
+    ConnectionClosed,
     HeartbeatTimeout,
     InvalidArgument,
     OperationRejected,
@@ -32,25 +33,29 @@ if TYPE_CHECKING:
     from aerokit.fleets.events import FleetEvent
     from aerokit.fleets.members import Member
     from aerokit.fleets.policy import PolicyOrder, PolicyRules
+    from aerokit.fleets.separation import Deconfliction
     from aerokit.missions.mission import Mission
     from aerokit.vehicle.vehicle import Vehicle
 
+
+FLEET_CLOSED = "the fleet's block has ended"
 
 START_TOLERANCE_S = 0.001
 """By how much the delay between the starts of two members may be shorter than ``stagger_s``."""
 
 
-async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
+async def wait_to_start(member: Member, delay_s: float, action: str, *, is_safe: bool = False) -> float:
     """Wait ``delay_s`` before a member's order, and then for its next HEARTBEAT if the last one is not recent.
 
     Return the seconds by which the whole wait exceeds ``delay_s``.
 
     Raises:
-        OperationRejected: the computer slept during the wait, or the member is unavailable.
+        OperationRejected: the computer slept during the wait, or the member is unavailable. Unless the action is safe
+            (such as a landing), also if the member was unavailable during the wait, because it has then failed.
         HeartbeatTimeout: the member is silent.
     """
     connection = member.vehicle.connection
-    began_at = connection.now()
+    began_at, absences = connection.now(), member.absences
     await anyio.sleep(delay_s)
     await member.vehicle._sender.await_recent_state()
     if connection._slept_since(began_at) > 0:
@@ -58,6 +63,8 @@ async def wait_to_start(member: Member, delay_s: float, action: str) -> float:
     member.refresh()
     if not member.is_available:
         raise OperationRejected(f"{action}: {member.name} is {member.status}")
+    if member.absences > absences and not is_safe:
+        raise OperationRejected(f"{action}: {member.name} was unavailable before it started; nothing was sent to it")
     return connection.now() - began_at - delay_s
 
 
@@ -74,6 +81,9 @@ class FleetAction:
         is_safe: the action makes the flight safer (hold, land, return), so a member's failure does not stop the others.
         holds_if_cancelled: if the action is cancelled or a function passed by the program raises an error, members that
             have already finished the action are told to hold as well.
+        moves_members: the action overrules older actions: these send its members no orders of their policy, and do not
+            start members that still wait.
+        corridors: the delay of each member, and how late it may start.
     """
 
     def __init__(
@@ -87,11 +97,15 @@ class FleetAction:
         stagger_s: float | None = None,
         is_safe: bool = False,
         holds_if_cancelled: bool = True,
+        moves_members: bool = False,
+        corridors: Deconfliction | None = None,
     ) -> None:
         self.name: str = name
         self._context, self._execute, self._timeout = context, execute, timeout
         self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
+        self._moves_members, self._corridors = moves_members, corridors
+        self._newer_actions: list[FleetAction] = []  # actions that move members and began while this one was running
         requested = list(members)
         for member in requested:
             member.refresh()
@@ -99,6 +113,7 @@ class FleetAction:
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
+        self._final_orders: dict[str, object] = {}  # the vehicle's newest order when the member had finished
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -115,15 +130,20 @@ class FleetAction:
 
     async def run(self) -> FleetResult:
         """Execute the action with all members concurrently, until every member has finished, failed or was stopped."""
+        if self._context.is_closed:
+            raise ConnectionClosed(f"{self.name}: {FLEET_CLOSED}")
         if not self._members:
             return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
+        if self._moves_members:
+            for action in self._context.actions:
+                action._newer_actions.append(self)
         self._context.actions.append(self)
         try:
+            delays_s = {} if self._corridors is None else self._corridors.delays_s
             for index, member in enumerate(self._members):
-                tasks.start(
-                    partial(self._run_member, member, index * self._stagger_s), f"aerokit {self.name} {member.name}"
-                )
+                delay_s = index * self._stagger_s + delays_s.get(member.name, 0.0)
+                tasks.start(partial(self._run_member, member, delay_s), f"aerokit {self.name} {member.name}")
             await self._finished.wait()
         except BaseException:
             self._hold_finished_members()
@@ -156,7 +176,16 @@ class FleetAction:
         names = [member.name for member in self._members]
         # The outcomes have the order of the members, not the order in which the members have finished.
         outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
-        return FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
+        result = FleetResult(self.name, outcomes, failed=self._failed, stopped=self._stopped, skipped=self._skipped)
+        result._final_orders = dict(self._final_orders)
+        return result
+
+    def close(self) -> None:
+        """Make the members that execute the action fail and cancel their tasks, because the fleet's block has ended."""
+        for member in self._members:
+            if member.name not in self._outcomes:
+                self._record_failure(member, ConnectionClosed(f"{self.name}: {FLEET_CLOSED}"))
+                self._cancel_tasks_of([member])
 
     def on_member_unavailable(self, member: Member) -> None:
         """Record that the member has failed because it was lost or taken over."""
@@ -173,11 +202,22 @@ class FleetAction:
         assert task is not None
         self._tasks[member.name] = task
         try:
-            if member.name in self._stopped:  # The policy stopped the member before this task began.
+            if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
-            wait_s = delay_s
+            wait_s, arbiter = delay_s, member.vehicle._arbiter
+            arm_commands, order_before = arbiter.arm_commands_sent, arbiter.newest
             while wait_s > START_TOLERANCE_S:
-                await wait_to_start(member, wait_s, self.name)
+                late_s = await wait_to_start(member, wait_s, self.name, is_safe=self._is_safe)
+                if self._corridors is not None and late_s > self._corridors.slack_s:
+                    raise OperationRejected(
+                        f"{self.name}: {member.name} would start {late_s:.1f} s late, so it stays where it is"
+                    )
+                has_armed = self.name == "arm" and arbiter.arm_commands_sent > arm_commands
+                has_landed = arbiter.newest is not order_before and _is_ending_flight(member)
+                if not self._is_safe and (has_armed or has_landed or self._has_newer_action(member)):
+                    raise OperationRejected(
+                        f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
+                    )
                 # After a blocked event loop, the delays of several members may end at once. Each of them then waits
                 # until `stagger_s` after the last start.
                 wait_s = self._last_start_at + self._stagger_s - self._context.now()
@@ -195,6 +235,7 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
+                self._final_orders[member.name] = member.vehicle._arbiter.newest
                 member.record_success()
         finally:
             del self._tasks[member.name]
@@ -202,6 +243,24 @@ class FleetAction:
 
     def _has_failed_or_stopped(self, member: Member) -> bool:
         return member.name in self._failed or member.name in self._stopped
+
+    def _has_newer_order(self, member: Member, order: PolicyOrder) -> bool:
+        """Return True if the program has given the member a newer order, which this order of the policy must not end.
+
+        This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
+        vehicle to land or to return.
+        """
+        # The landing may also be a part of the action, if it is a function of the program that still runs.
+        is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
+        if _is_ending_flight(member) and order != "land" and not is_ordered_by_action:
+            return True
+        return self._has_newer_action(member)
+
+    def _has_newer_action(self, member: Member) -> bool:
+        """Return True if a newer action of the fleet moves the member or has moved it."""
+        return any(
+            member in action._members and not action._has_failed_or_stopped(member) for action in self._newer_actions
+        )
 
     async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
@@ -221,7 +280,8 @@ class FleetAction:
         self._failed[member.name] = error
         self._outcomes[member.name] = error
         member.record_failure(self.name, error)
-        if self._is_safe or self._context.is_closed:
+        # The program flies a released member separately, so its failure does not concern the others.
+        if self._is_safe or self._context.is_closed or member.state is MemberState.RELEASED:
             return
         self._undecided.append((member, error))
         # This is a nested call from `_apply_policy` below, which refreshes the other members. The outer call handles
@@ -252,7 +312,9 @@ class FleetAction:
             order = orders.get(member.name)
             if order is None:
                 continue
-            if member.is_flown_by_program:
+            if self._has_newer_order(member, order):
+                skipped[member.name] = "it has a newer order"
+            elif member.is_flown_by_program:
                 self._policy_orders[member.name] = order
             elif member.vehicle.is_confirmed_disarmed:
                 skipped[member.name] = "it is disarmed"
@@ -339,7 +401,7 @@ class FleetAction:
         # cancelled. Failed and stopped members get no order.
         for member in self._members if self._holds_if_cancelled else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
-            if has_finished and member.is_flown_by_program:
+            if has_finished and member.is_flown_by_program and not self._has_newer_order(member, "hold"):
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:
@@ -350,6 +412,12 @@ class FleetAction:
     def _on_program_error(self, error: Exception) -> None:
         self.program_error = self.program_error or error
         self._finished.set()
+
+
+def _is_ending_flight(member: Member) -> bool:
+    """Return True if the vehicle's newest order is one of this program to land, return or disarm, and still valid."""
+    newest = member.vehicle._arbiter.newest
+    return newest is not None and newest.ends_flight and not newest.end
 
 
 class FleetContext:
@@ -373,6 +441,7 @@ class FleetContext:
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
+        self.newest_upload: Mapping[str, Mission] = {}  # the missions of the upload that began last
         self.is_closed: bool = False
 
     def start(self) -> None:
@@ -383,6 +452,8 @@ class FleetContext:
         self.is_closed = True
         for member in self.members.values():
             member.stop_monitoring()
+        for action in tuple(self.actions):  # Vehicles that the program passed to the fleet stay connected.
+            action.close()
         await self.background.aclose()
 
     def publish(self, event: FleetEvent) -> None:
@@ -427,6 +498,10 @@ FLIGHT_ENDING_ACTIONS = ("hold", "land", "return_to_launch", "disarm", "mission.
 ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
+# Besides those that end the flight, these actions overrule older ones.
+MOVING_ACTIONS = ("take_off", "go_to", "form", "show", "set_mode", "mission.start")
+
+
 class SelectionBase:
     """Base class of a selection: its members, and the execution of actions by all of them."""
 
@@ -444,6 +519,12 @@ class SelectionBase:
         """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
 
+    def _check_not_ordered_since(self, result: FleetResult, action: str, consequence: str) -> None:
+        """Raise OperationRejected if the program has ordered a member, since it finished a part of the action."""
+        for name, order in result._final_orders.items():
+            if self._context.members[name].vehicle._arbiter.newest is not order:
+                raise OperationRejected(f"{action}: {name} got a newer order on the way; {consequence}")
+
     def __len__(self) -> int:
         return len(self.members)
 
@@ -459,6 +540,7 @@ class SelectionBase:
         stagger_s: float | None = None,
         names: tuple[str, ...] | None = None,
         is_function: bool = False,
+        corridors: Deconfliction | None = None,
     ) -> FleetResult:
         """Execute an action with all members of the selection, or with those in ``names``.
 
@@ -476,4 +558,6 @@ class SelectionBase:
             stagger_s=stagger_s,
             is_safe=is_safe,
             holds_if_cancelled=not is_safe and built_in_action not in ACTIONS_ON_GROUND,
+            moves_members=is_safe or built_in_action in MOVING_ACTIONS,
+            corridors=corridors,
         ).run()

@@ -229,7 +229,7 @@ class Following:
             raise BusyError("a Following can be entered only once; call following() again")
         self._check_leader()
         self._was_entered = True
-        self._action = FleetAction(self._context, "following", self._followers, self._fly_follower)
+        self._action = FleetAction(self._context, "following", self._followers, self._fly_follower, moves_members=True)
         self._tasks.start(self._follow, "aerokit following")
         return self
 

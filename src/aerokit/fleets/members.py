@@ -54,6 +54,8 @@ class Member:
         """The member's state in the fleet."""
         self.reason: str = ""
         """The reason for this state; empty in the state ACTIVE."""
+        self.absences: int = 0
+        """How often the member became unavailable."""
         self._lost_at = 0.0  # when the member was lost
         # The vehicle's newest order and its mode at the time of `reclaim`. The member does not count as taken over
         # until one of them changes.
@@ -166,6 +168,7 @@ class Member:
         if state not in FAILSAFE_STATES:
             self._ignored_failsafe = None  # The ignored failsafe has ended, so the next one counts again.
         if vehicle.is_confirmed_disarmed:  # a disarmed vehicle does not fly, so there is no control to take over
+            self._control_when_reclaimed = None  # If another party arms it next, this is a takeover.
             return ""
         if state is not None and is_worse_failsafe(state, self._ignored_failsafe):
             return f"it is in a failsafe (MAV_STATE {MavState(state).name})"
@@ -224,6 +227,7 @@ class Member:
 
     def _set_state(self, state: MemberState, reason: str) -> None:
         self.state, self.reason = state, reason
+        self.absences += not self.is_available
 
     def _event_fields(self) -> tuple[float, int, str]:
         """Return the first fields of each FleetEvent: the time, and the member's system id and name."""

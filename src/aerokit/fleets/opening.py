@@ -26,6 +26,7 @@ from aerokit.fleets.distances import DistanceMonitor
 from aerokit.fleets.fleet import Fleet
 from aerokit.fleets.members import Member
 from aerokit.fleets.policy import MemberFailure, PolicyDecision, PolicyName, PolicyRules
+from aerokit.mavlink.messages import Heartbeat
 from aerokit.transport.link import Link
 from aerokit.vehicle.connect import connect
 from aerokit.vehicle.vehicle import Vehicle
@@ -43,6 +44,7 @@ TooCloseAction = Literal["hold", "report"]
 Source = str | Link | Connection | Vehicle
 
 DISCOVERY_S = 2.5  # long enough for two heartbeats at 1 Hz, because one may be lost
+HEARTBEAT_MAX_AGE_S = 10.0  # a vehicle of an open connection that was silent for longer has left
 WAIT_WARNING_S = 5.0
 
 
@@ -255,7 +257,10 @@ async def find_systems(
     found: dict[str, dict[int, None]] = {name: dict.fromkeys(requested[name] or ()) for name in networks}
     changed = anyio.Event()
 
-    def on_found(name: str, event: object) -> None:
+    def on_heartbeat(name: str, heartbeat: Heartbeat) -> None:
+        frame = heartbeat.received_frame
+        assert frame is not None
+        event = discovery_event(heartbeat, frame.received_at, frame.system_id, frame.component_id)
         if isinstance(event, VehicleFound) and event.system_id not in networks[name].attached:
             found[name].setdefault(event.system_id)
             changed.set()
@@ -284,10 +289,12 @@ async def find_systems(
         for name in searched:
             connection = networks[name]
             connection.raise_if_ended()
-            detachments.append(connection.bus.attach_event(VehicleFound, partial(on_found, name)))
+            # Not the events VehicleFound, because a vehicle that returns is not found again.
+            detachments.append(connection.bus.attach(Heartbeat, partial(on_heartbeat, name)))
             detachments.append(connection.on_end(lambda _: changed.set()))
             for source, heartbeat in connection.heartbeats.items():
-                on_found(name, discovery_event(heartbeat, connection.now(), *source))
+                if connection.now() - connection.last_heartbeat_at(*source) <= HEARTBEAT_MAX_AGE_S:
+                    on_heartbeat(name, heartbeat)
         with anyio.move_on_after(timeout):
             with warn_while_waiting(timeout, describe_progress):
                 while not is_complete():

@@ -11,7 +11,7 @@ import anyio
 from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit.errors import InvalidArgument, OperationRejected, ValueUnknownError
-from aerokit.fleets.action import SelectionBase, wait_to_start
+from aerokit.fleets.action import SelectionBase
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl, position_of
 from aerokit.fleets.events import PathsCompared
 from aerokit.fleets.members import Member
@@ -74,8 +74,8 @@ class Travel(SelectionBase):
                 ``stagger_s`` is given or ``speed_m_s`` is not the planned speed. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
-                members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
-                Then the others stay in their layers.
+                members, targets or positions, and nothing was sent; or a member became unavailable or got another order
+                between two legs. Then the others stay in their layers.
         """
         if speed_m_s is not None:
             check_range("speed_m_s", speed_m_s, 0, 1000, above=True)
@@ -268,17 +268,11 @@ class Travel(SelectionBase):
         """Fly members straight to their targets. If ``corridors`` has a delay for a member, that member waits first."""
 
         async def fly(member: Member) -> None:
-            if corridors is not None and corridors.delays_s.get(member.name):
-                late_s = await wait_to_start(member, corridors.delays_s[member.name], action)
-                if late_s > corridors.slack_s:
-                    raise OperationRejected(
-                        f"{action}: {member.name} would start {late_s:.1f} s late, so it stays where it is"
-                    )
             await member.vehicle.go_to(
                 targets[member.name], speed_m_s=speed_m_s, timeout=timeout, max_distance_m=max_distance_m
             )
 
-        return await self._run(action, fly, stagger_s=stagger_s, names=names or tuple(targets))
+        return await self._run(action, fly, stagger_s=stagger_s, names=names or tuple(targets), corridors=corridors)
 
     async def _fly_in_layers(
         self,
@@ -304,6 +298,8 @@ class Travel(SelectionBase):
                     f"{action}: {', '.join(missing)} became unavailable after the altitudes were assigned; "
                     + ("nothing was sent" if result is None else "the others stay at their assigned altitudes")
                 )
+            if result is not None:
+                self._check_not_ordered_since(result, action, "the others stay at their assigned altitudes")
             result = await self._fly_to(
                 action, leg, speed_m_s, timeout, max_distance_m=max_distance_m, stagger_s=stagger_s
             )
@@ -350,8 +346,8 @@ class Missions(SelectionBase):
     ) -> FleetResult:
         """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
 
-        :meth:`start_missions` starts the missions, but only if all uploads succeeded. A fleet with a
-        ``min_distance_m`` compares the missions first.
+        :meth:`start_missions` starts the missions, but only if all uploads succeeded, and no newer upload has begun. A
+        fleet with a ``min_distance_m`` compares the missions first.
 
         Args:
             missions: maps names of members to missions.
@@ -373,6 +369,7 @@ class Missions(SelectionBase):
             members[name].vehicle._position.check_reach(
                 f"missions[{name!r}]", positions, max_distance_m, are_items=True
             )
+        missions = self._context.newest_upload = dict(missions)
         self._context.missions.clear()
         if self._context.min_distance_m is not None:
             deconfliction = self.compare_missions(missions)
@@ -386,9 +383,15 @@ class Missions(SelectionBase):
                     missions[member.name], timeout=timeout, max_distance_m=max_distance_m
                 )
 
-        result = await self._run("upload", upload, names=tuple(missions))
+        try:
+            result = await self._run("upload", upload, names=tuple(missions))
+        finally:
+            newest = self._context.newest_upload
+            if newest is not missions and not newest.keys().isdisjoint(missions):
+                self._context.missions.clear()  # This upload may have replaced missions of the newer one.
         result.raise_for_errors()
-        self._context.missions.update(missions)
+        if self._context.newest_upload is missions:  # The missions of two uploads were not compared with each other.
+            self._context.missions.update(missions)
         return result
 
     async def start_missions(self, *, timeout: float = 10.0, stagger_s: float | None = None) -> FleetResult:

@@ -145,6 +145,8 @@ class ComponentCommands:
         self._host, self._tasks = host, tasks
         # Tasks that wait for a handler in a thread. They cannot be cancelled, because a thread cannot be stopped.
         self._tasks_in_threads: set[asyncio.Task[Any] | None] = set()
+        self.thread_calls: set[asyncio.Future[Any]] = set()
+        """Calls of functions in threads that have not returned, also those for which no task waits any more."""
         # Handlers have their own threads. In the loop's few default threads, slow handlers would delay the saving of
         # parameters, which uses them, too.
         self._threads: ThreadPoolExecutor | None = None  # None before the first call in a thread
@@ -203,7 +205,10 @@ class ComponentCommands:
     def begin(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Begin what `call` does, without waiting: return the result, or an awaitable for it."""
         if inspect.iscoroutinefunction(function) or not self.uses_threads:
-            return function(*arguments)
+            try:
+                return function(*arguments)
+            except asyncio.CancelledError as error:  # For example by `result()` of a task that was cancelled.
+                raise RuntimeError("the function raised CancelledError") from error
         return self._call_in_thread(function, *arguments)
 
     async def _call_in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -213,7 +218,10 @@ class ComponentCommands:
             self._threads = ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="aerokit command")
         call = partial(contextvars.copy_context().run, function, *arguments)
         try:
-            result = await asyncio.get_running_loop().run_in_executor(self._threads, call)
+            future = asyncio.get_running_loop().run_in_executor(self._threads, call)
+            self.thread_calls.add(future)
+            future.add_done_callback(self.thread_calls.discard)
+            result = await asyncio.shield(future)  # A thread goes on although its task is cancelled.
         finally:
             self._tasks_in_threads.discard(task)
         return await result if inspect.isawaitable(result) else result
@@ -231,6 +239,8 @@ class ComponentCommands:
 
     def close(self) -> None:
         """End the threads that run no handler."""
+        for call in tuple(self.thread_calls):
+            call.cancel()  # Nothing waits for its result any more.
         if self._threads is not None:
             self._threads.shutdown(wait=False)
 

@@ -101,6 +101,8 @@ class OnboardComponent:
         try:
             await self._tasks.aclose()
         finally:
+            # Nothing could stop a motion, or save a parameter, that arrives after the next lines.
+            self._host.stop_receiving()
             try:
                 await run_shielded(self._stop_and_save())  # A cancelled program must stop and save, too.
             finally:

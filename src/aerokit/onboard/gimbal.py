@@ -162,8 +162,8 @@ class GimbalAdapter(GimbalMount):
             self._motions["gimbal"] = partial(self._gimbal.point, zero_rates)
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
-        self._motions.pop("gimbal", None)
         self._gimbal.point(target)
+        self._motions.pop("gimbal", None)  # If the call above raises, the gimbal may still turn.
         self.flags = flags
         self._is_yaw_locked = target.yaw_locked
         self._followed_system_id = 0  # A newer command ends the following.
@@ -174,8 +174,8 @@ class GimbalAdapter(GimbalMount):
         else:
             latitude_e7, longitude_e7, altitude_amsl_m = place
             position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
-        self._motions.pop("gimbal", None)
         self._gimbal.look_at(position)
+        self._motions.pop("gimbal", None)
         self.flags: int = 0
         # While the gimbal looks at a position, turns of the vehicle do not turn the gimbal.
         self._is_yaw_locked = position is not None

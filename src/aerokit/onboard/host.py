@@ -157,12 +157,16 @@ class ComponentHost:
     def call_later(self, delay: float, action: Callable[[], None]) -> None:
         self.call_at(self.now + delay, action)
 
-    def close(self) -> None:
-        """Stop processing and sending."""
-        self._is_closed = True
+    def stop_receiving(self) -> None:
+        """Ignore all messages from now on. Sending continues."""
         for detach in self._detachments:
             detach()
         self._detachments.clear()
+
+    def close(self) -> None:
+        """Stop processing and sending."""
+        self._is_closed = True
+        self.stop_receiving()
 
     def _guarded(self, action: Callable[[], Any]) -> None:
         """Run code of a protocol server. An exception is logged, and the component continues."""

@@ -145,10 +145,12 @@ class ComponentMissions:
             self._report_refusal("set_current", error)
             return False
 
-    def _do_set_current(self, request: CommandRequest, index: int) -> None:
-        is_accepted = self._server.set_current(index)
-        if not is_accepted:
+    async def _do_set_current(self, _: CommandRequest, index: int) -> None:
+        is_known = 0 <= index < len(self.items())
+        # A coroutine, because the program's function may run in a thread, which must not send.
+        if not is_known or self._on_current is None or await self._commands.call(self._on_current, index) is False:
             raise InvalidArgument(f"the mission cannot continue at item {index}")
+        self.set_current(index)
 
 
 def _result_of(verdict: object) -> int:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -44,8 +45,16 @@ class ComponentServices:
 
     async def stop_motions(self) -> None:
         """Stop these motions, because nobody can order it after the end of the component. Errors are reported."""
-        while self.motions:
-            part, stop = self.motions.popitem()
+        thread_calls = set(self.commands.thread_calls)
+        motions = dict(self.motions)
+        self.motions.clear()
+        await self._call_all(motions)
+        if motions and thread_calls:  # One of these threads may have started the motion again.
+            await asyncio.wait(thread_calls, timeout=STOP_TIMEOUT_S)
+            await self._call_all(motions)
+
+    async def _call_all(self, motions: Mapping[str, Callable[[], Any]]) -> None:
+        for part, stop in motions.items():
             try:
                 with anyio.fail_after(STOP_TIMEOUT_S):
                     await self.commands.call(stop)

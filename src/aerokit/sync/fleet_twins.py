@@ -129,8 +129,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
                 ``stagger_s`` is given or ``speed_m_s`` is not the planned speed. Nothing was sent.
             ValueUnknownError: the position of a member is unknown. Nothing was sent.
             OperationRejected: paths come too close and cannot be separated, or the separation was planned for other
-                members, targets or positions, and nothing was sent; or a member became unavailable during the flight.
-                Then the others stay in their layers.
+                members, targets or positions, and nothing was sent; or a member became unavailable or got another order
+                between two legs. Then the others stay in their layers.
         """
         return self._loop.run(
             self.aio.go_to,
@@ -225,7 +225,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come too close to each other or to a member without a track, or a member is
-                unavailable. Nothing was sent.
+                unavailable; nothing was sent. Or a member became unavailable or got another order on the way to its
+                first point; the show was not started.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """
@@ -300,8 +301,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
     ) -> FleetResult:
         """Upload a mission to each member and verify it; see ``vehicle.mission.upload``.
 
-        :meth:`start_missions` starts the missions, but only if all uploads succeeded. A fleet with a
-        ``min_distance_m`` compares the missions first.
+        :meth:`start_missions` starts the missions, but only if all uploads succeeded, and no newer upload has begun. A
+        fleet with a ``min_distance_m`` compares the missions first.
 
         Args:
             missions: maps names of members to missions.
@@ -537,6 +538,9 @@ class Fleet(FleetTwin, Selection):
 
     def release(self, name: str, reason: str = "released by the program") -> None:
         """Exclude members from new actions until :meth:`reclaim`. Nothing is sent, and running actions continue.
+
+        If a released member then fails in a running action, the policy orders nothing. The followers of a released
+        leader hold, because the fleet no longer knows who flies it.
 
         Args:
             name: a member's name or a pattern.

@@ -144,6 +144,7 @@ class MultiLinkRoutes:
         self.copies: Copies = self._merged.copies
         # Maps (system id, link) to the counters of each component: component id → counters.
         self._counters: dict[tuple[int, int], dict[int, SourceStatistics]] = {}
+        self._stalled: set[int] = set()  # links whose written data stays in this machine's buffers
         self._probes = LinkProbes(link.names, self._choices, bus, send)
         self._states = LinkStates(link, self._choices, now, bus.publish)
         self.status: StateCell[tuple[LinkStatus, ...]] = self._states.cell
@@ -164,6 +165,7 @@ class MultiLinkRoutes:
             choice = self._choices[frame.system_id] = LinkChoice(needs_proof=is_autopilot)
         is_costly = _link_index(peer) in self._link.costly
         candidate = choice.record_heartbeat(_link_index(peer), frame.received_at, is_costly=is_costly)
+        candidate.is_stalled = _link_index(peer) in self._stalled
         is_first_autopilot = is_autopilot and not choice.needs_proof
         if is_first_autopilot:  # The links known so far lead to other components of this system.
             choice.start_with(candidate)
@@ -262,6 +264,8 @@ class MultiLinkRoutes:
     def link_changed(self, link: int, is_available: bool) -> None:
         """Record that a link was lost or is available again, and choose the link for each of its systems."""
         now = self._now()
+        if not is_available:
+            self._stalled.discard(link)
         for system_id, choice in self._choices.items():
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_available = is_available
@@ -272,6 +276,10 @@ class MultiLinkRoutes:
 
     def link_stalled(self, link: int, is_stalled: bool) -> None:
         now = self._now()
+        if is_stalled:
+            self._stalled.add(link)
+        else:
+            self._stalled.discard(link)
         for system_id, choice in self._choices.items():
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_stalled = is_stalled

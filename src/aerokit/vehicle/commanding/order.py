@@ -199,8 +199,8 @@ class Order:
         self._mode_now = None if mode_before is None else mode_before.custom_mode
         self._armed_now = armed_before
         self._last_state = state_before
-        # An order that ends the flight (land, return, disarm) stays valid during a failsafe.
-        self._ends_flight = ends_flight
+        self.ends_flight: bool = ends_flight
+        """True for an order to land, return or disarm, which stays valid during a failsafe."""
         self._ends_on_mode_change = ends_on_mode_change
         self._ends_on_disarm = ends_on_disarm
         self._is_newest = is_newest
@@ -219,7 +219,7 @@ class Order:
         """Text that explains why no command of the order may be sent; empty while commands may be sent."""
         if not self.is_newest:
             return SUPERSEDED
-        return self.takeover_reason or ("" if self._ends_flight else self.failsafe)
+        return self.takeover_reason or ("" if self.ends_flight else self.failsafe)
 
     @property
     def is_effect_due(self) -> bool:
