@@ -560,9 +560,10 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
-        """Write a frame to the peers that lead to the target of ``message``; ``to`` replaces its target system.
+        """Write a frame to the peers that lead to the target of ``message``.
 
-        A frame without a target goes to all peers. Return False if no peer leads to the target: nothing was sent.
+        With ``to``, write it to the peers that lead to this system instead. The frame itself is unchanged. A frame
+        without a target goes to all peers. Return False if no peer leads to the target: nothing was sent.
         """
         system_id = getattr(message, "target_system", 0) if to is None else to
         peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)

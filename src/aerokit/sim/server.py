@@ -140,7 +140,7 @@ class SimulatorServer:
         self._end(error)
 
     def _end(self, error: BaseException | None) -> None:
-        """Stop. If a vehicle has failed, raise `failure`, unless ``error``, which has ended the block, is `failure`."""
+        """Stop. If a vehicle has failed, raise `failure`, unless the block already raises it as ``error``."""
         self._stop()
         owner = self._owner
         self._owner = None

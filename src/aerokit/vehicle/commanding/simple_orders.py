@@ -57,9 +57,10 @@ class Argument(Snapshot):
 
 
 class Effect(Snapshot):
-    """Effect of an order: the class name of the message that reports it, and a predicate for the message.
+    """Describes how the vehicle reports that a command has taken effect.
 
-    ``is_reported(message, *values)`` is called with each message; ``values`` are those passed to `SimpleOrder.send`.
+    ``message`` is the class name of the message with the report. ``is_reported(message, *values)`` is called with each
+    such message, and returns True if it reports the effect. ``values`` are those passed to `SimpleOrder.send`.
     """
 
     message: str
