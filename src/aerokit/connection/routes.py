@@ -86,9 +86,10 @@ class RouteClaim:
         return self._sequence_matches is not False and self._clock_matches is True
 
     def has_replaced(self, now: float, rate: float) -> bool:
-        """Return True if the claim continues the owner's stream with at least three frames, while the owner sent none.
+        """Return True if the claim has continued the owner's stream for long enough, with at least three frames.
 
-        In the same time, the owner would have sent at least three frames at its ``rate`` (frames per second).
+        The time is long enough if the owner would have sent three frames in it at its ``rate`` (frames per second). A
+        frame of the owner ends the claim.
         """
         return (
             self.continues_owner

@@ -55,13 +55,13 @@ class Deconfliction(Snapshot):
 
     - ``"clear"``: no conflicts;
     - ``"layers"``: all vehicles climb to ``heights_m``, cross there, and descend after all have crossed;
-    - ``"corridors"``: each vehicle starts after its delay in ``delays_s``;
+    - ``"corridors"``: the vehicles fly the direct paths at ``speed_m_s``, each after its delay in ``delays_s``;
+      a vehicle that would start more than ``slack_s`` seconds late does not start;
     - ``"refused"``: the conflicts cannot be resolved.
 
-    ``conflicts`` are those that the direct paths would have without layers or corridors. Heights are in metres above
-    sea level. In corridors, all vehicles fly at ``speed_m_s``, and a vehicle that would start more than ``slack_s``
-    seconds late does not start. ``routes`` are the paths that were compared; ``stationary`` has the positions of the
-    members that do not move. Both are in metres north and east of the first route's target, and above sea level.
+    ``conflicts`` are those of the direct paths, without layers and delays. ``heights_m`` are above sea level.
+    ``routes`` has the paths that were compared, and ``stationary`` the positions of members that do not move. Their
+    coordinates are metres north and east of the first route's target, and metres above sea level.
     """
 
     decision: Literal["clear", "layers", "corridors", "refused"]

@@ -111,7 +111,7 @@ class Px4PlaneFlight(Px4Flight):
         super().enter(mode)
 
     def update(self) -> None:
-        """Fly for one tick as the present mode commands."""
+        """Fly for one tick in the present mode."""
         plane = self._plane
         mode, mission = plane.mode, plane.mission
         self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)

@@ -40,7 +40,7 @@ MAX_SILENCE_S = 5.0
 class CameraLink(CameraOrders):
     """One camera, addressed by component id, and by device id if it is attached to the autopilot.
 
-    Without a ``number``, the link binds to the first camera that is found.
+    ``number`` is one of these ids. Without it, the link binds to the first camera that is found.
     """
 
     def __init__(

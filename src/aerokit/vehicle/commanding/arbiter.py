@@ -63,23 +63,20 @@ class CommandArbiter:
         self._arming_accepted_at = -math.inf
         self.last_disarmed_report_at: float = -math.inf
         """Time of the last HEARTBEAT that reported disarmed."""
-        # Time of the last change from disarmed to armed, and the order that records that this program caused it; None
-        # if another party armed the vehicle.
-        self._last_arming_at = -math.inf
+        self._last_arming_at = -math.inf  # time of the last change from disarmed to armed
+        # The order of this program that caused this change; None if another party armed the vehicle.
         self._arming_order: Order | None = None
         # The newest steering order, and the auxiliary orders in progress.
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
-        # Modes of orders that were replaced, or whose block was left, before HEARTBEAT reported them, with that time.
+        # (time, mode) of each order that was replaced, or whose block was left, before HEARTBEAT reported its mode.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
-        # Number of `changing_mode` blocks that are open. Then the numbers of two mode changes: of the last one with an
-        # unknown result, and of the last one that was confirmed.
-        self._open_mode_changes = 0
-        self._doubted_change = 0
-        self._confirmed_change = 0
+        self._open_mode_changes = 0  # number of `changing_mode` blocks that are open
+        self._doubted_change = 0  # number of the last mode change with an unknown result
+        self._confirmed_change = 0  # number of the last mode change that was confirmed
         # The newest order about each topic, even if it was withdrawn or has ended.
         self._latest: dict[Topic, Order] = {}
         self._ordered_since_disarmed: set[Topic] = set()

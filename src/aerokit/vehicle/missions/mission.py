@@ -164,7 +164,8 @@ class MissionEndDetector:
         if is_mode_expected and not session.telemetry.is_confirmed_disarmed:
             self._left_at = None
             return None
-        # The mission's end also changes the mode. Its report may arrive after the mode change, so wait for END_GRACE_S.
+        # The end of the mission also changes the mode. The vehicle may report the mode before the end, so wait for
+        # END_GRACE_S before the mode counts as a failure.
         if self._left_at is None:
             self._left_at = now
         if now - self._left_at < END_GRACE_S or now < self._mode_grace_until:
