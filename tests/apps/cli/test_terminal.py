@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from cli_harness import HOME, run_on, run_with
 
-from aerokit.apps.cli import main
+from aerokit.apps.cli import main, output
 from aerokit.apps.cli import terminal as asking
 from aerokit.apps.cli.output import can_print, emit, nonblocking_stderr, plain_warnings
 from aerokit.parameters.renames import ParameterRenamedWarning
@@ -161,6 +161,22 @@ def test_confirm_reads_redirected_input(
     with (tmp_path / "input").open(encoding="utf-8") as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
         assert asyncio.run(asyncio.wait_for(asking.confirm("fly?"), 10.0)) is is_confirmed
+
+
+def test_text_that_another_thread_has_written_raises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+
+    def can_print_while_other_thread_writes(stream: object) -> bool:
+        monkeypatch.setattr(output, "can_print", lambda stream: True)
+        sys.stderr.flush()
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", terminal)
+        with nonblocking_stderr():
+            monkeypatch.setattr(output, "can_print", can_print_while_other_thread_writes)
+            sys.stderr.write("one")
+    assert terminal.getvalue() == "one"
 
 
 @pytest.mark.parametrize(("command", "question"), [("logs erase", "erase all"), ("camera format", "format the")])

@@ -170,6 +170,7 @@ def test_recording_of_fast_simulation_says_so(tmp_path: Path) -> None:
         return " ".join(read_flight(write_tlog(tmp_path / "log.tlog", messages)).notes)
 
     assert "simulation at 20 times real speed" in notes(range(0, 600_000, 20_000))
+    assert "simulation at 2000 times real speed" in notes(range(0, 60_000_000, 2_000_000))
     assert "simulation at 0.5 times real speed" in notes(range(0, 60_000, 500))
     assert "simulation" not in notes(range(0, 60_000, 1000))
     # Reboots and delayed messages are no sign of another speed.

@@ -94,7 +94,7 @@ class _NonblockingStream:
         return len(text)
 
     def flush(self, *, waits: bool = False) -> None:
-        with suppress(OSError):
+        with suppress(OSError, IndexError):  # IndexError: another thread has just written the last text.
             while self._unwritten and (waits or can_print(self._stream)):
                 self._stream.write(self._unwritten.popleft())
                 self._stream.flush()

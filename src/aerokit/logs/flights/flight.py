@@ -159,7 +159,7 @@ class Silence(Snapshot):
     ends_s: float
     """Time of the first message after the silence, or the end of the log."""
     is_recorded: bool
-    """True if the log contains other systems' messages during the silence. Otherwise the recording may have paused."""
+    """True if other systems' messages show that the recording ran for at least 3 s of the silence."""
 
 
 class Waypoint(Snapshot):

@@ -39,8 +39,8 @@ _ARMED, _DISARMED = 10, 11  # events (EV) that old logs have instead of ARM
 _HOME = 1
 # A position within this distance of 0° N 0° E is not real: the estimator has no position yet.
 _NULL_ISLAND_DEG = 0.01
-# A row is damaged if it is later than the next row of its table by more than _MAX_DISORDER_S, or than the last but one
-# row of every table by more than _MAX_LATE_S.
+# A row is damaged if it is later than the next row of its table, or earlier than the previous one, by more than
+# _MAX_DISORDER_S, or if it is later than the last but one row of every table by more than _MAX_LATE_S.
 _MAX_DISORDER_S, _MAX_LATE_S = 1.0, 3600.0
 _SAME_SETPOINT_S = 0.005  # PSCN and PSCE rows with times that differ by at most this are one set-point
 _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the rows
@@ -140,14 +140,15 @@ class _Tables:
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        """Return False if a row is later than the whole log, or than the next row, which agrees with the one before.
+        """Return False if a row is later than the whole log, or does not fit two adjacent rows that fit each other.
 
         Rows have no checksum. One wrong time would move all later rows of a `TimeSeries`.
         """
-        before = times[row - 1] if row else 0.0
-        after = times[row + 1] if row + 1 < len(times) else math.inf
-        is_between = times[row] <= after + _MAX_DISORDER_S or not 0.0 <= before <= after + _MAX_DISORDER_S
-        return times[row] <= self._max_s and is_between
+        time = times[row]
+        before = times[row - 1] if row else time
+        after = times[row + 1] if row + 1 < len(times) else time
+        is_outlier = time > after + _MAX_DISORDER_S or time < before - _MAX_DISORDER_S
+        return time <= self._max_s and not (is_outlier and 0.0 <= before <= after + _MAX_DISORDER_S)
 
     def _first_time(self) -> int:
         """Return the time of the first row in the file, which may be in any table."""

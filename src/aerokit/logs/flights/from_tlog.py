@@ -40,7 +40,8 @@ _HEARTBEAT_ID = b"\0\0\0"
 _NO_POSITION, _NO_VELOCITY, _NO_ATTITUDE = 0x7, 0x38, 0x80
 # If a record is earlier than the previous one by more than this, the recording's clock was set back.
 _MAX_DISORDER_S = 1.0
-# If a record is later than the previous one by more than this, it is damaged, unless the next record has that time too.
+# If the time of a record differs from the previous one by more than this, the record is damaged, unless the next record
+# has a similar time.
 _DOUBTFUL_JUMP_S = 3600.0
 # Older positions are not used to convert local set-points to global ones.
 _POSITION_MAX_AGE_S = 2.0
@@ -149,7 +150,7 @@ class _Reader:
                 if not records:
                     begins_at = previous_unix_s = unix_s
                 elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
-                    if unix_s - previous_unix_s > _DOUBTFUL_JUMP_S:
+                    if abs(unix_s - previous_unix_s) > _DOUBTFUL_JUMP_S:
                         if not abs(unix_s - doubtful_unix_s) <= _DOUBTFUL_JUMP_S:
                             doubtful_unix_s = unix_s
                             damaged += 1
@@ -177,10 +178,9 @@ class _Reader:
                     if sequence != expected_sequence or unix_s >= next_second_unix_s:
                         if unix_s - last_frame_at >= MIN_SILENCE_S:
                             link.add_silence(last_frame_at - begins_at, unix_s - begins_at, paused_s)
-                            paused_s = 0.0
                         next_second_s = link.count(unix_s - begins_at, sequence, expected_sequence, new_frames)
                         next_second_unix_s, new_frames = begins_at + next_second_s, 0
-                    last_frame_at = unix_s
+                    last_frame_at, paused_s = unix_s, 0.0
                     expected_sequence = (sequence + 1) & 0xFF
                     if message_id not in handlers_of_vehicle:
                         continue

@@ -6,6 +6,7 @@ import math
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
+from aerokit._internal.formatting import format_value
 from aerokit.logs.flights.flight import Silence, TimeSeries
 
 if TYPE_CHECKING:
@@ -144,8 +145,8 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
     recorded_s = flight.duration_s
     flight.speed = speed
     flight.notes.append(
-        f"this is a simulation at {speed:.3g} times real speed, as the vehicle's clock shows: all times and durations"
-        f" in this report are simulated; the recording took {recorded_s:.0f} s"
+        f"this is a simulation at {format_value(speed)} times real speed, as the vehicle's clock shows: all times and"
+        f" durations in this report are simulated; the recording took {recorded_s:.0f} s"
     )
     for series in _all_series(flight):
         for row, time_s in enumerate(series.times):
