@@ -442,7 +442,8 @@ class FleetContext:
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
-        self.newest_upload: Mapping[str, Mission] = {}  # the missions of the upload that began last
+        # The missions of the upload that began last; empty if an older upload may have replaced one of them.
+        self.newest_upload: Mapping[str, Mission] = {}
         self.is_closed: bool = False
 
     def start(self) -> None:
