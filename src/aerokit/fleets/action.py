@@ -236,7 +236,7 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                self._final_orders[member.name] = member.vehicle._arbiter.latest(STEERING)
+                self._final_orders[member.name] = newest_order(member)
                 member.record_success()
         finally:
             del self._tasks[member.name]
@@ -415,6 +415,11 @@ class FleetAction:
         self._finished.set()
 
 
+def newest_order(member: Member) -> object:
+    """Return the newest order of this program that flies the vehicle; None if there is none."""
+    return member.vehicle._arbiter.latest(STEERING)
+
+
 def _is_ending_flight(member: Member) -> bool:
     """Return True if the vehicle's newest order is one of this program to land, return or disarm, and still valid."""
     newest = member.vehicle._arbiter.newest
@@ -534,11 +539,11 @@ class SelectionBase:
         """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
 
-    def _check_not_ordered_since(self, result: FleetResult, action: str, consequence: str) -> None:
-        """Raise OperationRejected if the program has ordered a member, since it finished a part of the action."""
-        for name, order in result._final_orders.items():
-            if self._context.members[name].vehicle._arbiter.latest(STEERING) is not order:
-                raise OperationRejected(f"{action}: {name} got a newer order on the way; {consequence}")
+    def _check_not_ordered_since(self, orders: Mapping[str, object], action: str, consequence: str) -> None:
+        """Raise OperationRejected if the newest order of a member is no longer the one in ``orders``."""
+        for name, order in orders.items():
+            if newest_order(self._context.members[name]) is not order:
+                raise OperationRejected(f"{action}: {name} got a newer order meanwhile; {consequence}")
 
     def __len__(self) -> int:
         return len(self.members)

@@ -299,7 +299,9 @@ class Travel(SelectionBase):
                     + ("nothing was sent" if result is None else "the others stay at their assigned altitudes")
                 )
             if result is not None:
-                self._check_not_ordered_since(result, action, "the others stay at their assigned altitudes")
+                self._check_not_ordered_since(
+                    result._final_orders, action, "the others stay at their assigned altitudes"
+                )
             result = await self._fly_to(
                 action, leg, speed_m_s, timeout, max_distance_m=max_distance_m, stagger_s=stagger_s
             )
