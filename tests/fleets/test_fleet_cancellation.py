@@ -264,6 +264,22 @@ async def test_failure_of_released_member_stops_no_others() -> None:
         assert stage.modes_ordered("north/1") == stage.modes_ordered("north/3") == []
 
 
+async def test_cancelled_action_does_not_end_newer_orbit() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        places = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        targets = {"north/1": places["north/1"], "north/2": places["north/2"].offset(north_m=300)}
+        older = asyncio.create_task(stage.fleet.go_to(targets))
+        await anyio.sleep(5)
+        center = places["north/1"].offset(north_m=15)
+        orbit = asyncio.create_task(stage.fleet["north/1"].do("orbit", center, radius_m=15))
+        await anyio.sleep(2)
+        older.cancel()
+        await anyio.sleep(2)
+        assert not orbit.done()
+        assert stage.modes == {"north/1": "GUIDED", "north/2": "BRAKE"}
+
+
 async def test_cancelled_action_holds_no_member_with_newer_order() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()

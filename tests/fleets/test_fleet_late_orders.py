@@ -101,6 +101,16 @@ async def test_waiting_member_with_newer_order_does_not_start(action: str) -> No
         assert stage.modes_ordered("north/2") == ["LAND" if action == "land" else "BRAKE"]
 
 
+async def test_newer_hold_ends_staggered_landing() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        landing = asyncio.create_task(stage.fleet.land(stagger_s=3))
+        await anyio.sleep(1)
+        await stage.fleet["north/2"].hold()
+        assert "got a newer order before it started" in str((await landing).failed["north/2"])
+        assert stage.modes_ordered("north/2") == ["BRAKE"]
+
+
 async def test_staggered_members_that_were_landing_before_start() -> None:
     async with open_stage(2) as stage:
         await stage.take_off()

@@ -236,6 +236,35 @@ async def test_upload_that_ends_after_newer_one_voids_it() -> None:
             await stage.fleet.start_missions()
 
 
+async def test_upload_that_ends_during_newer_one_voids_it() -> None:
+    async with open_stage(3) as stage:
+        (climb, place, landing) = mission_of(10)
+        older_missions = {"north/1": Mission([climb, *[place] * 50, landing]), "north/2": mission_of(10)}
+        newer_missions = {"north/2": mission_of(20), "north/3": Mission([climb, *[place] * 200, landing])}
+        older = asyncio.create_task(stage.fleet.upload(older_missions, max_concurrent=1))
+        await anyio.sleep(0.01)
+        newer = asyncio.create_task(stage.fleet.upload(newer_missions))
+        await older
+        assert not newer.done()
+        await newer
+        with pytest.raises(OperationRejected, match="call upload"):
+            await stage.fleet.start_missions()
+
+
+async def test_upload_that_ends_after_newer_one_without_replacing_it_voids_nothing() -> None:
+    async with open_stage(2) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.arm()).raise_for_errors()
+        (climb, place, landing) = mission_of(10)
+        long = Mission([climb, *[place] * 300, landing])
+        older = asyncio.create_task(stage.fleet.upload({"north/2": mission_of(10), "north/1": long}))
+        await anyio.sleep(0.01)
+        await stage.fleet.upload({"north/2": mission_of(20)})
+        assert not older.done()
+        await older
+        assert list(await stage.fleet.start_missions()) == ["north/2"]
+
+
 async def test_upload_conflicting_missions_is_rejected() -> None:
     async with open_stage(2, min_distance_m=5.0) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()

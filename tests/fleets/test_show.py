@@ -151,17 +151,41 @@ async def test_show_with_member_released_before_start_does_not_start() -> None:
         assert stage.orders_to("north/2") == []
 
 
-async def test_show_does_not_overrule_landing_of_member_that_waits() -> None:
+@pytest.mark.parametrize("is_posted", [False, True])
+async def test_show_does_not_overrule_landing_of_member_that_waits(is_posted: bool) -> None:
     async with open_stage(2) as stage:
         await stage.take_off(8)
         show = Show.from_points({"north/1": circle(0, 0, 6), "north/2": circle(100, 10, 6)})
         flying = asyncio.create_task(stage.fleet.fly_show(show, ORIGIN))
         await anyio.sleep(6)  # north/1 is at its first point, north/2 is not.
-        landing = asyncio.create_task(stage.fleet.vehicles["north/1"].land())
+        vehicle = stage.fleet.vehicles["north/1"]
+
+        async def land() -> None:
+            if not is_posted:
+                await vehicle.land()
+                return
+            mode = vehicle.autopilot.find_mode("LAND")
+            with vehicle.posted("mode", modes=(mode,)) as posted:
+                await posted.set_mode(mode)
+
+        landing = asyncio.create_task(land())
         with pytest.raises(OperationRejected, match=r"north/1 got a newer order .*; the show was not started"):
             await flying
         await landing
         assert stage.modes_ordered("north/1") == ["LAND"]
+
+
+async def test_show_does_not_overrule_landing_during_clock_measurement() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off(8)
+        show = Show.from_points({"north/1": circle(0, 0, 6), "north/2": circle(0, 10, 6)})
+        flying = asyncio.create_task(stage.fleet.fly_show(show, ORIGIN))
+        await anyio.sleep(0.1)
+        landing = asyncio.create_task(stage.fleet.vehicles["north/1"].land())
+        with pytest.raises(OperationRejected, match=r"north/1 got a newer order .*; the show was not started"):
+            await flying
+        await landing
+        assert stage.orders_to("north/2") == []
 
 
 @pytest.mark.parametrize(("block_s", "is_late"), [(4.0, False), (5.8, True)])

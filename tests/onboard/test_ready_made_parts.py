@@ -531,6 +531,23 @@ async def test_block_ends_although_winch_never_stops() -> None:
     assert any("stopping the winch" in text.text for text in texts)
 
 
+async def test_parameters_are_saved_although_stopping_winch_raises_cancelled_error(tmp_path: Path) -> None:
+    class Motorized(Reel):
+        async def hold(self) -> None:
+            motor = asyncio.ensure_future(asyncio.sleep(math.inf))
+            motor.cancel()
+            await motor
+
+    path = tmp_path / "parameters.json"
+    async with payload_and_station(component_id=169, type=MavType.WINCH, parameters_file=path) as (component, station):
+        component.add_winch(Motorized())
+        component.parameters.add("SPEED", 1.0)
+        await station.command(MavCmd.DO_WINCH, 1, WinchActions.RATE_CONTROL, 0, 1.0)
+        component.parameters.set("SPEED", 2.0)
+        await component._aclose()
+    assert "2.0" in path.read_text()
+
+
 async def test_winch_pays_out_and_retracts() -> None:
     spool = Spool()
     async with device_and_client(169, MavType.WINCH) as (component, vehicle):

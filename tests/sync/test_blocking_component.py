@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -17,7 +18,17 @@ from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavResult, MavType, WinchActions
 from aerokit.mavlink.message import Message
 from aerokit.missions import waypoint
-from aerokit.onboard import AutopilotDriver, CameraDriver, CommandRequest, OnboardComponent, Photo, Range, WinchDriver
+from aerokit.onboard import (
+    AutopilotDriver,
+    CameraDriver,
+    CommandRequest,
+    GimbalDriver,
+    GimbalTarget,
+    OnboardComponent,
+    Photo,
+    Range,
+    WinchDriver,
+)
 from aerokit.onboard.host import ComponentHost
 from aerokit.protocols.servers.commands import MAX_RUNNING_COMMANDS
 
@@ -168,6 +179,23 @@ def test_winch_started_by_thread_at_block_end_is_stopped() -> None:
         vehicle.send(m.CommandLong(*ids, MavCmd.DO_WINCH, 0, 1, WinchActions.RATE_CONTROL, 0, 1.0, 0, 0, 0))
         assert has_begun.wait(10)
     assert calls == ["stop", "start", "stop"]
+
+
+def test_turning_gimbal_is_stopped_on_event_loop() -> None:
+    class Head(GimbalDriver):
+        def point(self, target: GimbalTarget) -> None:
+            threads.append(threading.current_thread().name)
+
+        def attitude(self) -> tuple[float, float, float]:
+            return (0.0, 0.0, 0.0)
+
+    threads: list[str] = []
+    with autopilot_and_client() as (node, vehicle):
+        node.add_gimbal(Head())
+        vehicle.command(MavCmd.DO_GIMBAL_MANAGER_CONFIGURE, 255, 190, -1, -1, 0, 0, vehicle.component_id)
+        vehicle.command(MavCmd.DO_GIMBAL_MANAGER_PITCHYAW, math.nan, math.nan, 5, 9, 0, 0, vehicle.component_id)
+    assert len(threads) == 2
+    assert threads[0] == threads[1]
 
 
 class Slow(CameraDriver):

@@ -25,6 +25,7 @@ from aerokit.errors import (
 from aerokit.fleets.events import PolicyApplied, PolicyCompleted
 from aerokit.fleets.members import MemberState
 from aerokit.fleets.policy import FleetResult, MemberFailure
+from aerokit.vehicle.commanding.arbiter import STEERING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -113,7 +114,7 @@ class FleetAction:
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
-        self._final_orders: dict[str, object] = {}  # the vehicle's newest order when the member had finished
+        self._final_orders: dict[str, object] = {}  # the newest steering order when the member had finished
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -214,7 +215,7 @@ class FleetAction:
                     )
                 has_armed = self.name == "arm" and arbiter.arm_commands_sent > arm_commands
                 has_landed = arbiter.newest is not order_before and _is_ending_flight(member)
-                if not self._is_safe and (has_armed or has_landed or self._has_newer_action(member)):
+                if has_armed or has_landed or self._has_newer_action(member):
                     raise OperationRejected(
                         f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
                     )
@@ -235,7 +236,7 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                self._final_orders[member.name] = member.vehicle._arbiter.newest
+                self._final_orders[member.name] = newest_order(member)
                 member.record_success()
         finally:
             del self._tasks[member.name]
@@ -414,6 +415,11 @@ class FleetAction:
         self._finished.set()
 
 
+def newest_order(member: Member) -> object:
+    """Return the newest order of this program that flies the vehicle; None if there is none."""
+    return member.vehicle._arbiter.latest(STEERING)
+
+
 def _is_ending_flight(member: Member) -> bool:
     """Return True if the vehicle's newest order is one of this program to land, return or disarm, and still valid."""
     newest = member.vehicle._arbiter.newest
@@ -441,7 +447,8 @@ class FleetContext:
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
-        self.newest_upload: Mapping[str, Mission] = {}  # the missions of the upload that began last
+        # The missions of the upload that began last; empty if an older upload may have replaced one of them.
+        self.newest_upload: Mapping[str, Mission] = {}
         self.is_closed: bool = False
 
     def start(self) -> None:
@@ -499,7 +506,20 @@ ACTIONS_ON_GROUND = ("arm", "wait_ready", "upload")
 
 
 # Besides those that end the flight, these actions overrule older ones.
-MOVING_ACTIONS = ("take_off", "go_to", "form", "show", "set_mode", "mission.start")
+MOVING_ACTIONS = (
+    "take_off",
+    "go_to",
+    "form",
+    "show",
+    "set_mode",
+    "set_heading",
+    "orbit",
+    "loiter",
+    "figure_eight",
+    "land_on",
+    "mission.start",
+    "mission.resume",
+)
 
 
 class SelectionBase:
@@ -519,11 +539,11 @@ class SelectionBase:
         """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
 
-    def _check_not_ordered_since(self, result: FleetResult, action: str, consequence: str) -> None:
-        """Raise OperationRejected if the program has ordered a member, since it finished a part of the action."""
-        for name, order in result._final_orders.items():
-            if self._context.members[name].vehicle._arbiter.newest is not order:
-                raise OperationRejected(f"{action}: {name} got a newer order on the way; {consequence}")
+    def _check_not_ordered_since(self, orders: Mapping[str, object], action: str, consequence: str) -> None:
+        """Raise OperationRejected if the newest order of a member is no longer the one in ``orders``."""
+        for name, order in orders.items():
+            if newest_order(self._context.members[name]) is not order:
+                raise OperationRejected(f"{action}: {name} got a newer order meanwhile; {consequence}")
 
     def __len__(self) -> int:
         return len(self.members)

@@ -16,6 +16,7 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, OperationRejected, OperationTimeout, StaleValueError
+from aerokit.fleets.action import newest_order
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.members import Member
@@ -358,8 +359,8 @@ class Shows(Travel):
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come too close to each other or to a member without a track, or a member is
-                unavailable; nothing was sent. Or a member became unavailable or got another order on the way to its
-                first point; the show was not started.
+                unavailable; nothing was sent. Or a member became unavailable or got another order before all were at
+                their first points; the show was not started.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """
@@ -369,13 +370,15 @@ class Shows(Travel):
         local_origin, origin_amsl_m = self._local_origin(show, origin)
         self._check_show(show, local_origin, origin_amsl_m)
         names = tuple(show.tracks)
+        orders_before = {name: newest_order(self.members[name]) for name in names}
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
+        self._check_not_ordered_since(orders_before, "fly_show", "the show was not started")
         start_positions = self._start_positions(show, local_origin, origin_amsl_m)
         arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
         self._check_available(show, "the show was not started")
-        self._check_not_ordered_since(arrived, "fly_show", "the show was not started")
+        self._check_not_ordered_since(arrived._final_orders, "fly_show", "the show was not started")
         begin_at = self._context.now() + start_in_s
         max_late_s = math.inf if self._context.min_distance_m is None else CONFLICT_SLACK_S
         recorders: dict[str, TrackRecorder] = {}

@@ -299,7 +299,9 @@ class Travel(SelectionBase):
                     + ("nothing was sent" if result is None else "the others stay at their assigned altitudes")
                 )
             if result is not None:
-                self._check_not_ordered_since(result, action, "the others stay at their assigned altitudes")
+                self._check_not_ordered_since(
+                    result._final_orders, action, "the others stay at their assigned altitudes"
+                )
             result = await self._fly_to(
                 action, leg, speed_m_s, timeout, max_distance_m=max_distance_m, stagger_s=stagger_s
             )
@@ -379,16 +381,15 @@ class Missions(SelectionBase):
 
         async def upload(member: Member) -> None:
             async with slots[member.network]:
+                newest = self._context.newest_upload
+                if newest is not missions and member.name in newest:  # This transfer may replace the newer mission.
+                    self._context.newest_upload = {}
+                    self._context.missions.clear()
                 await member.vehicle.mission.upload(
                     missions[member.name], timeout=timeout, max_distance_m=max_distance_m
                 )
 
-        try:
-            result = await self._run("upload", upload, names=tuple(missions))
-        finally:
-            newest = self._context.newest_upload
-            if newest is not missions and not newest.keys().isdisjoint(missions):
-                self._context.missions.clear()  # This upload may have replaced missions of the newer one.
+        result = await self._run("upload", upload, names=tuple(missions))
         result.raise_for_errors()
         if self._context.newest_upload is missions:  # The missions of two uploads were not compared with each other.
             self._context.missions.update(missions)

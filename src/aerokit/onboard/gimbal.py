@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import TYPE_CHECKING
 
 from aerokit._internal.values import Snapshot
@@ -158,8 +157,10 @@ class GimbalAdapter(GimbalMount):
         roll, pitch, yaw = (math.degrees(max(-limit, min(limit, rate))) for rate in rates)
         self._apply(GimbalTarget(angles=None, rates=(roll, pitch, yaw), yaw_locked=locked), flags)
         if any(rates):
-            zero_rates = GimbalTarget(angles=None, rates=(0.0, 0.0, 0.0), yaw_locked=locked)
-            self._motions["gimbal"] = partial(self._gimbal.point, zero_rates)
+            self._motions["gimbal"] = self._stop
+
+    async def _stop(self) -> None:  # A coroutine function, because plain functions may be called in a thread.
+        self._gimbal.point(GimbalTarget(angles=None, rates=(0.0, 0.0, 0.0), yaw_locked=self._is_yaw_locked))
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
         self._gimbal.point(target)

@@ -138,7 +138,7 @@ class ComponentHost:
         if len(text) % CHUNK_SIZE == 0:  # A full chunk does not end the text, so an empty chunk must follow.
             self.send(m.Statustext(severity, "", id=self._text_id, chunk_seq=len(text) // CHUNK_SIZE))
 
-    def report_error(self, subject: str, error: Exception) -> None:
+    def report_error(self, subject: str, error: BaseException) -> None:
         """Send an exception of the program's code as a status text, and log it unless it is an AerokitError."""
         text = f"{subject}: {error_text(error)}"
         if not isinstance(error, AerokitError):
@@ -178,6 +178,6 @@ class ComponentHost:
             logger.exception("component %d/%d: unexpected error", self.system_id, self.component_id)
 
 
-def error_text(error: Exception) -> str:
+def error_text(error: BaseException) -> str:
     """Return the text of an exception, or the name of its type if it has none."""
     return str(error) or type(error).__name__

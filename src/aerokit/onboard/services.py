@@ -58,7 +58,7 @@ class ComponentServices:
             try:
                 with anyio.fail_after(STOP_TIMEOUT_S):
                     await self.commands.call(stop)
-            except Exception as error:
+            except (Exception, asyncio.CancelledError) as error:  # A driver may await a task that it has cancelled.
                 self.host.report_error(f"stopping the {part}", error)
 
     def add_message(self, message_type: type[Message], function: Callable[[], Message | None], hz: float) -> None:

@@ -225,8 +225,8 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Raises:
             InvalidArgument: a track has no member, or an argument is out of range. Nothing was sent.
             OperationRejected: tracks come too close to each other or to a member without a track, or a member is
-                unavailable; nothing was sent. Or a member became unavailable or got another order on the way to its
-                first point; the show was not started.
+                unavailable; nothing was sent. Or a member became unavailable or got another order before all were at
+                their first points; the show was not started.
             FleetError: a member did not answer TIMESYNC or did not reach its first point. The show was not started.
             ValueUnknownError: the position of a member is unknown.
         """

@@ -653,6 +653,20 @@ async def test_px4_setpoint_stream_cancelled_while_entering_holds() -> None:
             assert not flight.wire.setpoints()
 
 
+async def test_following_cancelled_before_target_is_known_keeps_mode_of_other_station() -> None:
+    """The other station has chosen the mode that the stream would have set."""
+    async with in_the_air() as flight:
+        assert flight.copter.set_mode(LOITER)
+        await anyio.sleep(2.0)
+        asyncio.get_running_loop().call_later(1.0, flight.copter.set_mode, GUIDED)
+        with anyio.move_on_after(3.0) as scope:
+            async with flight.vehicle.follow(lambda: None, valid_for_s=5):
+                raise AssertionError("entered")
+        assert scope.cancelled_caught
+        await anyio.sleep(5.0)
+        assert flight.vehicle.mode_name == "GUIDED"
+
+
 async def test_px4_entry_cancelled_before_offboard_request_keeps_pilot() -> None:
     async with open_px4() as flight:
         await flight.take_off()

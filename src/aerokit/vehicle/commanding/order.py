@@ -263,7 +263,8 @@ class Order:
         is_change = not is_first_report and number != self._mode_now
         is_settled = reported_at >= self.settles_at
         is_expected = number in self._expected_modes and number in self._accepted_modes
-        if is_change and (number in self._own_modes or is_expected):  # An effect of this or of an earlier order.
+        is_own_effect = self.was_sent and number in self._own_modes
+        if is_change and (is_own_effect or is_expected):  # An effect of this or of an earlier order.
             self.may_move = True
         if number in self._own_modes:
             self.is_confirmed = self.is_confirmed or is_change
