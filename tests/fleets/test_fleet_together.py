@@ -251,7 +251,7 @@ async def test_upload_that_ends_during_newer_one_voids_it() -> None:
             await stage.fleet.start_missions()
 
 
-async def test_upload_that_ends_after_newer_one_without_replacing_it_voids_nothing() -> None:
+async def test_older_upload_that_replaces_nothing_voids_nothing() -> None:
     async with open_stage(2) as stage:
         (await stage.fleet.wait_ready()).raise_for_errors()
         (await stage.fleet.arm()).raise_for_errors()

@@ -163,6 +163,7 @@ class FakeFlight:
         self.telemetry = SimpleNamespace(velocity=self.velocity, position=self.position)
         self.connection = SimpleNamespace(now=lambda: self.now, unix_time=lambda: 1e9 + self.now)
         self.autopilot = SimpleNamespace(vehicle_type=MavType.QUADROTOR, firmware="ArduCopter")
+        self.parameters = SimpleNamespace(known=lambda name: None)
         self._session = self
         self.watch = FlightWatch(self)  # type: ignore[arg-type]
 

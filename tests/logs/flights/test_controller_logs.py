@@ -179,13 +179,15 @@ def test_tables_of_similar_names_lose_no_rows(tmp_path: Path, monkeypatch: pytes
 
 @pytest.mark.parametrize("wrong_us", [10**15, 0])
 @pytest.mark.parametrize("row", [(20.05, "POS", 0x83), (20.05, "ATT", 0x84), (38.0, "ARM", 0x87)])
-def test_row_with_impossible_time_changes_nothing_else(row: Row, wrong_us: int, logs: Logs, tmp_path: Path) -> None:
+def test_row_with_impossible_time_changes_nothing_else(
+    row: tuple[float, str, int], wrong_us: int, logs: Logs, tmp_path: Path
+) -> None:
     """A row has no checksum, so the time of a damaged row may be any number."""
     time_s, table, number = row
     values = {"POS": (0, 0, 0.0, 0.0), "ATT": (0.0,) * 6, "ARM": (1,)}[table]
     logs.read_bin((time_s, table, values), without="")
     path = tmp_path / "flight.bin"
-    begin = b"\xa3\x95" + bytes((int(number),)) + round(time_s * 1e6).to_bytes(8, "little")
+    begin = b"\xa3\x95" + bytes((number,)) + round(time_s * 1e6).to_bytes(8, "little")
     wrong = begin[:3] + wrong_us.to_bytes(8, "little")
     assert path.read_bytes().count(begin) == 1
     path.write_bytes(path.read_bytes().replace(begin, wrong))

@@ -273,7 +273,7 @@ def test_clock_set_by_hours_is_no_damage(tmp_path: Path) -> None:
         assert not any("damaged" in note for note in flight.notes)
 
 
-def test_pauses_before_first_message_of_vehicle_are_not_counted_in_its_silence(tmp_path: Path) -> None:
+def test_pauses_before_first_message_do_not_count_as_silence(tmp_path: Path) -> None:
     rows = [(float(time_s), 255) for time_s in (0, 20, 40, *range(60, 75))]
     rows += [(float(time_s), 1) for time_s in (*range(50, 60), *range(75, 80))]
     (silence,) = heartbeats(tmp_path / "log.tlog", sorted(rows)).silences

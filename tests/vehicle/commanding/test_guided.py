@@ -653,7 +653,7 @@ async def test_px4_setpoint_stream_cancelled_while_entering_holds() -> None:
             assert not flight.wire.setpoints()
 
 
-async def test_following_cancelled_before_target_is_known_keeps_mode_of_other_station() -> None:
+async def test_following_cancelled_without_target_keeps_mode_of_other_station() -> None:
     """The other station has chosen the mode that the stream would have set."""
     async with in_the_air() as flight:
         assert flight.copter.set_mode(LOITER)

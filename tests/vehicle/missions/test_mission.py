@@ -215,6 +215,7 @@ async def test_without_mission_state_second_flight_is_waited_for(monkeypatch: py
 
 async def test_px4_completion_reported_during_slow_start_is_ignored() -> None:
     async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
         mission = flight.vehicle.mission
         await mission.start()
         await mission.wait_finished(timeout=60)
