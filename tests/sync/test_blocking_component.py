@@ -144,7 +144,7 @@ def test_mission_function_runs_in_thread_but_loop_answers(monkeypatch: pytest.Mo
 
     def send(self: ComponentHost, message: Message, *arguments: object) -> None:
         threads[message.NAME] = threading.current_thread().name
-        send_on_loop(self, message, *arguments)  # type: ignore[arg-type]
+        send_on_loop(self, message, *arguments)
 
     send_on_loop = ComponentHost.send
     with autopilot_and_client() as (node, vehicle):
