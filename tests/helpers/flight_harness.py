@@ -190,7 +190,7 @@ class HeldHeartbeats:
         self._receiver.bytes_received(self._held[0], None)
 
 
-def speed_of(copter: SimulatedCopter) -> float:
+def speed_of(copter: SimulatedCopter | SimulatedPx4) -> float:
     motion = copter.motion
     return math.hypot(motion.velocity_north, motion.velocity_east, motion.velocity_down)
 
