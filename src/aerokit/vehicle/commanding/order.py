@@ -158,7 +158,7 @@ class Order:
         self.modes: tuple[Mode, ...] = tuple(modes)
         self.armed = armed
         """True if the order arms the vehicle, False if it disarms it, None if it does neither."""
-        self.may_move = False
+        self.may_move: bool = False
         """True once the vehicle may move because of this or an earlier order; if abandoned, it must then hold."""
         self.was_refused: bool = False
         """True if the vehicle refused the order, and therefore continues its previous task."""
