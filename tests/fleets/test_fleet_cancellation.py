@@ -7,7 +7,7 @@ from typing import Any
 
 import anyio
 import pytest
-from fleet_stage import open_stage
+from fleet_stage import Stage, open_stage
 from flight_harness import attached_sinks, now, waiting_on_cells
 
 from aerokit.connection.opening import open_connection
@@ -264,14 +264,20 @@ async def test_failure_of_released_member_stops_no_others() -> None:
         assert stage.modes_ordered("north/1") == stage.modes_ordered("north/3") == []
 
 
+async def flight_with_one_arrival(stage: Stage) -> asyncio.Task[Any]:
+    """Begin a flight of two members: north/1 is at its target already, and north/2 flies 300 m."""
+    await stage.take_off()
+    places = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+    targets = {"north/1": places["north/1"], "north/2": places["north/2"].offset(north_m=300)}
+    flight = asyncio.create_task(stage.fleet.go_to(targets))
+    await anyio.sleep(5)
+    return flight
+
+
 async def test_cancelled_action_does_not_end_newer_orbit() -> None:
     async with open_stage(2) as stage:
-        await stage.take_off()
-        places = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
-        targets = {"north/1": places["north/1"], "north/2": places["north/2"].offset(north_m=300)}
-        older = asyncio.create_task(stage.fleet.go_to(targets))
-        await anyio.sleep(5)
-        center = places["north/1"].offset(north_m=15)
+        older = await flight_with_one_arrival(stage)
+        center = stage.fleet.vehicles["north/1"].position.value.offset(north_m=15)
         orbit = asyncio.create_task(stage.fleet["north/1"].do("orbit", center, radius_m=15))
         await anyio.sleep(2)
         older.cancel()
@@ -282,11 +288,7 @@ async def test_cancelled_action_does_not_end_newer_orbit() -> None:
 
 async def test_cancelled_action_holds_no_member_with_newer_order() -> None:
     async with open_stage(2) as stage:
-        await stage.take_off()
-        places = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
-        targets = {"north/1": places["north/1"], "north/2": places["north/2"].offset(north_m=300)}
-        older = asyncio.create_task(stage.fleet.go_to(targets))
-        await anyio.sleep(5)
+        older = await flight_with_one_arrival(stage)
         landing = asyncio.create_task(stage.fleet["north/1"].land())
         await anyio.sleep(2)
         older.cancel()

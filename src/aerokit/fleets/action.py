@@ -45,30 +45,6 @@ START_TOLERANCE_S = 0.001
 """By how much the delay between the starts of two members may be shorter than ``stagger_s``."""
 
 
-async def wait_to_start(member: Member, delay_s: float, action: str, *, is_safe: bool = False) -> float:
-    """Wait ``delay_s`` before a member's order, and then for its next HEARTBEAT if the last one is not recent.
-
-    Return the seconds by which the whole wait exceeds ``delay_s``.
-
-    Raises:
-        OperationRejected: the computer slept during the wait, or the member is unavailable. Unless the action is safe
-            (such as a landing), also if the member was unavailable during the wait, because it has then failed.
-        HeartbeatTimeout: the member is silent.
-    """
-    connection = member.vehicle.connection
-    began_at, absences = connection.now(), member.absences
-    await anyio.sleep(delay_s)
-    await member.vehicle._sender.await_recent_state()
-    if connection._slept_since(began_at) > 0:
-        raise OperationRejected(f"{action}: the computer slept before {member.name} started; nothing was sent to it")
-    member.refresh()
-    if not member.is_available:
-        raise OperationRejected(f"{action}: {member.name} is {member.status}")
-    if member.absences > absences and not is_safe:
-        raise OperationRejected(f"{action}: {member.name} was unavailable before it started; nothing was sent to it")
-    return connection.now() - began_at - delay_s
-
-
 class FleetAction:
     """One run of an action.
 
@@ -208,11 +184,7 @@ class FleetAction:
             wait_s, arbiter = delay_s, member.vehicle._arbiter
             arm_commands, order_before = arbiter.arm_commands_sent, arbiter.newest
             while wait_s > START_TOLERANCE_S:
-                late_s = await wait_to_start(member, wait_s, self.name, is_safe=self._is_safe)
-                if self._corridors is not None and late_s > self._corridors.slack_s:
-                    raise OperationRejected(
-                        f"{self.name}: {member.name} would start {late_s:.1f} s late, so it stays where it is"
-                    )
+                await self._wait_to_start(member, wait_s)
                 has_armed = self.name == "arm" and arbiter.arm_commands_sent > arm_commands
                 has_landed = arbiter.newest is not order_before and _is_ending_flight(member)
                 if has_armed or has_landed or self._has_newer_action(member):
@@ -241,6 +213,30 @@ class FleetAction:
         finally:
             del self._tasks[member.name]
             self._check_finished()
+
+    async def _wait_to_start(self, member: Member, delay_s: float) -> None:
+        """Wait ``delay_s`` before a member's order, and then for its next HEARTBEAT if the last one is not recent.
+
+        Raises:
+            OperationRejected: the computer slept during the wait, the member is unavailable, or it would start too late
+                in its corridor. Unless the action is safe (such as a landing), also if the member was unavailable
+                during the wait, because it has then failed.
+            HeartbeatTimeout: the member is silent.
+        """
+        connection, name = member.vehicle.connection, member.name
+        began_at, absences = connection.now(), member.absences
+        await anyio.sleep(delay_s)
+        await member.vehicle._sender.await_recent_state()
+        if connection._slept_since(began_at) > 0:
+            raise OperationRejected(f"{self.name}: the computer slept before {name} started; nothing was sent to it")
+        member.refresh()
+        if not member.is_available:
+            raise OperationRejected(f"{self.name}: {name} is {member.status}")
+        if member.absences > absences and not self._is_safe:
+            raise OperationRejected(f"{self.name}: {name} was unavailable before it started; nothing was sent to it")
+        late_s = connection.now() - began_at - delay_s
+        if self._corridors is not None and late_s > self._corridors.slack_s:
+            raise OperationRejected(f"{self.name}: {name} would start {late_s:.1f} s late, so it stays where it is")
 
     def _has_failed_or_stopped(self, member: Member) -> bool:
         return member.name in self._failed or member.name in self._stopped
@@ -538,6 +534,13 @@ class SelectionBase:
     def vehicles(self) -> Mapping[str, Vehicle]:
         """Maps names to vehicles."""
         return {name: member.vehicle for name, member in self.members.items()}
+
+    @staticmethod
+    def _check_available(member: Member, action: str, consequence: str) -> None:
+        """Raise OperationRejected if the member is unavailable now."""
+        member.refresh()
+        if not member.is_available:
+            raise OperationRejected(f"{action}: {member.name} is {member.status}; {consequence}")
 
     def _check_not_ordered_since(self, orders: Mapping[str, object], action: str, consequence: str) -> None:
         """Raise OperationRejected if the newest order of a member is no longer the one in ``orders``."""

@@ -16,11 +16,10 @@ from aerokit._internal.arguments import checked
 from aerokit._internal.async_block import async_block
 from aerokit._internal.formatting import short_repr
 from aerokit.connection.connection import Connection
-from aerokit.connection.heartbeats import discovery_event
+from aerokit.connection.heartbeats import is_autopilot
 from aerokit.connection.opening import explain_no_vehicle, open_connection
 from aerokit.connection.tasks import BackgroundTasks, run_shielded
 from aerokit.errors import ConnectFailed, InvalidArgument
-from aerokit.events import VehicleFound
 from aerokit.fleets.action import FleetContext
 from aerokit.fleets.distances import DistanceMonitor
 from aerokit.fleets.fleet import Fleet
@@ -260,9 +259,8 @@ async def find_systems(
     def on_heartbeat(name: str, heartbeat: Heartbeat) -> None:
         frame = heartbeat.received_frame
         assert frame is not None
-        event = discovery_event(heartbeat, frame.received_at, frame.system_id, frame.component_id)
-        if isinstance(event, VehicleFound) and event.system_id not in networks[name].attached:
-            found[name].setdefault(event.system_id)
+        if is_autopilot(heartbeat) and frame.system_id not in networks[name].attached:
+            found[name].setdefault(frame.system_id)
             changed.set()
 
     def is_complete() -> bool:

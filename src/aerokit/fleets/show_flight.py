@@ -377,7 +377,8 @@ class Shows(Travel):
         start_positions = self._start_positions(show, local_origin, origin_amsl_m)
         arrived = await self.go_to(start_positions, speed_m_s=speed_m_s)
         arrived.raise_for_errors()
-        self._check_available(show, "the show was not started")
+        for name in names:
+            self._check_available(self.members[name], "fly_show", "the show was not started")
         self._check_not_ordered_since(arrived._final_orders, "fly_show", "the show was not started")
         begin_at = self._context.now() + start_in_s
         max_late_s = math.inf if self._context.min_distance_m is None else CONFLICT_SLACK_S
@@ -428,17 +429,10 @@ class Shows(Travel):
             for name, start in starts.items()
         }
 
-    def _check_available(self, show: Show, consequence: str) -> None:
-        """Raise OperationRejected if a member with a track is unavailable."""
-        for name in show.tracks:
-            member = self.members[name]
-            member.refresh()
-            if not member.is_available:
-                raise OperationRejected(f"fly_show: {name} is {member.status}; {consequence}")
-
     def _check_show(self, show: Show, origin: LocalOrigin, origin_amsl_m: float) -> None:
         """Raise OperationRejected if a member is unavailable, or if tracks or other members come too close."""
-        self._check_available(show, "nothing was sent")
+        for name in show.tracks:
+            self._check_available(self.members[name], "fly_show", "nothing was sent")
         min_m = self._context.min_distance_m
         if min_m is None:
             return

@@ -494,9 +494,7 @@ class Missions(SelectionBase):
                     f"missions: {short_repr(name)} is not a member; members: {', '.join(self.members)}"
                 )
             member = self.members[name]
-            member.refresh()
-            if not member.is_available:
-                raise OperationRejected(f"missions: {name} is {member.status}; nothing was sent")
+            self._check_available(member, "missions", "nothing was sent")
             members[name] = member
         return members
 

@@ -164,9 +164,13 @@ class GimbalAdapter(GimbalMount):
 
     def _apply(self, target: GimbalTarget, flags: int) -> None:
         self._gimbal.point(target)
-        self._motions.pop("gimbal", None)  # If the call above raises, the gimbal may still turn.
-        self.flags = flags
-        self._is_yaw_locked = target.yaw_locked
+        self._record(flags, is_yaw_locked=target.yaw_locked)
+
+    def _record(self, flags: int, *, is_yaw_locked: bool) -> None:
+        """Record an executed command. If the program's method raises, the gimbal may still turn as before."""
+        self._motions.pop("gimbal", None)
+        self.flags: int = flags
+        self._is_yaw_locked = is_yaw_locked
         self._followed_system_id = 0  # A newer command ends the following.
 
     def look_at(self, place: Place | None) -> None:
@@ -176,11 +180,8 @@ class GimbalAdapter(GimbalMount):
             latitude_e7, longitude_e7, altitude_amsl_m = place
             position = Position(latitude_e7 / 1e7, longitude_e7 / 1e7, altitude_amsl_m=altitude_amsl_m)
         self._gimbal.look_at(position)
-        self._motions.pop("gimbal", None)
-        self.flags: int = 0
         # While the gimbal looks at a position, turns of the vehicle do not turn the gimbal.
-        self._is_yaw_locked = position is not None
-        self._followed_system_id = 0
+        self._record(0, is_yaw_locked=position is not None)
 
     def follow(self, system_id: int) -> None:
         self._followed_system_id = system_id

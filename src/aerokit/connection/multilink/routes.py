@@ -264,13 +264,12 @@ class MultiLinkRoutes:
     def link_changed(self, link: int, is_available: bool) -> None:
         """Record that a link was lost or is available again, and choose the link for each of its systems."""
         now = self._now()
-        if not is_available:
+        if not is_available:  # A lost link has no unsent data.
             self._stalled.discard(link)
         for system_id, choice in self._choices.items():
             if (candidate := choice.candidates.get(link)) is not None:
                 candidate.is_available = is_available
-                if not is_available:
-                    candidate.is_stalled = False  # A lost link has no unsent data.
+                candidate.is_stalled = link in self._stalled
                 self._choose(system_id, choice, now)
         self._states.set_state(link, LinkState.CONNECTED if is_available else LinkState.LOST, now)
 

@@ -65,7 +65,7 @@ class CalibrationRun:
         self._started_at = math.inf
         self._cancel_sent_at: float | None = None  # when the cancel command was last sent
         # Holds the order that cancels the calibration. The arbiter keeps this order until the stack is closed.
-        self._cancel_order_stack = ExitStack()
+        self._cleanup = ExitStack()
         self._cancel_command_status: SentCommand | None = None
         self._has_rebooted = False
         self._is_abandoned = False
@@ -104,8 +104,9 @@ class CalibrationRun:
         self._cannot_cancel_reason = cannot_cancel_reason
         self._started_at = self.session.connection.now()
         self._runs.append(self)
-        self._detach_finish = self.context.on_finish(self.abandon)
+        self._cleanup.callback(self.context.on_finish(self.abandon))
         self.session.on_reboot.append(self._on_reboot)
+        self._cleanup.callback(self.session.on_reboot.remove, self._on_reboot)
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
         """Send a command of the calibration and wait for its answer. The results in ``accepts`` raise no error."""
@@ -129,11 +130,9 @@ class CalibrationRun:
         """Register that the calibration has ended on the vehicle."""
         if not self._ended.is_set():
             self._ended.set()
-            self._cancel_order_stack.close()  # The cancel command, if one was sent, need not be repeated.
+            self._cleanup.close()  # This also withdraws the cancel command, if one was sent: it need not be repeated.
             if self in self._runs:
                 self._runs.remove(self)
-                self._detach_finish()
-                self.session.on_reboot.remove(self._on_reboot)
 
     def _on_reboot(self) -> None:
         self._has_rebooted = True
@@ -158,8 +157,8 @@ class CalibrationRun:
         arbiter = self.context.arbiter
         # When another party takes over, the arbiter ends this order, and `_confirm_cancel` then sends no more cancel
         # commands.
-        order = self._cancel_order_stack.enter_context(arbiter.auxiliary_order())
-        self._cancel_command_status = self._cancel_order_stack.enter_context(arbiter.sending(order))
+        order = self._cleanup.enter_context(arbiter.auxiliary_order())
+        self._cancel_command_status = self._cleanup.enter_context(arbiter.sending(order))
         if self.session.connection.is_open and arbiter.is_state_recent:
             self._send_cancel(*self._cancel_command)
         self._is_unconfirmed = True

@@ -396,7 +396,7 @@ class CommandArbiter:
             modes,
             ending_topics,
             {mode.custom_mode for mode in (*newest_modes, *late_modes, *self._posted_modes())},
-            settles_at=max(self.mode_settles_at, self._now() + MODE_GRACE_S) if late_modes else self.mode_settles_at,
+            settles_at=self._now() + MODE_GRACE_S if late_modes else self.mode_settles_at,
             any_until=self._any_mode_until,
             ends_flight=ends_flight,
         )

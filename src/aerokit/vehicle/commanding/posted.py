@@ -156,6 +156,7 @@ class PostedOrder:
         """
         await self._sender.await_effect(
             "posted order",
+            self._order,
             self._refusals,
             is_done=self._is_done,
             failure_reason=lambda: None,

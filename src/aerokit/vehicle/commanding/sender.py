@@ -155,11 +155,7 @@ class OrderSender:
             if was_in_doubt:
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
-            try:
-                await self.await_mode(mode, order, refusals, remaining_s, reported_since)
-            except CommandRejected:  # PX4 may refuse a mode that it has accepted.
-                order.was_refused = True
-                raise
+            await self.await_mode(mode, order, refusals, remaining_s, reported_since)
             self._arbiter.settle_mode()
 
     async def request_mode(
@@ -210,6 +206,7 @@ class OrderSender:
 
         await self.await_effect(
             f"set_mode({mode.name})",
+            order,
             refusals,
             is_done=is_reported,
             failure_reason=lambda: order.end or None,
@@ -219,6 +216,7 @@ class OrderSender:
     async def await_effect(
         self,
         operation: str,
+        order: Order,
         refusals: list[CommandAck],
         *,
         is_done: Callable[[], bool],
@@ -254,6 +252,7 @@ class OrderSender:
         except OperationRejected:
             if not refusals:
                 raise
+            order.was_refused = True
             error = rejection(refusals[-1].command, refusals[-1].result)
             error.args = (f"{operation}: {ACCEPTANCE_REVOKED}: {error}",)
             raise self._session.with_reasons(error, started) from None
