@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import aerokit
-from aerokit.logs.flights import FlightLog, read_flight
+from aerokit.logs.flights import read_flight
 from aerokit.logs.flights.tlog_missions import RecordedMission
 from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavFtpOpcode
@@ -45,11 +45,9 @@ def ftp(opcode: int, **fields: Any) -> m.FileTransferProtocol:
 
 
 def recorded(messages: list[m.FileTransferProtocol]) -> list[tuple[int, int]]:
-    flight = FlightLog(Path("unused.tlog"))
-    flight.system_id = 1
-    mission = RecordedMission(flight)
+    mission = RecordedMission(1)
     for message in messages:
-        mission.on_file_transfer(0.0, message)
+        mission.add(0.0, message)
     return [(item.number, item.command) for item in mission.waypoints]
 
 

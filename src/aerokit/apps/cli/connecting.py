@@ -13,8 +13,8 @@ import anyio
 
 from aerokit.apps.cli.arguments import add_baud, address, number, system_id
 from aerokit.apps.cli.completion import addresses, set_completions
-from aerokit.apps.cli.output import DONE, add_json, emit_done
-from aerokit.apps.cli.terminal import on_interrupt, waiting
+from aerokit.apps.cli.output import DONE, add_json, emit, emit_done
+from aerokit.apps.cli.terminal import confirm, is_interactive, on_interrupt, waiting
 from aerokit.connection.opening import OBSERVER_SYSTEM_ID
 from aerokit.errors import ConnectFailed, InvalidArgument
 
@@ -171,6 +171,17 @@ def add_action(
     action.set_defaults(run=run)
     add_json(action)
     return action
+
+
+async def is_declined(options: argparse.Namespace, action: str, question: str, outcome: str) -> bool:
+    """Ask a question before a connection is opened, unless ``--yes`` is given. Say "nothing was ``outcome``" after no.
+
+    The answer is no if stdin is not a terminal.
+    """
+    if options.yes or (is_interactive() and await confirm(question)):
+        return False
+    emit(options, "declined", {"action": action}, f"not confirmed; nothing was {outcome}")
+    return True
 
 
 def command_action(

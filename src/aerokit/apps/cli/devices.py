@@ -10,9 +10,8 @@ from urllib.parse import unquote
 import anyio
 
 from aerokit.apps.cli.arguments import directory, integer, number
-from aerokit.apps.cli.connecting import add_action, command_action, connected
+from aerokit.apps.cli.connecting import add_action, command_action, connected, is_declined
 from aerokit.apps.cli.output import DONE, FAILED, emit, emit_done
-from aerokit.apps.cli.terminal import confirm, is_interactive
 from aerokit.errors import AerokitError
 from aerokit.position import Position
 
@@ -180,8 +179,7 @@ async def _streams(options: argparse.Namespace) -> int:
 
 
 async def _format(options: argparse.Namespace) -> int:
-    if not (options.yes or (is_interactive() and await confirm("format the camera's storage?"))):
-        emit(options, "declined", {"action": "camera format"}, "not confirmed; nothing was formatted")
+    if await is_declined(options, "camera format", "format the camera's storage?", "formatted"):
         return FAILED
     async with _camera(options) as camera:
         await camera.format_storage()

@@ -9,9 +9,9 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import directory
-from aerokit.apps.cli.connecting import add_action, command_action, connected
+from aerokit.apps.cli.connecting import add_action, command_action, connected, is_declined
 from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing, emit, emit_done
-from aerokit.apps.cli.terminal import confirm, is_interactive, progress_bar
+from aerokit.apps.cli.terminal import progress_bar
 from aerokit.connection.frame_observers import keep_existing
 from aerokit.errors import InvalidArgument
 
@@ -171,8 +171,7 @@ def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequenc
 
 
 async def _erase(options: argparse.Namespace) -> int:
-    if not (options.yes or (is_interactive() and await confirm("erase all flight logs of the vehicle?"))):
-        emit(options, "declined", {"action": "logs erase"}, "not confirmed; nothing was erased")
+    if await is_declined(options, "logs erase", "erase all flight logs of the vehicle?", "erased"):
         return FAILED
     async with connected(options, changes=True) as vehicle:
         await vehicle.logs.erase(idle_timeout_s=options.patience)

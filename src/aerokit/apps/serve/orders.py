@@ -68,6 +68,7 @@ class OrderType:
     """One type of order: its arguments, and the function that runs it.
 
     ``is_safe`` is True for an order that stops, lands or disarms the vehicle. It is sent even to a silent vehicle.
+    ``holds_at_end`` is True if the vehicle is commanded to hold when the server ends while the order runs.
     ``parse`` takes the arguments of the request. It returns those to record, and those to pass to ``run``.
     """
 
@@ -76,6 +77,7 @@ class OrderType:
     run: Callable[[Vehicle, dict[str, Any]], Awaitable[object]]
     arguments: Mapping[str, OrderArgument] = field(default_factory=dict)
     is_safe: bool = False
+    holds_at_end: bool = False
     parse: Callable[[Mapping[str, Any]], tuple[dict[str, Any], dict[str, Any]]] = _parse_unchanged
     max_body_size: int = MAX_BODY_SIZE
 
@@ -237,8 +239,14 @@ UPLOAD = OrderType(
 ORDERS = (
     OrderType("arm", "Arm the motors: propellers may start to turn", lambda vehicle, _: vehicle.arm()),
     OrderType("disarm", "Stop the motors, on the ground", _disarm, _DISARM, is_safe=True),
-    OrderType("take_off", "Take off and climb", lambda vehicle, values: vehicle.take_off(**values), _ALTITUDE),
-    OrderType("go_to", "Go to a position", _go_to, _GO_TO),
+    OrderType(
+        "take_off",
+        "Take off and climb",
+        lambda vehicle, values: vehicle.take_off(**values),
+        _ALTITUDE,
+        holds_at_end=True,
+    ),
+    OrderType("go_to", "Go to a position", _go_to, _GO_TO, holds_at_end=True),
     OrderType("hold", "Stop and hold position", _hold, is_safe=True),
     OrderType("land", "Land at the current position", lambda vehicle, _: vehicle.land(), is_safe=True),
     OrderType(
@@ -249,18 +257,22 @@ ORDERS = (
     ),
     OrderType("mode", "Change the flight mode", lambda vehicle, values: vehicle.set_mode(values["mode"]), _MODE),
     UPLOAD,
-    OrderType("mission/start", "Fly the mission", lambda vehicle, values: vehicle.mission.start(**values), _ITEM),
+    OrderType(
+        "mission/start",
+        "Fly the mission",
+        lambda vehicle, values: vehicle.mission.start(**values),
+        _ITEM,
+        holds_at_end=True,
+    ),
     OrderType("mission/pause", "Pause the mission", _pause, is_safe=True),
-    OrderType("mission/resume", "Resume the mission, in the air", _resume),
+    OrderType("mission/resume", "Resume the mission, in the air", _resume, holds_at_end=True),
 )
 SET_PARAMETER = OrderType("set_parameter", "Set a parameter", _set_parameter, _VALUE)
 
 
-def _end_note(order_type: OrderType) -> str:
-    """Return what happens to a running order when the server ends (docs/reliability.md)."""
-    if order_type.name in ("take_off", "go_to", "mission/start", "mission/resume"):
-        return "the vehicle is commanded to hold, unless it is silent or another party has taken over"
-    return "the vehicle may have executed it, or may continue it"
+# What happens to a running order when the server ends (docs/reliability.md).
+_HOLDS_NOTE = "the vehicle is commanded to hold, unless it is silent or another party has taken over"
+_UNKNOWN_NOTE = "the vehicle may have executed it, or may continue it"
 
 
 _RECORD_FIELDS = (
@@ -293,6 +305,11 @@ class OrderRecord:
     replaced_by: str | None = None
     """Key of the later order that replaced this one."""
     ended: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def fail(self, error: Exception) -> dict[str, Any]:
+        """Record that the order has failed, and return the problem that the API shows."""
+        self.state, self.problem = "failed", problem_of(error)
+        return self.problem
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields of the order that the API shows."""
@@ -427,16 +444,13 @@ class OrderRunner:
             record.result = to_jsonable(await order_type.run(vehicle, arguments))
             record.state = "done"
         except asyncio.CancelledError:
-            record.state = "failed"
-            record.problem = problem_of(
-                HttpProblem(503, "Ended", f"the server ended before {order_type.name} did; {_end_note(order_type)}")
-            )
+            end_note = _HOLDS_NOTE if order_type.holds_at_end else _UNKNOWN_NOTE
+            record.fail(HttpProblem(503, "Ended", f"the server ended before {order_type.name} did; {end_note}"))
             raise
         except Exception as error:
-            record.state = "failed"
-            record.problem = problem_of(error)
+            problem = record.fail(error)
             record.replaced_by = self._replacing(record, error)
-            if record.problem["status"] == 500:
+            if problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
             self._end(vehicle, record)
@@ -444,8 +458,7 @@ class OrderRunner:
     def _end_unstarted(self, vehicle: Vehicle, record: OrderRecord) -> None:
         """End an order whose task was cancelled before its first step, so that no request waits for it."""
         if not record.ended.is_set():
-            record.state = "failed"
-            record.problem = problem_of(HttpProblem(503, "Ended", "the server has ended; nothing was sent"))
+            record.fail(HttpProblem(503, "Ended", "the server has ended; nothing was sent"))
             self._end(vehicle, record)
 
     def _end(self, vehicle: Vehicle, record: OrderRecord) -> None:

@@ -7,9 +7,7 @@ from datetime import datetime, timezone
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from aerokit.logs.flights.flight import FlightLog
 from aerokit.logs.flights.tlog_missions import RecordedMission
-from aerokit.mavlink import messages as m
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import canonical_frame
 
@@ -19,8 +17,6 @@ if TYPE_CHECKING:
     from aerokit.logs.flights.flight import Waypoint
     from aerokit.logs.flights.records import LogReader, LogRecord
     from aerokit.position import Position
-
-_MISSION_MESSAGES = (m.MissionItemInt, m.MissionItem, m.MissionCount, m.FileTransferProtocol)
 
 
 def _waypoint_name(waypoint: Waypoint) -> str:
@@ -66,7 +62,7 @@ class _TrackWriter:
             if state == "position":
                 self._tracks.setdefault(record.system_id, _Track()).add(record.unix_s, value)
                 self.written += 1
-        if isinstance(record.message, _MISSION_MESSAGES):
+        if isinstance(record.message, RecordedMission.MESSAGES):
             self._record_mission(record)
 
     def discard(self) -> None:
@@ -82,29 +78,20 @@ class _TrackWriter:
         message: Any = record.message
         for system_id in {record.system_id, message.target_system}:
             if system_id not in self._missions:
-                self._missions[system_id] = RecordedMission(FlightLog(self._path, system_id=system_id))
-            mission = self._missions[system_id]
-            if isinstance(message, m.MissionCount):
-                mission.on_count(record.unix_s, message)
-            elif isinstance(message, m.FileTransferProtocol):
-                mission.on_file_transfer(record.unix_s, message)
-            else:
-                mission.on_item(record.unix_s, message)
+                self._missions[system_id] = RecordedMission(system_id)
+            self._missions[system_id].add(record.unix_s, message)
 
     def _waypoints(self, system_id: int) -> list[Waypoint]:
         """Return the last mission of a vehicle without the items that have no valid position. NaN is not valid."""
-        mission = self._missions.get(system_id)
-        return (
-            []
-            if mission is None
-            else [
-                waypoint
-                for waypoint in mission.waypoints
-                if abs(waypoint.latitude_deg) <= 90
-                and abs(waypoint.longitude_deg) <= 180
-                and math.isfinite(waypoint.altitude_m)
-            ]
-        )
+        if system_id not in self._missions:
+            return []
+        return [
+            waypoint
+            for waypoint in self._missions[system_id].waypoints
+            if abs(waypoint.latitude_deg) <= 90
+            and abs(waypoint.longitude_deg) <= 180
+            and math.isfinite(waypoint.altitude_m)
+        ]
 
     def _text(self) -> str:
         """Return the content of the file."""

@@ -259,7 +259,7 @@ class UlogReader(_RowReader):
             self.notes.append("the log is damaged: the readable part was converted")
         if not log.data_list:
             raise FileFormatError(f"{self.path} contains no data")
-        self._log = log
+        self._topics = {_table_of(data): data for data in log.data_list}
         begins_s = utc_at_boot(log)
         self._note_time(begins_s)
         system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
@@ -278,8 +278,7 @@ class UlogReader(_RowReader):
         on_bytes(size)
 
     def _is_uint64(self, table: str, field: str) -> bool:
-        topic = next((data for data in self._log.data_list if _table_of(data) == table), None)
-        return topic is not None and bool(topic.data[field].dtype == "uint64")
+        return table in self._topics and bool(self._topics[table].data[field].dtype == "uint64")
 
 
 def _time_of(row: tuple[int, str, dict[str, Any]]) -> int:

@@ -6,6 +6,7 @@ import math
 import operator
 import struct
 from collections import defaultdict
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.ardupilot import ardupilot_for
@@ -134,9 +135,9 @@ class _Tables:
             times_us, *values = chunk
             times = [(time_us - self.began_us) / 1e6 for time_us in times_us]
             if times[-1] > self._max_s or not all(map(operator.le, times, times[1:])):
-                kept = [row for row, _ in enumerate(times) if self._is_plausible(times, row)]
-                self.damaged.update(offsets[begin + row] for row in set(range(len(times))).difference(kept))
-                times, *values = ([column[row] for row in kept] for column in (times, *values))
+                kept = [self._is_plausible(times, row) for row in range(len(times))]
+                self.damaged.update(offsets[begin + row] for row, is_kept in enumerate(kept) if not is_kept)
+                times, *values = (list(compress(column, kept)) for column in (times, *values))
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:

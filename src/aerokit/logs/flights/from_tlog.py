@@ -106,7 +106,7 @@ class _Reader:
         self._is_breached = False
         self._destinations = TimeSeries(*flight.position_target.names)
         self._link = LinkCounter(flight)
-        self._mission = RecordedMission(flight)
+        self._mission = RecordedMission(flight.system_id)
         # Commands that the vehicle itself has sent are ignored, because they are for its own components. For
         # example, PX4 informs its components when it has decided to return.
         commands: dict[type[Message], Callable[[float, Any], None]] = {
@@ -115,10 +115,7 @@ class _Reader:
             m.SetMode: self._mode_commands.on_set_mode,
         }
         handlers: dict[type[Message], Callable[[float, Any], None]] = {
-            m.MissionItemInt: self._mission.on_item,
-            m.MissionItem: self._mission.on_item,
-            m.MissionCount: self._mission.on_count,
-            m.FileTransferProtocol: self._mission.on_file_transfer,
+            **dict.fromkeys(RecordedMission.MESSAGES, self._mission.add),
             # Telemetry radios insert these with ids of their own.
             m.RadioStatus: self._on_radio,
             m.Radio: self._on_radio,
@@ -142,7 +139,7 @@ class _Reader:
         last_frame_at = math.nan  # time of the record with the vehicle's last frame
         previous_unix_s = math.nan
         paused_s = 0.0  # seconds without any record since the vehicle's last frame
-        doubtful_unix_s = math.nan  # time of the last record that was skipped because of _DOUBTFUL_JUMP_S
+        doubtful_unix_s = math.inf  # time of the last record that was skipped because of _DOUBTFUL_JUMP_S
         set_back_s = 0.0  # sum of the jumps by which the recording's clock was set back
         with flight.path.open("rb") as file:
             for recorded_unix_s, raw in read_tlog(file):
@@ -150,17 +147,18 @@ class _Reader:
                 if not records:
                     begins_at = previous_unix_s = unix_s
                 elif not -_MAX_DISORDER_S <= unix_s - previous_unix_s < MIN_SILENCE_S:
-                    if abs(unix_s - previous_unix_s) > _DOUBTFUL_JUMP_S:
-                        if not abs(unix_s - doubtful_unix_s) <= _DOUBTFUL_JUMP_S:
+                    step_s = unix_s - previous_unix_s
+                    if abs(step_s) > _DOUBTFUL_JUMP_S:
+                        if abs(unix_s - doubtful_unix_s) > _DOUBTFUL_JUMP_S:
                             doubtful_unix_s = unix_s
                             damaged += 1
                             continue
                         damaged -= 1  # the skipped record was right
-                    if unix_s > previous_unix_s:
-                        paused_s += unix_s - previous_unix_s
+                    if step_s > 0:
+                        paused_s += step_s
                     else:
-                        self._note_clock(previous_unix_s - unix_s, previous_unix_s - begins_at)
-                        set_back_s += previous_unix_s - unix_s
+                        self._note_clock(-step_s, previous_unix_s - begins_at)
+                        set_back_s -= step_s
                         unix_s = previous_unix_s
                 previous_unix_s = unix_s
                 records += 1
@@ -402,17 +400,17 @@ class _Reader:
     def _on_local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
         """Add a local set-point, converted with the newest local and global positions of the vehicle, if recent."""
         if message.type_mask & _NO_POSITION != _NO_POSITION:
-            local_north, local_east, local_down = self._local_position
-            north, east, down = message.x - local_north, message.y - local_east, message.z - local_down
             is_recent = time_s - min(self._position_at, self._local_position_at) <= _POSITION_MAX_AGE_S
-            latitude, longitude, amsl = self._position if is_recent else (NAN, NAN, NAN)
+            local_north, local_east, local_down = self._local_position if is_recent else (NAN, NAN, NAN)
+            north, east, down = message.x - local_north, message.y - local_east, message.z - local_down
+            latitude, longitude, amsl = self._position
             east_per_degree = _METRES_PER_DEGREE * math.cos(math.radians(latitude))
             self._flight.position_target.add(
                 time_s,
                 latitude + north / _METRES_PER_DEGREE,
                 longitude + east / east_per_degree,
                 amsl - down,
-                self._relative_m - down if is_recent else NAN,
+                self._relative_m - down,
             )
         self._add_velocity_target(time_s, message)
 

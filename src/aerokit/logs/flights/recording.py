@@ -54,8 +54,8 @@ class ClockComparison:
         recorded_s, vehicle_s = self._recorded_s, self._vehicle_s
         if not self._is_comparable:
             recorded_s, vehicle_s = recorded_s + self._long_recorded_s, vehicle_s + self._long_vehicle_s
-        if min(recorded_s, vehicle_s) < _MIN_CLOCK_COMPARISON_S:
-            return 1.0
+            if min(recorded_s, vehicle_s) < _MIN_CLOCK_COMPARISON_S:
+                return 1.0
         return vehicle_s / recorded_s
 
     @property

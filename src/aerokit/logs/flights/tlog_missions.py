@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 from aerokit.errors import RemoteProtocolError
 from aerokit.logs.flights.flight import Waypoint
@@ -12,9 +12,6 @@ from aerokit.mavlink.enums import MavFtpOpcode, MavMissionType
 from aerokit.missions.item import GLOBAL_FRAMES, has_place
 from aerokit.missions.wire import HEADER, NO_CLEAR, PACKED_PATHS, read_header, to_wire, unpack_items
 from aerokit.protocols.ftp import FtpMessage
-
-if TYPE_CHECKING:
-    from aerokit.logs.flights.flight import FlightLog
 
 MissionMessage: TypeAlias = "m.MissionItemInt | m.MissionItem | m.MissionCount | m.FileTransferProtocol"
 
@@ -27,8 +24,11 @@ _READING = (MavFtpOpcode.READFILE, MavFtpOpcode.BURSTREADFILE)
 class RecordedMission:
     """The last mission that was sent to a vehicle or read from it."""
 
-    def __init__(self, flight: FlightLog) -> None:
-        self._flight = flight
+    MESSAGES = (m.MissionItemInt, m.MissionItem, m.MissionCount, m.FileTransferProtocol)
+    """Classes of the messages that :meth:`add` takes."""
+
+    def __init__(self, system_id: int) -> None:
+        self._system_id = system_id
         self._items: dict[int, Waypoint] = {}
         self._is_file_open = False  # True while a program writes or reads the mission file
         self._file = bytearray()  # the mission file, up to the first missing block
@@ -38,20 +38,22 @@ class RecordedMission:
     def waypoints(self) -> list[Waypoint]:
         return [self._items[number] for number in sorted(self._items)]
 
-    def on_item(self, time_s: float, message: m.MissionItemInt | m.MissionItem) -> None:
-        if not self._is_of_vehicle(message) or message.mission_type != MavMissionType.MISSION:
+    def add(self, _time_s: float, message: MissionMessage) -> None:
+        """Record a message that the vehicle sent or received. Other messages are ignored."""
+        sender = None if message.received_frame is None else message.received_frame.system_id
+        if self._system_id not in (sender, message.target_system):
             return
-        self._add(message)
-
-    def on_count(self, time_s: float, message: m.MissionCount) -> None:
-        """Drop the items beyond the new number of items, because they belong to an earlier mission."""
-        if self._is_of_vehicle(message) and message.mission_type == MavMissionType.MISSION:
+        if isinstance(message, m.FileTransferProtocol):
+            self._on_file_transfer(message)
+        elif message.mission_type != MavMissionType.MISSION:
+            return
+        elif isinstance(message, m.MissionCount):  # Items beyond this number belong to an earlier mission.
             self._items = {number: item for number, item in self._items.items() if number < message.count}
+        else:
+            self._add(message)
 
-    def on_file_transfer(self, time_s: float, message: m.FileTransferProtocol) -> None:
+    def _on_file_transfer(self, message: m.FileTransferProtocol) -> None:
         """Collect the blocks of ArduPilot's mission file while a program uploads or downloads the file."""
-        if not self._is_of_vehicle(message):
-            return
         ftp = FtpMessage.decode(message.payload)
         if ftp.opcode in _OPENING:
             self._is_file_open = ftp.data.rstrip(b"\0") == _MISSION_PATH
@@ -95,8 +97,3 @@ class RecordedMission:
             altitude_m=message.z,
             frame=message.frame,
         )
-
-    def _is_of_vehicle(self, message: MissionMessage) -> bool:
-        """Return True if the vehicle of this flight sent or received the message."""
-        sender = None if message.received_frame is None else message.received_frame.system_id
-        return self._flight.system_id in (sender, message.target_system)

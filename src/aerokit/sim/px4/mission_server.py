@@ -50,7 +50,7 @@ class _Link(ListUpload):
 
     @property
     def is_retried(self) -> bool:
-        """True if the firmware, without an answer, repeats its last message (MISSION_REQUEST or MISSION_COUNT)."""
+        """True if the firmware repeats its last message (MISSION_REQUEST or MISSION_COUNT) until it is answered."""
         return self.state is TransferState.GETTING or self.next == 0
 
 
