@@ -184,6 +184,7 @@ def row_25_gimbal(stage: Stage) -> Any:
     )
 )
 def row_26_version(stage: Stage) -> Any:
+    stage.reached()  # The answer to the request at connecting must not arrive after the versions below.
     stage.fc.flight_sw_version = 0x030302FF
     stage.fc.send_version(flight_sw_version=0x030302FF)
     stage.settle()
