@@ -83,25 +83,25 @@ class ImpactDetector:
     def update(self) -> None:
         """Detect an impact by the vehicle's last reported velocity; called repeatedly."""
         cell = self._telemetry.velocity
-        velocity = cell.latest
-        if velocity is None or cell.updated_at == self._updated_at:
+        velocity, updated_at = cell.latest, cell.updated_at
+        if velocity is None or updated_at == self._updated_at:
             return
-        if cell.updated_at < self._updated_at:  # The computer slept: the velocity is older now, and not a new one.
-            self._updated_at, self._sank_fast_at = cell.updated_at, -math.inf
+        if updated_at < self._updated_at:  # The computer slept: the velocity is older now, and not a new one.
+            self._updated_at, self._sank_fast_at = updated_at, -math.inf
             return
         # An impact may be shorter than the interval between two received velocities. It then shows in two consecutive
         # velocities, so these are compared even if the interval is long.
-        interval_s = min(cell.updated_at - self._updated_at, MAX_INTERVAL_S)
+        interval_s = min(updated_at - self._updated_at, MAX_INTERVAL_S)
         max_stop_s = max(IMPACT_STOP_S, 1.5 * interval_s)
-        self._updated_at = cell.updated_at
+        self._updated_at = updated_at
         height_m = self.current_height()
         sinks_fast = velocity.down_m_s >= IMPACT_M_S
-        has_just_sunk_fast = cell.updated_at - self._sank_fast_at <= max_stop_s
+        has_just_sunk_fast = updated_at - self._sank_fast_at <= max_stop_s
         has_stopped_suddenly = has_just_sunk_fast and abs(velocity.down_m_s) < STILL_M_S
         if sinks_fast:
             max_sink_before_m_s = self._max_sink_m_s if has_just_sunk_fast else 0.0
             self._max_sink_m_s = max(max_sink_before_m_s, velocity.down_m_s)
-            self._sank_fast_at = cell.updated_at
+            self._sank_fast_at = updated_at
         elif has_stopped_suddenly:
             # A vehicle that has lost less height than MIN_DROP_M did not fall: its reported velocity was wrong.
             if self._top_m is None or height_m is None or self._top_m - height_m >= MIN_DROP_M:

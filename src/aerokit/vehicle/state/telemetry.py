@@ -293,11 +293,9 @@ class Telemetry(States):
 
     def _has_recent_better_value(self, cell: StateCell[Any], source: Source) -> bool:
         """Return True if another message than the fallback ``source`` has recently reported the cell's value."""
-        return (
-            cell.source is not None
-            and cell.source.message != source.message
-            and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
-        )
+        latest = cell.source
+        is_other_message = latest is not None and latest.message != source.message
+        return is_other_message and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
 
     # --------------------------------------------------------- messages with special handling
 
