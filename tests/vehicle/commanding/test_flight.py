@@ -163,6 +163,16 @@ async def test_take_off_refused_says_why(grounded: Flight) -> None:
     assert "Takeoff: not today" in str(caught.value)
 
 
+async def test_take_off_refused_while_rising_says_why() -> None:
+    async with open_flight(latency_s=0.3) as flight:  # The refusal arrives after reports of a further climb.
+        vehicle = flight.vehicle
+        await vehicle.wait_ready()
+        await vehicle.arm()
+        await vehicle.take_off(30.0)  # Returns just below this altitude.
+        with pytest.raises(CommandRejected, match="the vehicle is taking off"):
+            await vehicle.take_off(40.0)
+
+
 async def test_take_off_state_of_last_flight_is_no_effect(grounded: Flight) -> None:
     """TAKING_OFF was the last landed state before the stream of states ended."""
     await grounded.vehicle.wait_ready()

@@ -120,6 +120,17 @@ async def test_go_to_with_speed_and_heading(flying: Px4Flight) -> None:
     assert command.z == pytest.approx(flying.vehicle.home.value.altitude_amsl_m + 15.0, abs=0.01)
 
 
+async def test_lost_go_to_right_after_take_off_is_repeated() -> None:
+    async with open_px4(latency_s=0.3) as flight:
+        vehicle = flight.vehicle
+        await vehicle.wait_ready()
+        await vehicle.arm()
+        await vehicle.take_off(10.0)  # The mode changes to LOITER later.
+        flight.px4.faults.ignore(MavCmd.DO_REPOSITION, times=1)
+        await vehicle.go_to(vehicle.home.value.position.offset(north_m=20.0))
+        assert len(flight.wire.commands(MavCmd.DO_REPOSITION)) == 2
+
+
 async def test_px4_go_to_cancelled_stops_in_place(flying: Px4Flight) -> None:
     """A PX4 that flies to a destination is in LOITER as well, so setting the mode would not stop it."""
     with anyio.move_on_after(5.0) as scope:

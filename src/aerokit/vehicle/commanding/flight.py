@@ -153,9 +153,11 @@ class FlightActions(VehicleBase):
     def _climb_detector(self) -> Callable[[], bool]:
         """Return a function that returns True once new messages report a climb.
 
-        Earlier messages may describe the previous flight.
+        Earlier messages may describe the previous flight. A climb during an earlier take-off proves nothing.
         """
         started, landed = self.connection.now(), self.telemetry.landed_state
+        if landed.latest == MavLandedState.TAKEOFF and landed.age <= POSITION_MAX_AGE_S:
+            return lambda: False
         # Without a recent altitude, the climb is measured from the first one that is received.
         is_start_known = self._position.was_received_since(started - POSITION_MAX_AGE_S)
         start_m = self._position.altitude_relative() if is_start_known else -math.inf

@@ -181,7 +181,7 @@ class StallDetector:
             self._record_descent(here)
         elif now - self._there_since >= timeout_s:
             still_for_s, descent = now - self._there_since, self._describe_descent(here)
-            return f"the vehicle accepted the order and has not moved for {still_for_s:.0f} s{descent}"
+            return f"the vehicle has not moved for {still_for_s:.0f} s{descent}"
         return None
 
     def _record_descent(self, here: Position) -> None:
