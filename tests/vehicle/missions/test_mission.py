@@ -123,6 +123,7 @@ async def test_mission_accepted_from_another_station_is_finished_in_air(station:
         assert isinstance(flight, Flight)
         replacement = short_mission(flight, waypoint(*near_home(18), altitude_relative_m=4))
         flight.copter.missions.replace(MavMissionType.MISSION, replacement.to_items(home_is_item_0=True))
+        await anyio.sleep(2.0)  # Directly after the upload, the answer would be a duplicate of the upload's own.
         flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(*station, MavMissionResult.ACCEPTED)))
         await flight.vehicle.mission.start()
         await flight.vehicle.mission.wait_finished(timeout=600)
@@ -141,6 +142,37 @@ async def test_unknown_mission_that_ends_in_air_is_finished_there() -> None:
         await flight.vehicle.mission.wait_finished(timeout=600)
         assert not px4.is_landed
         assert flight.vehicle.mode_name == "LOITER"
+
+
+@pytest.mark.parametrize("lost", range(4))
+@pytest.mark.parametrize("are_items_known", [True, False])
+async def test_mission_end_with_lost_reports_is_no_takeover(lost: int, are_items_known: bool) -> None:
+    """HEARTBEAT reports the mode after the mission, but the MISSION_CURRENTs that report the end are lost."""
+    async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
+        mission = flight.vehicle.mission
+        if not are_items_known:
+            mission._context.caches[MavMissionType.MISSION].forget(now())
+        await mission.start()
+
+        async def lose_reports_of_end() -> None:
+            await reaches(flight, 2)
+            while not flight.px4.mission.is_finished:
+                await anyio.sleep(0.02)
+            flight.px4.faults.lose(m.MissionCurrent, times=lost)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(lose_reports_of_end)
+            await mission.wait_finished(timeout=600)
+
+
+async def test_duplicate_ack_of_upload_keeps_items_known() -> None:
+    async with open_flight() as flight:
+        await flight.vehicle.wait_ready()
+        mission = flight.vehicle.mission
+        await mission.upload(short_mission(flight))
+        flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(255, 190, MavMissionResult.ACCEPTED)))
+        assert mission._context.caches[MavMissionType.MISSION].items is not None
 
 
 @pytest.mark.parametrize("opened", [open_flight, open_px4])

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 # Maximum age of a reported plan id: two and a half periods of MISSION_CURRENT, which is sent at 1 Hz.
 PLAN_ID_MAX_AGE_S = 2.5
 
+# A MISSION_ACK to this program that arrives within this time after its own transfer is a duplicate.
+DUPLICATE_ACK_S = 1.0
+
 # If the same item is reported as reached again within this time, the message is a duplicate.
 DUPLICATE_WINDOW_S = 0.3
 
@@ -157,7 +160,8 @@ class PlanContext:
         if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:
             return
         for mission_type, cache in enumerate(self.caches):
-            if ack.mission_type in (mission_type, MavMissionType.ALL):
+            is_duplicate = is_addressed and self.now() - cache.updated_at < DUPLICATE_ACK_S
+            if ack.mission_type in (mission_type, MavMissionType.ALL) and not is_duplicate:
                 cache.forget(self.now())
 
 

@@ -42,6 +42,10 @@ LANDING_PURPOSES: dict[int, Literal["return", "land"]] = {
 # Seconds to wait for a report of the end, because MISSION_CURRENT is sent at 1 Hz or faster, and may be lost.
 END_GRACE_S = 2.0
 
+# On a bad link, several MISSION_CURRENTs may be lost, so a later one is awaited before the mission counts as
+# interrupted. A vehicle may also send none.
+END_REPORT_TIMEOUT_S = 10.0
+
 # A return may end at a rally point, whose position is unknown here, so it counts as finished after this time.
 RETURN_TIMEOUT_S = 300.0
 
@@ -157,6 +161,8 @@ class MissionEndDetector:
             return f"{fall}, {self.describe()}"
         if self.ground.is_reported_on_ground:  # It is not yet decided whether the vehicle has landed.
             return None
+        if self._completed_at is not None:  # The mission is complete, and `_has_stayed_complete` decides.
+            return None
         is_in_mode = session.telemetry.is_in(self._mode)
         self._was_in_mode = self._was_in_mode or is_in_mode
         is_mode_settling = now < self._vehicle_context.arbiter.mode_settles_at
@@ -165,10 +171,12 @@ class MissionEndDetector:
             self._left_at = None
             return None
         # The end of the mission also changes the mode. The vehicle may report the mode before the end, so wait for
-        # END_GRACE_S before the mode counts as a failure.
+        # END_GRACE_S and for a MISSION_CURRENT before the mode counts as a failure.
         if self._left_at is None:
             self._left_at = now
-        if now - self._left_at < END_GRACE_S or now < self._mode_grace_until:
+        has_report = self._tracker.progress.updated_at > self._left_at
+        timeout_s = END_GRACE_S if has_report else END_REPORT_TIMEOUT_S
+        if now - self._left_at < timeout_s or now < self._mode_grace_until:
             return None
         if session.telemetry.is_confirmed_disarmed:
             return f"the mission has not ended ({self.describe()}), but the vehicle is disarmed"
