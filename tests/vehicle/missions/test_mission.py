@@ -157,7 +157,7 @@ async def test_mission_end_with_lost_reports_is_no_takeover(lost: int, are_items
 
         async def lose_reports_of_end() -> None:
             await reaches(flight, 2)
-            while not flight.px4.mission.is_finished:
+            while not flight.px4.mission.is_finished:  # noqa: ASYNC110
                 await anyio.sleep(0.02)
             flight.px4.faults.lose(m.MissionCurrent, times=lost)
 
