@@ -197,7 +197,7 @@ def test_row_with_impossible_time_changes_nothing_else(
     assert flight.duration_s == pytest.approx(43.9, abs=0.1)
     assert flight.track.at("altitude_relative_m", 30.0) == pytest.approx(log_files.height_m(31.0), abs=0.35)
     assert list(flight.attitude.times) == sorted(flight.attitude.times)
-    assert "1 damaged rows with an impossible time were skipped" in flight.notes
+    assert "1 damaged row was skipped: impossible time" in flight.notes
 
 
 @pytest.mark.parametrize("wrong_us", [10**15, 0])
@@ -209,4 +209,4 @@ def test_ulog_row_with_impossible_time_changes_nothing_else(wrong_us: int, logs:
     flight = read_flight(path)
     assert flight.duration_s == pytest.approx(43.9, abs=0.2)
     assert [change.time_s for change in flight.modes] == sorted(change.time_s for change in flight.modes)
-    assert "1 damaged rows with an impossible time were skipped" in flight.notes
+    assert "1 damaged row was skipped: impossible time" in flight.notes

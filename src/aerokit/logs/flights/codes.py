@@ -147,6 +147,10 @@ def clean_text(text: str) -> str:
     return _CONTROL_CHARACTERS.sub("", text).strip()
 
 
+def skipped_rows_note(count: int) -> str:
+    return f"{count} damaged row{' was' if count == 1 else 's were'} skipped: impossible time"
+
+
 _STOPS = "stops the motors"
 _COPTER_BATTERY = (
     "none",

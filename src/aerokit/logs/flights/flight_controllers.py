@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal.geo import check_place
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import clean_text
+from aerokit.logs.flights.codes import clean_text, skipped_rows_note
 from aerokit.logs.flights.from_ulog import utc_at_boot
 from aerokit.logs.flights.records import LogReader, LogRecord, TableColumn, name_with_unit
 from aerokit.position import Position
@@ -101,7 +101,7 @@ class _RowReader(LogReader):
 
     def _note_skipped(self) -> None:
         if self._skipped:
-            self.notes.append(f"{self._skipped} damaged rows with an impossible time were skipped")
+            self.notes.append(skipped_rows_note(self._skipped))
 
     def _note_time(self, unix_s: float) -> None:
         if unix_s < _A_YEAR_S and _NO_UTC not in self.notes:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.ardupilot import ardupilot_for
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, clean_text, error_text
+from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, clean_text, error_text, skipped_rows_note
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane, TimeSeries, Waypoint
 from aerokit.logs.flights.flight_controllers import close_bin, opened_bin
 from aerokit.mavlink.enums import GpsFixType, MavType
@@ -235,7 +235,7 @@ class _Reader:
             ends.append(flight.texts[-1].time_s)
         flight.ends_at = flight.begins_at + max(ends, default=0.0)
         if tables.damaged:
-            flight.notes.append(f"{len(tables.damaged)} damaged rows with an impossible time were skipped")
+            flight.notes.append(skipped_rows_note(len(tables.damaged)))
         if not tables.unix_at_0:
             flight.notes.append("no GNSS time in the log: times count from power-on")
 
