@@ -279,6 +279,27 @@ def test_gpx_has_last_mission_although_sent_before_positions(tmp_path: Path) -> 
     assert [waypoint.name for waypoint in read.waypoints] == ["0 NAV_WAYPOINT", "2 NAV_WAYPOINT"]
 
 
+@pytest.mark.parametrize(("result", "names"), [(0, []), (1, ["0 NAV_WAYPOINT"])])
+def test_gpx_has_no_guided_target_and_no_cleared_mission(result: int, names: list[str], tmp_path: Path) -> None:
+    gpxpy = pytest.importorskip("gpxpy")
+    vehicle, station = FrameEncoder(1, 1), FrameEncoder(255, 190)
+    place = (474010000, 85010000, 30.0)
+    with TlogWriter(tmp_path / "in.tlog") as writer:
+        for encoder, message in (
+            (vehicle, m.Heartbeat(2, 3, 81, 4, 4, 3)),
+            (vehicle, m.GlobalPositionInt(0, 474000000, 85000000, 500000, 0, 0, 0, 0, 0)),
+            (station, m.MissionItemInt(1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, *place)),
+            (vehicle, m.MissionAck(255, 190, 0)),
+            (station, m.MissionClearAll(1, 1)),
+            (station, m.MissionAck(1, 1, 0)),  # ends a download, and is no answer
+            (vehicle, m.MissionAck(255, 190, result)),
+            (station, m.MissionItemInt(1, 1, 0, 3, 22, 2, 1, 0, 0, 0, 0, *place)),
+        ):
+            writer.write(encoder.encode(message), BEGIN)
+    convert(tmp_path / "in.tlog", tmp_path / "out.gpx")
+    assert [waypoint.name for waypoint in gpxpy.parse((tmp_path / "out.gpx").read_text()).waypoints] == names
+
+
 def test_kml_has_altitude_modes(log: Path, tmp_path: Path) -> None:
     pytest.importorskip("simplekml")
     convert(log, tmp_path / "out.kml")
