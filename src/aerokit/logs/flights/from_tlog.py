@@ -437,6 +437,8 @@ class _Reader:
         """Add the values of a battery, and evidence of a failsafe if its charge state has become worse."""
         cells_mv = [mv for mv in message.voltages if mv != _U16]
         cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 means a missing cell
+        if not any(cells_mv):  # PX4 reports a battery on CAN that does not measure its voltage as 0 mV.
+            cells_mv = []
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         state = message.charge_state
