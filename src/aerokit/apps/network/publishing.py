@@ -48,9 +48,7 @@ def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
     Raises:
         InvalidArgument: no publisher has the scheme of the address.
     """
-    scheme = (
-        address.partition(":")[0].strip().lower()
-    )  # the error has no more of the address, as it may have a password
+    scheme = address.partition(":")[0].strip().lower()  # The error omits the rest, which may contain a password.
     if scheme not in PUBLISHERS:
         raise InvalidArgument(f"to: {scheme!r} is not a scheme of a publisher; they are {', '.join(PUBLISHERS)}")
     return PUBLISHERS[scheme](address)
