@@ -326,6 +326,15 @@ def test_kml_has_altitude_modes(log: Path, tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not allow such names")
+@pytest.mark.parametrize("name", [b"a\x01b.tlog", b"a\xffb.tlog"])
+def test_kml_of_log_with_unprintable_name_is_valid(name: bytes, log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("simplekml")
+    convert(log.rename(tmp_path / os.fsdecode(name)), tmp_path / "out.kml")
+    root: Any = ElementTree.parse(tmp_path / "out.kml").getroot()
+    assert root[0][0].text == "a\N{REPLACEMENT CHARACTER}b.tlog"
+
+
 def test_existing_target_needs_force_and_failure_leaves_nothing(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
