@@ -269,7 +269,7 @@ def test_battery_with_and_without_cells_is_decoded(telemetry: Telemetry) -> None
     assert (second.current_a, second.consumed_mah) == (12.34, 500)
 
 
-def test_battery_voltage_of_zero_is_unknown_but_not_a_single_cell(telemetry: Telemetry) -> None:
+def test_battery_voltage_of_zero_is_unknown_unlike_zero_of_cell(telemetry: Telemetry) -> None:
     telemetry.receive(battery(0, [0]))
     telemetry.receive(battery(1, [4100, 0, 4000]))
     unmeasured, with_dead_cell = telemetry.batteries.value
