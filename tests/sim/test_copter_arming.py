@@ -3,7 +3,7 @@ from __future__ import annotations
 from simulated_client import Client, flying_copter, ready_copter, set_mode
 
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import CopterMode, MavCmd, MavModeFlag, MavResult, MavSysStatusSensor
+from aerokit.mavlink.enums import CopterMode, FenceType, MavCmd, MavModeFlag, MavResult, MavSysStatusSensor
 from aerokit.sim import SimulatedCopter
 
 ARM = MavCmd.COMPONENT_ARM_DISARM
@@ -59,6 +59,27 @@ def test_arming_reasons_change_during_boot() -> None:
         "Need Position Estimate",
         "none",
     ]
+
+
+def test_forced_arming_while_estimator_starts_is_refused() -> None:
+    copter = SimulatedCopter(boot_time_s=41.5)
+    client = Client(copter)
+    while not copter.is_initialised:
+        client.run(0.05)
+    assert client.command(ARM, 1, FORCE) == MavResult.FAILED
+    assert client.texts[-1].startswith("Arm: AHRS: ")
+
+
+def test_fence_needs_position_to_arm_in_any_mode() -> None:
+    copter = SimulatedCopter()
+    copter.parameters["FENCE_ENABLE"], copter.parameters["FENCE_TYPE"] = 1, FenceType.CIRCLE
+    client = Client(copter)
+    client.run(2.0)
+    set_mode(client, CopterMode.STABILIZE)
+    assert list(copter.arming.position_reasons()) == ["AHRS: waiting for home"]
+    client.run(2.0)
+    assert client.command(ARM, 1, FORCE) == MavResult.FAILED
+    assert client.texts[-1] == "Arm: Fence enabled, need position estimate"
 
 
 def test_arming_in_returning_modes_is_refused() -> None:

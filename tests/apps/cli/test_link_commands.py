@@ -195,6 +195,24 @@ def test_events_names_number_of_missed_events(
     assert lines[text_at - 1] == "3 events were dropped"
 
 
+def test_events_wait_while_terminal_is_stopped(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Printing would block the event loop, and with it the heartbeat."""
+    printed = []
+
+    def can_print() -> bool:
+        printed.append(capsys.readouterr().out)
+        return len(printed) > 10
+
+    monkeypatch.setattr(listening, "can_print", can_print)
+    text = (1, 1, m.Statustext(6, "text"))
+    assert run_on_messages([(1, 1, m.Heartbeat(2, 3, 81, 0, 3, 3)), text], "events", "--seconds", "4") == 0
+    assert len(printed) > 10
+    assert "".join(printed[:11]) == ""
+    assert "INFO: text" in "".join(printed[11:]) + capsys.readouterr().out
+
+
 def test_events_control_characters_are_replaced(capsys: pytest.CaptureFixture[str]) -> None:
     heartbeat = m.Heartbeat(2, 3, 81, 0, 3, 3)
     text = m.Statustext(6, "bad\x1b[2Jtext")

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import os
 import signal
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from free_ports import free_port
 from zenoh_network import eventually, router
 
+from aerokit.apps.cli import bridge
 from aerokit.apps.cli.main import make_parser
 from aerokit.sim import SimulatedCopter, SimulatedPlane, simulated_link
 
@@ -65,6 +68,16 @@ def test_bridge_zenoh_with_other_address_exits_with_code_2(network: str, capsys:
     assert ended.value.code == 2
     assert "argument NETWORK: " in (printed := capsys.readouterr().err)
     assert "zenoh://" in printed
+
+
+def test_bridge_prints_nothing_while_terminal_is_stopped(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Printing would block, and the bridge would publish nothing."""
+    monkeypatch.setattr(bridge, "can_print", lambda: False)
+    vehicle: Any = SimpleNamespace(system_id=1, autopilot=SimpleNamespace(firmware="PX4"))
+    bridge._emit_vehicle(argparse.Namespace(json=False), vehicle)
+    assert capsys.readouterr().out == ""
 
 
 def test_bridge_zenoh_uses_default_vehicle_address() -> None:

@@ -279,6 +279,27 @@ def test_gpx_has_last_mission_although_sent_before_positions(tmp_path: Path) -> 
     assert [waypoint.name for waypoint in read.waypoints] == ["0 NAV_WAYPOINT", "2 NAV_WAYPOINT"]
 
 
+@pytest.mark.parametrize(("result", "names"), [(0, []), (1, ["0 NAV_WAYPOINT"])])
+def test_gpx_has_no_guided_target_and_no_cleared_mission(result: int, names: list[str], tmp_path: Path) -> None:
+    gpxpy = pytest.importorskip("gpxpy")
+    vehicle, station = FrameEncoder(1, 1), FrameEncoder(255, 190)
+    place = (474010000, 85010000, 30.0)
+    with TlogWriter(tmp_path / "in.tlog") as writer:
+        for encoder, message in (
+            (vehicle, m.Heartbeat(2, 3, 81, 4, 4, 3)),
+            (vehicle, m.GlobalPositionInt(0, 474000000, 85000000, 500000, 0, 0, 0, 0, 0)),
+            (station, m.MissionItemInt(1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, *place)),
+            (vehicle, m.MissionAck(255, 190, 0)),
+            (station, m.MissionClearAll(1, 1)),
+            (station, m.MissionAck(1, 1, 0)),  # ends a download, and is no answer
+            (vehicle, m.MissionAck(255, 190, result)),
+            (station, m.MissionItemInt(1, 1, 0, 3, 22, 2, 1, 0, 0, 0, 0, *place)),
+        ):
+            writer.write(encoder.encode(message), BEGIN)
+    convert(tmp_path / "in.tlog", tmp_path / "out.gpx")
+    assert [waypoint.name for waypoint in gpxpy.parse((tmp_path / "out.gpx").read_text()).waypoints] == names
+
+
 def test_kml_has_altitude_modes(log: Path, tmp_path: Path) -> None:
     pytest.importorskip("simplekml")
     convert(log, tmp_path / "out.kml")
@@ -303,6 +324,15 @@ def test_kml_has_altitude_modes(log: Path, tmp_path: Path) -> None:
         ("absolute", "8.502,47.402,555.0"),
         ("relativeToGround", "8.503,47.403,7.0"),
     ]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not allow such names")
+@pytest.mark.parametrize("name", [b"a\x01b.tlog", b"a\xffb.tlog"])
+def test_kml_of_log_with_unprintable_name_is_valid(name: bytes, log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("simplekml")
+    convert(log.rename(tmp_path / os.fsdecode(name)), tmp_path / "out.kml")
+    root: Any = ElementTree.parse(tmp_path / "out.kml").getroot()
+    assert root[0][0].text == "a\N{REPLACEMENT CHARACTER}b.tlog"
 
 
 def test_existing_target_needs_force_and_failure_leaves_nothing(

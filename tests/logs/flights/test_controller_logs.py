@@ -13,7 +13,7 @@ import pytest
 
 from aerokit.logs.convert import convert
 from aerokit.logs.flights import FlightLog, read_flight
-from aerokit.logs.flights.flight_controllers import UlogReader
+from aerokit.logs.flights.flight_controllers import BinReader, UlogReader
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.position import Position
 from aerokit.vehicle.state.movement import Velocity
@@ -197,7 +197,7 @@ def test_row_with_impossible_time_changes_nothing_else(
     assert flight.duration_s == pytest.approx(43.9, abs=0.1)
     assert flight.track.at("altitude_relative_m", 30.0) == pytest.approx(log_files.height_m(31.0), abs=0.35)
     assert list(flight.attitude.times) == sorted(flight.attitude.times)
-    assert "1 damaged rows with an impossible time were skipped" in flight.notes
+    assert "1 damaged row was skipped: impossible time" in flight.notes
 
 
 @pytest.mark.parametrize("wrong_us", [10**15, 0])
@@ -209,4 +209,17 @@ def test_ulog_row_with_impossible_time_changes_nothing_else(wrong_us: int, logs:
     flight = read_flight(path)
     assert flight.duration_s == pytest.approx(43.9, abs=0.2)
     assert [change.time_s for change in flight.modes] == sorted(change.time_s for change in flight.modes)
-    assert "1 damaged rows with an impossible time were skipped" in flight.notes
+    assert "1 damaged row was skipped: impossible time" in flight.notes
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "system_id"), [(b"MAV_SYSID", 7, 7), (b"SYSID_THISMAV", 7, 7), (b"MAV_SYSID", math.nan, 1)]
+)
+def test_system_id_of_bin_is_that_of_its_parameter(
+    name: bytes, value: float, system_id: int, logs: Logs, tmp_path: Path
+) -> None:
+    flight = logs.read_bin((3.0, "PARM", (name, value)), (30.0, "PARM", (name, 9)), without="")
+    assert flight.system_id == system_id
+    records = list(BinReader(tmp_path / "flight.bin").entries(lambda done: None))
+    assert {record.system_id for record in records} == {system_id}
+    assert [record.table for record in records].count("POS") == len(log_files.times(10))

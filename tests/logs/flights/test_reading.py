@@ -259,3 +259,31 @@ def test_local_setpoints_without_recent_position_are_unknown(tmp_path: Path) -> 
     target = read_flight(path).position_target
     for name in ("latitude_deg", "altitude_relative_m"):
         assert [math.isnan(value) for value in target[name]] == [False] * 7 + [True] * 3
+
+
+def test_battery_voltage_of_zero_is_unknown_in_tlog(tmp_path: Path) -> None:
+    path, encoder = tmp_path / "log.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for message in (
+            m.Heartbeat(2, 12, 209, 4, 4, 3),
+            m.BatteryStatus(0, 0, 0, 32767, (0, *(65535,) * 9), 100, 10, -1, 90),
+            m.SysStatus(0, 0, 0, 0, 12_000, -1, 90, 0, 0, 0, 0, 0, 0),
+        ):
+            writer.write(encoder.encode(message), 1.7e9)
+    voltages = read_flight(path).batteries[0]["voltage_v"]
+    assert math.isnan(voltages[0])
+    assert voltages[1] == 12.0
+
+
+@pytest.mark.parametrize(("ends_s", "is_noted"), [(60, True), (6, False)])
+def test_missing_heartbeats_of_armed_vehicle_are_noted(ends_s: int, is_noted: bool, tmp_path: Path) -> None:
+    """While no message arrives at all, the vehicle is silent, which the report says by itself."""
+    path, encoder = tmp_path / "log.tlog", FrameEncoder(1, 1)
+    with TlogWriter(path) as writer:
+        for second in (*range(ends_s + 1), 61):
+            if second <= 5 or second == 61:
+                writer.write(encoder.encode(m.Heartbeat(2, 3, 209, 4, 4, 3)), 1.7e9 + second)
+            writer.write(encoder.encode(m.Attitude(second * 1000, 0, 0, 0, 0, 0, 0)), 1.7e9 + second)
+    notes = read_flight(path).notes
+    assert any(note.startswith("for 56 s, other messages arrived, but no HEARTBEAT") for note in notes) is is_noted
+    assert any("HEARTBEAT" in note for note in notes) is is_noted

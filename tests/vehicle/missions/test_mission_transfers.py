@@ -184,6 +184,21 @@ async def test_plan_replaced_by_another_station_during_upload_of_changes() -> No
         assert holds(flight, changed(long_mission(60), 10, 30))
 
 
+async def test_plan_replaced_by_another_station_during_download_is_read_again() -> None:
+    async with open_flight(latency_s=0.05) as flight:
+        mission = flight.vehicle.mission
+        await mission.upload(long_mission(60), method="items")
+
+        def on_item(_: m.MissionItemInt) -> None:
+            detach()
+            flight.copter.missions.replace(0, changed(long_mission(60), 0).to_items(home_is_item_0=True))
+            flight.wire.deliver(FrameEncoder(1, 1).encode(m.MissionAck(99, 190, Result.ACCEPTED)))
+
+        detach = flight.vehicle.connection.bus.attach(m.MissionItemInt, on_item)
+        downloaded = await mission.download(method="items")
+        assert holds(flight, downloaded)
+
+
 async def test_px4_plan_changed_by_another_station() -> None:
     async with open_px4() as flight:
         await flight.vehicle.mission.upload(long_mission(5))

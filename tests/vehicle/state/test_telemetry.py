@@ -269,6 +269,14 @@ def test_battery_with_and_without_cells_is_decoded(telemetry: Telemetry) -> None
     assert (second.current_a, second.consumed_mah) == (12.34, 500)
 
 
+def test_battery_voltage_of_zero_is_unknown_unlike_zero_of_cell(telemetry: Telemetry) -> None:
+    telemetry.receive(battery(0, [0]))
+    telemetry.receive(battery(1, [4100, 0, 4000]))
+    unmeasured, with_dead_cell = telemetry.batteries.value
+    assert (unmeasured.voltage_v, unmeasured.cell_voltages_v) == (None, ())
+    assert with_dead_cell.cell_voltages_v == (4.1, 0.0, 4.0)
+
+
 def test_battery_with_many_cells_or_high_voltage(telemetry: Telemetry) -> None:
     telemetry.receive(battery(0, [4000] * 10, voltages_ext=(4000, 4000, 0, 0)))
     assert len(telemetry.batteries.value[0].cell_voltages_v) == 12

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import address, number, port
 from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
-from aerokit.apps.cli.output import DONE, add_json, emit, import_extra
+from aerokit.apps.cli.output import DONE, add_json, can_print, emit, import_extra
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
 from aerokit.transport.address import parse_address
@@ -212,4 +212,5 @@ def _emit_serving(options: argparse.Namespace, bridge: FoxgloveBridge) -> None:
 
 def _emit_vehicle(options: argparse.Namespace, vehicle: Vehicle) -> None:
     record = {"system_id": vehicle.system_id, "firmware": vehicle.autopilot.firmware}
-    emit(options, "bridged_vehicle", record, f"vehicle {vehicle.system_id}: {vehicle.autopilot.firmware}")
+    if can_print():  # Otherwise, printing would block the event loop.
+        emit(options, "bridged_vehicle", record, f"vehicle {vehicle.system_id}: {vehicle.autopilot.firmware}")

@@ -13,6 +13,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import anyio
+
 from aerokit.apps.cli.arguments import add_record, log_file
 from aerokit.apps.cli.connecting import (
     SIGNING_KEY_VARIABLE,
@@ -28,6 +30,7 @@ from aerokit.apps.cli.output import (
     DONE,
     FAILED,
     INTERRUPTED,
+    can_print,
     emit,
     import_extra,
     new_recording,
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
 
 # If more events wait because the terminal prints slowly, the oldest are dropped and counted.
 _MAX_WAITING_EVENTS = 1000
+_POLL_INTERVAL_S = 0.1  # of a stopped terminal
 _SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
 # The countdown ends after this time. The command then continues to wait without a countdown.
 _COUNTDOWN_S = 30.0
@@ -170,6 +174,8 @@ async def _print_all(connection: Connection, options: argparse.Namespace) -> Non
         async with waiting(options, connection.link.address, _COUNTDOWN_S):
             event = await events.get()
         while True:
+            while not can_print():  # noqa: ASYNC110 - printing would block the event loop, and with it our heartbeat
+                await anyio.sleep(_POLL_INTERVAL_S)
             if events.missed > missed:
                 new_missed = events.missed - missed
                 emit(options, "missed", {"events": new_missed}, f"{new_missed} events were dropped")

@@ -7,6 +7,7 @@ from datetime import datetime, timezone
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from aerokit._internal.formatting import printable
 from aerokit.logs.flights.tlog_missions import RecordedMission
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import canonical_frame
@@ -134,7 +135,7 @@ class KmlWriter(_TrackWriter):
 
     def _text(self) -> str:
         kml = import_module("simplekml")
-        file = kml.Kml(name=self._log.path.name)
+        file = kml.Kml(name=printable(self._log.path.name))
         for system_id, track in self._tracks.items():
             folder = file.newfolder(name=f"vehicle {system_id}")
             # If an altitude above sea level is unknown, altitudes above home are used. KML has no mode for them, but

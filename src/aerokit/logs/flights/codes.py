@@ -147,6 +147,16 @@ def clean_text(text: str) -> str:
     return _CONTROL_CHARACTERS.sub("", text).strip()
 
 
+def ardupilot_system_id(parameters: Mapping[str, float]) -> int:
+    """Return the system id that is among ArduPilot's parameters; 1, the default, if none is or it is invalid."""
+    system_id = parameters.get("MAV_SYSID", parameters.get("SYSID_THISMAV", 1))  # renamed in 4.7
+    return int(system_id) if 1 <= system_id <= 255 else 1
+
+
+def skipped_rows_note(count: int) -> str:
+    return f"{count} damaged row{' was' if count == 1 else 's were'} skipped: impossible time"
+
+
 _STOPS = "stops the motors"
 _COPTER_BATTERY = (
     "none",

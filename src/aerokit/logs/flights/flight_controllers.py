@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from aerokit._internal.geo import check_place
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import clean_text
+from aerokit.logs.flights.codes import ardupilot_system_id, clean_text, skipped_rows_note
 from aerokit.logs.flights.from_ulog import utc_at_boot
 from aerokit.logs.flights.records import LogReader, LogRecord, TableColumn, name_with_unit
 from aerokit.position import Position
@@ -101,7 +101,7 @@ class _RowReader(LogReader):
 
     def _note_skipped(self) -> None:
         if self._skipped:
-            self.notes.append(f"{self._skipped} damaged rows with an impossible time were skipped")
+            self.notes.append(skipped_rows_note(self._skipped))
 
     def _note_time(self, unix_s: float) -> None:
         if unix_s < _A_YEAR_S and _NO_UTC not in self.notes:
@@ -129,7 +129,7 @@ def _optional_state(name: str, value: object) -> States:
 
 
 class BinReader(_RowReader):
-    """Reads a ``.bin`` of ArduPilot with pymavlink. Its rows do not contain a system id, so 1 is used."""
+    """Reads a ``.bin`` of ArduPilot with pymavlink. The system id is that of its parameters, or else 1."""
 
     _reader: Any = None
 
@@ -147,6 +147,7 @@ class BinReader(_RowReader):
         Report the progress to ``on_bytes``.
         """
         count = 0
+        system_id = _bin_system_id(reader)
         while (message := self._next(reader)) is not None:
             count += 1
             if count % 16_384 == 0:
@@ -156,9 +157,8 @@ class BinReader(_RowReader):
             if table not in ("FMT", "FMTU") and self._is_plausible_time(message._timestamp):
                 self._note_time(message._timestamp)
                 states = _ardupilot_states(table, fields, reader)
-                # The rows of a .bin contain no system and component id, so both are 1.
                 yield LogRecord(
-                    message._timestamp, system_id=1, component_id=1, table=table, fields=fields, states=states
+                    message._timestamp, system_id, component_id=1, table=table, fields=fields, states=states
                 )
         if not count:
             raise FileFormatError(f"{self.path} is not an ArduPilot log: it contains no message")
@@ -184,6 +184,16 @@ class BinReader(_RowReader):
     def _is_uint64(self, table: str, field: str) -> bool:
         row_format = self._reader.formats[self._reader.name_to_id[table]]
         return bool(row_format.format[row_format.columns.index(field)] == "Q")
+
+
+def _bin_system_id(reader: Any) -> int:
+    """Return the system id according to the first logged value of its parameter. Then the reader is at the start."""
+    parameters: dict[str, float] = {}
+    with suppress(Exception), redirect_stdout(sys.stderr):  # `_next` reports damage
+        while (row := reader.recv_match(type=["PARM"], strict=True)) is not None:
+            parameters.setdefault(row.Name, row.Value)
+    reader.rewind()
+    return ardupilot_system_id(parameters)
 
 
 def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:

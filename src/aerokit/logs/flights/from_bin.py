@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.ardupilot import ardupilot_for
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import ERRORS, MODE_REASONS, clean_text, error_text
+from aerokit.logs.flights.codes import (
+    ERRORS,
+    MODE_REASONS,
+    ardupilot_system_id,
+    clean_text,
+    error_text,
+    skipped_rows_note,
+)
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane, TimeSeries, Waypoint
 from aerokit.logs.flights.flight_controllers import close_bin, opened_bin
 from aerokit.mavlink.enums import GpsFixType, MavType
@@ -48,7 +55,7 @@ _INDEXING_SHARE = 0.3  # the progress is 30 % when pymavlink has indexed the row
 
 
 def read_bin_flight(flight: FlightLog, system_id: int | None, on_bytes: Callable[[int], object]) -> None:
-    """Fill a flight with the content of the file ``flight.path``. ``system_id`` is ignored: the rows have none.
+    """Fill a flight with the content of the file ``flight.path``. ``system_id`` is ignored: a .bin has one vehicle.
 
     Raises:
         FileFormatError: the file is not an ArduPilot log, or was written before 2015.
@@ -235,7 +242,7 @@ class _Reader:
             ends.append(flight.texts[-1].time_s)
         flight.ends_at = flight.begins_at + max(ends, default=0.0)
         if tables.damaged:
-            flight.notes.append(f"{len(tables.damaged)} damaged rows with an impossible time were skipped")
+            flight.notes.append(skipped_rows_note(len(tables.damaged)))
         if not tables.unix_at_0:
             flight.notes.append("no GNSS time in the log: times count from power-on")
 
@@ -272,6 +279,7 @@ class _Reader:
     def _read_parameters(self) -> None:
         for time, name, value in self._tables.rows("PARM", "Name", "Value"):
             self._flight.set_parameter(time, name, value)
+        self._flight.system_id = ardupilot_system_id(self._flight.parameters)
 
     def _read_mission(self) -> None:
         items: dict[int, Waypoint] = {}

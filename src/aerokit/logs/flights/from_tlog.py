@@ -43,6 +43,8 @@ _MAX_DISORDER_S = 1.0
 # If the time of a record differs from the previous one by more than this, the record is damaged, unless the next record
 # has a similar time.
 _DOUBTFUL_JUMP_S = 3600.0
+# If no HEARTBEAT arrives for longer than this, the arming state is unknown.
+_MAX_HEARTBEAT_INTERVAL_S = 5.0
 # Older positions are not used to convert local set-points to global ones.
 _POSITION_MAX_AGE_S = 2.0
 _ALARM_STATES = {MavState.CRITICAL: "critical", MavState.EMERGENCY: "emergency"}
@@ -96,6 +98,8 @@ class _Reader:
         self._capabilities: int | None = None
         self._mode_commands = RecordedModeCommands(flight, self._autopilot)
         self._system_status = 0
+        self._last_heartbeat_s, self._was_armed = 0.0, False
+        self._armed_gaps: list[tuple[float, float]] = []  # times without HEARTBEAT, after one of an armed vehicle
         self._has_battery_status = False
         self._charge_states: dict[int, int] = {}  # MAV_BATTERY_CHARGE_STATE by battery
         self._position = (NAN, NAN, NAN)  # latitude, longitude and altitude above sea level
@@ -209,6 +213,7 @@ class _Reader:
         """Complete the flight after the last message. ``damaged`` is the number of damaged messages."""
         flight = self._flight
         self._add_texts(flight.duration_s, self._texts.expire(math.inf))
+        self._note_missing_heartbeats()
         self._add_destinations()
         flight.mission = self._mission.waypoints
         if damaged:
@@ -305,12 +310,32 @@ class _Reader:
         flight.add_mode(time_s, self._autopilot.mode_of(message).name)
         armed = is_armed(message.base_mode)
         flight.set_armed(time_s, armed)
+        self._end_heartbeat_gap(time_s)
+        self._was_armed = armed
         status = message.system_status
         if armed and status in _ALARM_STATES and status != self._system_status:
             name = _ALARM_STATES[MavState(status)]
             text = f"system status {name} (HEARTBEAT)"
             flight.failsafe_evidence.append(FailsafeEvidence(time_s, "general", text))
         self._system_status = status
+
+    def _end_heartbeat_gap(self, time_s: float) -> None:
+        if self._was_armed and time_s - self._last_heartbeat_s > _MAX_HEARTBEAT_INTERVAL_S:
+            self._armed_gaps.append((self._last_heartbeat_s, time_s))
+        self._last_heartbeat_s = time_s
+
+    def _note_missing_heartbeats(self) -> None:
+        """Note for how long only other messages arrived. Silences, in which nothing arrived, have their own text."""
+        self._end_heartbeat_gap(self._flight.duration_s)
+        missing_s = sum(
+            end - begin - sum(max(min(end, s.ends_s) - max(begin, s.begins_s), 0.0) for s in self._flight.silences)
+            for begin, end in self._armed_gaps
+        )
+        if missing_s > _MAX_HEARTBEAT_INTERVAL_S:
+            self._flight.notes.append(
+                f"for {missing_s:.0f} s, other messages arrived, but no HEARTBEAT: this time counts as armed, although"
+                " it is unknown whether the vehicle was armed, and in which mode"
+            )
 
     def _record_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
         """Record a ground station's heartbeat, or that the log contains another vehicle."""
@@ -437,6 +462,8 @@ class _Reader:
         """Add the values of a battery, and evidence of a failsafe if its charge state has become worse."""
         cells_mv = [mv for mv in message.voltages if mv != _U16]
         cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 means a missing cell
+        if not any(cells_mv):  # PX4 reports a battery on CAN that does not measure its voltage as 0 mV.
+            cells_mv = []
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         state = message.charge_state

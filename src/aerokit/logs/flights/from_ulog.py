@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from aerokit.autopilots.px4 import Px4
 from aerokit.errors import FileFormatError
-from aerokit.logs.flights.codes import clean_text
+from aerokit.logs.flights.codes import clean_text, skipped_rows_note
 from aerokit.logs.flights.flight import FailsafeEvidence, LoggedText, TangentPlane
 from aerokit.mavlink.enums import GpsFixType
 
@@ -170,7 +170,7 @@ class _Reader:
         flight.begins_at = booted_at + self._began_us / 1e6
         last_us = log.last_timestamp
         if self._damaged:
-            flight.notes.append(f"{self._damaged} damaged rows with an impossible time were skipped")
+            flight.notes.append(skipped_rows_note(self._damaged))
             last_us = max([int(data.data["timestamp"][-1]) for data in self._data], default=self._began_us)
         flight.ends_at = booted_at + last_us / 1e6
         if not booted_at:

@@ -8,28 +8,34 @@ from typing import TypeAlias
 from aerokit.errors import RemoteProtocolError
 from aerokit.logs.flights.flight import Waypoint
 from aerokit.mavlink import messages as m
-from aerokit.mavlink.enums import MavFtpOpcode, MavMissionType
+from aerokit.mavlink.enums import MavFtpOpcode, MavMissionResult, MavMissionType
 from aerokit.missions.item import GLOBAL_FRAMES, has_place
 from aerokit.missions.wire import HEADER, NO_CLEAR, PACKED_PATHS, read_header, to_wire, unpack_items
 from aerokit.protocols.ftp import FtpMessage
 
-MissionMessage: TypeAlias = "m.MissionItemInt | m.MissionItem | m.MissionCount | m.FileTransferProtocol"
+MissionMessage: TypeAlias = (
+    "m.MissionItemInt | m.MissionItem | m.MissionCount | m.MissionClearAll | m.MissionAck | m.FileTransferProtocol"
+)
 
 _DEGREES_E7 = 1e7
 _MISSION_PATH = PACKED_PATHS[MavMissionType.MISSION].encode()
 _OPENING = (MavFtpOpcode.OPENFILERO, MavFtpOpcode.OPENFILEWO, MavFtpOpcode.CREATEFILE)
+_NO_MISSION_ITEM = (2, 3)  # values of `current` with which an item is a target or an altitude for GUIDED
 _READING = (MavFtpOpcode.READFILE, MavFtpOpcode.BURSTREADFILE)
 
 
 class RecordedMission:
     """The last mission that was sent to a vehicle or read from it."""
 
-    MESSAGES = (m.MissionItemInt, m.MissionItem, m.MissionCount, m.FileTransferProtocol)
+    MESSAGES = (
+        m.MissionItemInt, m.MissionItem, m.MissionCount, m.MissionClearAll, m.MissionAck, m.FileTransferProtocol,
+    )  # fmt: skip
     """Classes of the messages that :meth:`add` takes."""
 
     def __init__(self, system_id: int) -> None:
         self._system_id = system_id
         self._items: dict[int, Waypoint] = {}
+        self._is_clearing = False  # True until the vehicle answers a MISSION_CLEAR_ALL
         self._is_file_open = False  # True while a program writes or reads the mission file
         self._file = bytearray()  # the mission file, up to the first missing block
         self._later_blocks: dict[int, bytes] = {}  # the blocks after the missing block, by their offset
@@ -45,11 +51,18 @@ class RecordedMission:
             return
         if isinstance(message, m.FileTransferProtocol):
             self._on_file_transfer(message)
-        elif message.mission_type != MavMissionType.MISSION:
+        elif message.mission_type not in (MavMissionType.MISSION, MavMissionType.ALL):
             return
+        elif isinstance(message, m.MissionClearAll):
+            self._is_clearing = True
+        elif isinstance(message, m.MissionAck):  # ArduPilot refuses to clear a mission that it flies.
+            if self._is_clearing and sender == self._system_id:
+                self._is_clearing = False
+                if message.type == MavMissionResult.ACCEPTED:
+                    self._items.clear()
         elif isinstance(message, m.MissionCount):  # Items beyond this number belong to an earlier mission.
             self._items = {number: item for number, item in self._items.items() if number < message.count}
-        else:
+        elif message.current not in _NO_MISSION_ITEM:
             self._add(message)
 
     def _on_file_transfer(self, message: m.FileTransferProtocol) -> None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
-from aerokit.mavlink.enums import CopterMode, FenceMitigate, MavSeverity
+from aerokit.mavlink.enums import CopterMode, FenceMitigate, FenceType, MavSeverity
 from aerokit.sim.ardupilot.copter_modes import CopterHost
 from aerokit.sim.ardupilot.failsafes import ArduPilotArming, ArduPilotFailsafes, ArmingCheck
 from aerokit.sim.ardupilot.fence import REPORT_ONLY, ArduPilotFence
@@ -25,9 +25,9 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return ()  # `position_reasons` includes these checks, because ArduCopter runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
-        """Return the failures of the first group that has any: GPS (if needed), the estimator, the mandatory checks."""
-        gps_reasons = super().position_reasons() if self.vehicle.mode.needs_position else ()
-        return gps_reasons or super().ahrs_reasons() or self.mandatory_reasons()
+        """Return the failures of the first group that has any: GPS (if needed), the mandatory checks."""
+        needs_gps = self.vehicle.mode.needs_position or self._fence_needs_position
+        return (super().position_reasons() if needs_gps else ()) or self.mandatory_reasons()
 
     def own_reasons(self) -> list[str]:
         reasons = []
@@ -38,15 +38,22 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return reasons
 
     def mandatory_reasons(self) -> list[str]:
-        """Return the failures that even a forced arming does not skip: no position or altitude."""
+        """Return the failures that even a forced arming does not skip: the estimator, no position or altitude."""
         copter, nav = self.vehicle, self.vehicle.navigation
-        reasons = []
+        reasons = list(super().ahrs_reasons())
         is_position_usable = nav.has_position and not copter.failsafes.has_estimator_failed
-        if copter.mode.needs_position and not is_position_usable:
-            reasons.append("Need Position Estimate")
+        if not reasons and not is_position_usable:
+            if copter.mode.needs_position:
+                reasons.append("Need Position Estimate")
+            elif self._fence_needs_position:
+                reasons.append("Fence enabled, need position estimate")
         if not copter.mode.has_manual_throttle and not nav.has_altitude:
             reasons.append("Need Alt Estimate")
         return reasons
+
+    @property
+    def _fence_needs_position(self) -> bool:
+        return bool(self.vehicle.fence.active & (FenceType.CIRCLE | FenceType.POLYGON))
 
     def on_armed(self) -> None:
         self.vehicle.path.reset()

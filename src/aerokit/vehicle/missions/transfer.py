@@ -276,7 +276,16 @@ class PlanTransfer(Generic[PlanT]):
             raise self._mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
-        """Read the plan into the cache, as a file if possible."""
+        """Read the plan into the cache, as a file if possible; again if another station replaces it meanwhile."""
+        while True:
+            changes = self._cache.changes
+            items, plan_id = await self._receive(method)
+            if self._cache.changes == changes:  # Otherwise, the items may be those of two plans.
+                self._cache.set(items, self._context.now(), plan_id)
+                return items
+
+    async def _receive(self, method: str) -> tuple[tuple[MissionItem, ...], int]:
+        """Return the plan on the vehicle and the vehicle's id of it, which is 0 if it reports none."""
         if await self._uses_file(method):
             try:
                 items = await self._channel.read_file()
@@ -284,11 +293,9 @@ class PlanTransfer(Generic[PlanT]):
                 self._on_file_error(error, method)
             else:
                 self._cache.has_file = True
-                self._cache.set(items, self._context.now())
-                return items
+                return items, 0
         received = await self._channel.receive()
-        self._cache.set(received.items, self._context.now(), received.opaque_id)
-        return received.items
+        return received.items, received.opaque_id
 
     async def _uses_file(self, method: str, *, is_upload: bool = False) -> bool:
         """Return True if the plan is to be transferred as a file.
