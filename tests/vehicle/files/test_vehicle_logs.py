@@ -268,6 +268,22 @@ async def test_erase_without_effect_times_out(ardupilot: Bench) -> None:
         await ardupilot.logs.erase(idle_timeout_s=3.0)
 
 
+async def test_erase_lost_while_log_grows_is_repeated(ardupilot: Bench) -> None:
+    server, requests = ardupilot.server, []
+    del server.logs[:-1]
+
+    def lose_first(*_: object) -> None:
+        requests.append(len(server.logs))
+        if len(requests) == 1:
+            server.write_on(500, server.logs[-1].time_utc + 1)
+        else:
+            server.logs.clear()
+
+    ardupilot.simulated.on(m.LogErase, lose_first)
+    await ardupilot.logs.erase()
+    assert requests == [1, 1]
+
+
 async def test_erase_waits_for_board_that_does_not_answer_meanwhile(ardupilot: Bench) -> None:
     faults = ardupilot.simulated.faults
 

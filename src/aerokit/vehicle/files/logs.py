@@ -211,15 +211,14 @@ class Logs:
             FileTimeout: some of the old logs still exist.
         """
         async with self._channel.operation("erase logs", timeout):
-            # Identify logs by time and size, because a new log may get the id of an erased log.
-            remaining = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
+            remaining = await self._entries(IDLE_TIMEOUT_S)
             progress_at = self._transfers.connection.now()
             while remaining:
                 self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
                 await anyio.sleep(ERASE_RETRY_INTERVAL_S)
                 count_before = len(remaining)
                 # Some boards do not answer while they erase.
-                remaining &= {(entry.time_utc, entry.size) for entry in await self._entries(idle_timeout_s)}
+                remaining = _still_listed(remaining, await self._entries(idle_timeout_s))
                 now = self._transfers.connection.now()
                 if len(remaining) < count_before:
                     progress_at = now
@@ -345,6 +344,21 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
     if old.time_utc is None:
         return False
     return new.time_utc is None or new.time_utc < old.time_utc - MAX_CLOCK_DIFFERENCE
+
+
+def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
+    """Return those of ``logs`` that a newer list still has.
+
+    Logs are identified by time and size, because a new log may get the id of an erased one. The newest may still be
+    written, so it is also the same log if it has its id and has grown.
+    """
+    newest = logs[-1]
+    kinds = {(entry.time_utc, entry.size) for entry in logs}
+    return tuple(
+        entry
+        for entry in listed
+        if (entry.time_utc, entry.size) in kinds or (entry.id == newest.id and not _is_different_log(newest, entry))
+    )
 
 
 def _no_such_log(log_id: int, text: str) -> FileError:
