@@ -1476,7 +1476,7 @@ class Files(TwinOf["AsyncFiles"]):
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
-            OSError: the local file cannot be written.
+            OSError: the local file cannot be written, or another download of this program is writing it.
         """
         self._loop.run(
             self.aio.download,
@@ -1683,7 +1683,7 @@ class Logs(TwinOf["AsyncLogs"]):
             InvalidArgument: an argument is invalid. Nothing was sent.
             FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
-            OSError: the local file cannot be written.
+            OSError: the local file cannot be written, or another download of this program is writing it.
         """
         self._loop.run(
             self.aio.download,

@@ -135,6 +135,17 @@ async def test_download_by_mavftp(ardupilot: Bench, tmp_path: Path) -> None:
     assert (tmp_path / "b.bin").read_bytes() == ardupilot.content(1)
 
 
+async def test_two_downloads_to_one_file_do_not_mix(ardupilot: Bench, tmp_path: Path) -> None:
+    first, second = await ardupilot.logs.list()
+    to = tmp_path / "b.bin"
+    calls = (ardupilot.logs.download(entry, to, method="ftp") for entry in (first, second))
+    _, refused = await asyncio.gather(*calls, return_exceptions=True)
+    assert isinstance(refused, OSError)
+    assert to.read_bytes() == ardupilot.content(0)
+    await ardupilot.logs.download(second, to, method="ftp")
+    assert to.read_bytes() == ardupilot.content(1)
+
+
 async def test_missing_log_is_file_error(bench: Bench) -> None:
     with pytest.raises(FileError, match="log 77: there is no such log"):
         await bench.logs.read(77)

@@ -148,7 +148,7 @@ class Logs:
             InvalidArgument: an argument is invalid. Nothing was sent.
             FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
-            OSError: the local file cannot be written.
+            OSError: the local file cannot be written, or another download of this program is writing it.
         """
         _check_id(log)
         path, entry = await self._locate(log, method, idle_timeout_s, timeout)
@@ -160,15 +160,15 @@ class Logs:
             )
             growth.report()
             return
-        part = PartFile(to, _part_suffix(entry))
-        # The time of the log is part of the file name's suffix. If the time is unknown, the part file may belong to
-        # another flight, so it must not be continued.
-        has_time = entry.time_utc is not None
-        start = part.size if resume and has_time and part.size <= entry.size else 0
-        with part.writing(start) as disk:
-            into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
-            await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
-        part.finish()
+        with PartFile(to, _part_suffix(entry)) as part:
+            # The time of the log is part of the file name's suffix. If the time is unknown, the part file may belong
+            # to another flight, so it must not be continued.
+            has_time = entry.time_utc is not None
+            start = part.size if resume and has_time and part.size <= entry.size else 0
+            with part.writing(start) as disk:
+                into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
+                await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
+            part.finish()
         growth.report()
 
     async def read(
