@@ -389,3 +389,24 @@ def test_rejections_describe_vehicle_state(vehicle: dronekit.Vehicle, caplog: py
         vehicle.wait_simple_takeoff(10, timeout=LIMIT_S)
     assert "takeoff: " in caplog.text
     assert "(the vehicle is disarmed, in STABILIZE)" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda vehicle: vehicle.wait_ready("unknown"),
+        lambda vehicle: vehicle.wait_for(lambda: False),
+        lambda vehicle: vehicle.arm(),
+        lambda vehicle: (vehicle.commands.download(), vehicle.commands.clear()),
+    ],
+)
+def test_wait_on_loop_thread_raises(vehicle: dronekit.Vehicle, wait: Callable[[Any], object]) -> None:
+    """Nothing could arrive meanwhile, so such a wait would last forever and stop our heartbeat."""
+
+    async def call() -> None:
+        wait(vehicle)
+
+    with pytest.raises(dronekit.APIException, match="loop's own thread would be a deadlock"):
+        vehicle.run(call)
+    vehicle.wait_ready("commands")
+    assert not vehicle.armed

@@ -199,6 +199,12 @@ class Core:
             raise APIException(f"no heartbeat from the vehicle for {age:.0f} s")
         return aio
 
+    def check_may_wait(self) -> None:
+        """Raise APIException if the link is down, or on the loop's thread, which must receive what is waited for."""
+        self.check_link()
+        with classic_errors():
+            self.handler.loop.check_may_wait()
+
     # ----------------------------------------------------------------------------- receiving
 
     def on(
@@ -371,7 +377,7 @@ class VehicleCore(HasObservers):
                     error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
                     raise error from LookupError(f"not received: {', '.join(sorted(missing))}")
                 return False
-            self._dk.check_link()
+            self._dk.check_may_wait()
             if (failure := ready.failure_of(missing)) is not None:
                 if raise_exception:  # Several threads may raise it, so each raises a copy.
                     raise type(failure)(str(failure)) from failure.__cause__

@@ -317,7 +317,7 @@ class FlightMethods(VehicleAttributes):
         """
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not condition():
-            self._dk.check_link()
+            self._dk.check_may_wait()
             if time.monotonic() >= deadline:
                 raise TimeoutError(errmsg or f"the condition was not true within {timeout:g} s")
             self._handler.wait_closed(min(interval, max(deadline - time.monotonic(), 0.0)))
