@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -410,3 +410,29 @@ def test_wait_on_loop_thread_raises(vehicle: dronekit.Vehicle, wait: Callable[[A
         vehicle.run(call)
     vehicle.wait_ready("commands")
     assert not vehicle.armed
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda vehicle: vehicle._dk.ready.wait_for_change({"new"}, 0.001),
+        lambda vehicle: vehicle._master.recv_match(type="NAMED_VALUE_INT", blocking=True, timeout=0.001),
+        lambda vehicle: vehicle.wait_for(iter((False, True)).__next__, interval=0.001),
+    ],
+)
+def test_waits_do_not_use_condition(vehicle: dronekit.Vehicle, wait: Callable[[Any], object]) -> None:
+    """Ctrl-C can leave the lock of threading.Condition acquired; the loop's thread or close() then hangs forever."""
+    wait(vehicle)  # This imports what it needs.
+    used = set[str]()
+
+    def trace(frame: FrameType, *_: object) -> None:
+        if frame.f_code.co_name != "current_thread":  # It takes no lock.
+            used.add(frame.f_code.co_filename)
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        wait(vehicle)
+    finally:
+        sys.settrace(before)
+    assert threading.__file__ not in used

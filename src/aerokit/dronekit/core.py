@@ -16,6 +16,7 @@ from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message, decoder_of
 from aerokit.protocols.command import allowed_attempts
+from aerokit.sync.thread_future import ThreadFuture
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -44,28 +45,33 @@ class Readiness:
         self.fetchers: dict[str, Callable[[], None]] = {}
         """Maps attributes to functions that request the value; called repeatedly while a program waits for it."""
         self._failures: dict[str, APIException] = {}  # errors with which reading an attribute has failed
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._changed: ThreadFuture[None] = ThreadFuture()  # finished and replaced at the next value or failure
 
     def mark(self, name: str) -> None:
         """Record that the attribute has a value."""
         if name in self.names and name not in self._failures:
             return
-        with self._changed:
+        with self._lock:
             self._failures.pop(name, None)
             self.names.add(name)
-            self._changed.notify_all()
+            self._notify()
 
     def unmark(self, name: str) -> None:
         """Record that the attribute is being read again, so that programs wait for the new value."""
-        with self._changed:
+        with self._lock:
             self._failures.pop(name, None)
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
         """Record that reading the attribute has failed. Programs that wait for the attribute raise this error."""
-        with self._changed:
+        with self._lock:
             self._failures[name] = error
-            self._changed.notify_all()
+            self._notify()
+
+    def _notify(self) -> None:
+        changed, self._changed = self._changed, ThreadFuture()
+        changed.finish()
 
     def failure_of(self, names: set[str]) -> APIException | None:
         """Return the error with which reading one of these attributes has failed, or None."""
@@ -79,10 +85,11 @@ class Readiness:
 
         Returns at once if none of these attributes is missing, or if one of the missing ones has failed.
         """
-        with self._changed:
-            missing = names - self.names
-            if missing and self.failure_of(missing) is None:
-                self._changed.wait(min(WAIT_STEP_S, max_wait_s))
+        with self._lock:
+            missing, changed = names - self.names, self._changed
+            must_wait = missing and self.failure_of(missing) is None
+        if must_wait:
+            changed.wait(min(WAIT_STEP_S, max_wait_s))
 
 
 class LatestMessage(Generic[MessageT]):
