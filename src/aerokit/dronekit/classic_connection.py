@@ -164,6 +164,10 @@ class BackgroundCall(concurrent.futures.Future[None]):
         self.kind = kind
         self.task: asyncio.Task[None] | None = None
 
+    def done(self) -> bool:
+        # Without the lock of Future, which Ctrl-C could leave acquired: waits call this method again and again.
+        return self._state not in ("PENDING", "RUNNING")
+
 
 class BackgroundCalls:
     """Runs coroutine functions on the loop in the background, and logs each failure as a warning.
