@@ -24,6 +24,7 @@ from aerokit.dronekit.classic_connection import BackgroundCall
 from aerokit.mavlink.messages import GlobalPositionInt
 
 LIMIT_S = 100.0
+ORDER = BackgroundCall("arm")
 SOURCES = Path(__file__).parent.parent.parent / "src"
 
 
@@ -419,7 +420,7 @@ def test_wait_on_loop_thread_raises(vehicle: dronekit.Vehicle, wait: Callable[[A
         lambda vehicle: vehicle._dk.ready.wait_for_change({"new"}, 0.001),
         lambda vehicle: vehicle._master.recv_match(type="NAMED_VALUE_INT", blocking=True, timeout=0.001),
         lambda vehicle: vehicle.wait_for(iter((False, True)).__next__, interval=0.001),
-        lambda _, order=BackgroundCall("arm"): order.done(),
+        lambda _: ORDER.done(),
     ],
 )
 def test_waits_do_not_use_condition(vehicle: dronekit.Vehicle, wait: Callable[[Any], object]) -> None:
