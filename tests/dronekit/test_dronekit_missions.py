@@ -313,6 +313,24 @@ def test_rejected_home_location_is_restored() -> None:
         vehicle.wait_for(lambda: str(vehicle.home_location) == before, timeout=LIMIT_S, interval=0.01)
 
 
+@pytest.mark.parametrize(
+    "order",
+    [
+        lambda vehicle: setattr(vehicle, "home_location", LocationGlobal(10, 20, 1e300)),
+        lambda vehicle: vehicle.simple_takeoff(1e300),
+        lambda vehicle: setattr(vehicle, "groundspeed", 1e300),
+    ],
+)
+def test_numbers_beyond_32_bit_floats_are_refused(order: Callable[[Any], object]) -> None:
+    """They cannot be sent, and home_location would keep the number."""
+    with connected(HOME, FIRST) as (_, vehicle):
+        vehicle.wait_ready("home_location", timeout=LIMIT_S)
+        before = str(vehicle.home_location)
+        with pytest.raises(ValueError, match=r"number"):
+            order(vehicle)
+        assert str(vehicle.home_location) == before
+
+
 def test_next_without_confirmation_is_sent_once(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message that is not answered could be repeated against a pilot: the order that follows has an answer."""
     monkeypatch.setattr("aerokit.dronekit.flight_orders.MISSION_CURRENT_TIMEOUT_S", 2.5)

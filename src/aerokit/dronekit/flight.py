@@ -158,7 +158,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_take_off(self, altitude: float) -> BackgroundCall:
         """Start the take-off order of this autopilot. ``altitude`` is in metres above home."""
-        if not math.isfinite(altitude):
+        if not abs(altitude) <= flight_orders.MAX_FLOAT:
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
         order_take_off = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
