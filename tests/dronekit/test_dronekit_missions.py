@@ -313,6 +313,18 @@ def test_rejected_home_location_is_restored() -> None:
         vehicle.wait_for(lambda: str(vehicle.home_location) == before, timeout=LIMIT_S, interval=0.01)
 
 
+def test_rejected_home_location_restores_accepted_one() -> None:
+    """The vehicle has the accepted home, although it did not report it."""
+    with connected(HOME, FIRST) as (controller, vehicle):
+        vehicle.wait_ready("home_location", timeout=LIMIT_S)
+        vehicle.home_location = accepted = LocationGlobal(10, 20, 30.0)
+        vehicle._handler.calls.wait(LIMIT_S)
+        controller.results[179] = 4
+        vehicle.home_location = LocationGlobal(11, 20, 30)
+        vehicle.wait_for(lambda: vehicle.home_location.lat != 11, timeout=LIMIT_S, interval=0.01)
+        assert str(vehicle.home_location) == str(accepted)
+
+
 @pytest.mark.parametrize(
     "order",
     [

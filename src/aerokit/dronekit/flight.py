@@ -280,11 +280,14 @@ class FlightMethods(VehicleAttributes):
         home = {"frame": MavFrame.GLOBAL, "x": latitude, "y": longitude, "z": altitude}
         order = self._dk.order("home", aio.command_int, MavCmd.DO_SET_HOME, 0, **home, component_id=0, or_long=True)
         self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
-        order.add_done_callback(self._dk_on_home_answer)
+        order.add_done_callback(functools.partial(self._dk_on_home_answer, self._home_location))
 
-    def _dk_on_home_answer(self, order: Future[None]) -> None:
-        """Restore the reported home if the vehicle has rejected the new home, or has not answered."""
-        if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
+    def _dk_on_home_answer(self, new: LocationGlobal, order: Future[None]) -> None:
+        """Restore the last home of the vehicle if it has rejected the new home, or has not answered."""
+        error = order.exception()
+        if error is None:
+            self._dk_reported_home = new
+        elif isinstance(error, (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_reported_home
 
     def _dk_home_altitude(self) -> float:
