@@ -1618,7 +1618,7 @@ class LogStream(LogStreamTwin):
     """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
     If you append all bytes to a file, the file is a valid ULog file at any time. Lost messages are marked in the log as
-    dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 streams its log to one station at a time.
+    dropouts; ``lost`` counts them. PX4 streams its log to one station at a time.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot. Nothing was sent.
