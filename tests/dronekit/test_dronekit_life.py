@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,9 +20,11 @@ from served_copter import served_copter
 import aerokit.dronekit as dronekit
 from aerokit.dronekit import mavlink
 from aerokit.dronekit import vehicle as vehicle_module
+from aerokit.dronekit.classic_connection import BackgroundCall
 from aerokit.mavlink.messages import GlobalPositionInt
 
 LIMIT_S = 100.0
+ORDER = BackgroundCall("arm")
 SOURCES = Path(__file__).parent.parent.parent / "src"
 
 
@@ -389,3 +391,51 @@ def test_rejections_describe_vehicle_state(vehicle: dronekit.Vehicle, caplog: py
         vehicle.wait_simple_takeoff(10, timeout=LIMIT_S)
     assert "takeoff: " in caplog.text
     assert "(the vehicle is disarmed, in STABILIZE)" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda vehicle: vehicle.wait_ready("unknown"),
+        lambda vehicle: vehicle.wait_for(lambda: False),
+        lambda vehicle: vehicle.arm(),
+        lambda vehicle: (vehicle.commands.download(), vehicle.commands.clear()),
+    ],
+)
+def test_wait_on_loop_thread_raises(vehicle: dronekit.Vehicle, wait: Callable[[Any], object]) -> None:
+    """Nothing could arrive meanwhile, so such a wait would last forever and stop our heartbeat."""
+
+    async def call() -> None:
+        wait(vehicle)
+
+    with pytest.raises(dronekit.APIException, match="loop's own thread would be a deadlock"):
+        vehicle.run(call)
+    vehicle.wait_ready("commands")
+    assert not vehicle.armed
+
+
+@pytest.mark.parametrize(
+    "wait",
+    [
+        lambda vehicle: vehicle._dk.ready.wait_for_change({"new"}, 0.001),
+        lambda vehicle: vehicle._master.recv_match(type="NAMED_VALUE_INT", blocking=True, timeout=0.001),
+        lambda vehicle: vehicle.wait_for(iter((False, True)).__next__, interval=0.001),
+        lambda _: ORDER.done(),
+    ],
+)
+def test_waits_do_not_use_condition(vehicle: dronekit.Vehicle, wait: Callable[[Any], object]) -> None:
+    """Ctrl-C can leave the lock of threading.Condition acquired; the loop's thread or close() then hangs forever."""
+    wait(vehicle)  # This imports what it needs.
+    used = set[str]()
+
+    def trace(frame: FrameType, *_: object) -> None:
+        if frame.f_code.co_name != "current_thread":  # It takes no lock.
+            used.add(frame.f_code.co_filename)
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        wait(vehicle)
+    finally:
+        sys.settrace(before)
+    assert threading.__file__ not in used

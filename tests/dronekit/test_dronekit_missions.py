@@ -313,6 +313,36 @@ def test_rejected_home_location_is_restored() -> None:
         vehicle.wait_for(lambda: str(vehicle.home_location) == before, timeout=LIMIT_S, interval=0.01)
 
 
+def test_rejected_home_location_restores_accepted_one() -> None:
+    """The vehicle has the accepted home, although it did not report it."""
+    with connected(HOME, FIRST) as (controller, vehicle):
+        vehicle.wait_ready("home_location", timeout=LIMIT_S)
+        vehicle.home_location = accepted = LocationGlobal(10, 20, 30.0)
+        vehicle._handler.calls.wait(LIMIT_S)
+        controller.results[179] = 4
+        vehicle.home_location = LocationGlobal(11, 20, 30)
+        vehicle.wait_for(lambda: vehicle.home_location.lat != 11, timeout=LIMIT_S, interval=0.01)
+        assert str(vehicle.home_location) == str(accepted)
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        lambda vehicle: setattr(vehicle, "home_location", LocationGlobal(10, 20, 1e300)),
+        lambda vehicle: vehicle.simple_takeoff(1e300),
+        lambda vehicle: setattr(vehicle, "groundspeed", 1e300),
+    ],
+)
+def test_numbers_beyond_32_bit_floats_are_refused(order: Callable[[Any], object]) -> None:
+    """They cannot be sent, and home_location would keep the number."""
+    with connected(HOME, FIRST) as (_, vehicle):
+        vehicle.wait_ready("home_location", timeout=LIMIT_S)
+        before = str(vehicle.home_location)
+        with pytest.raises(ValueError, match=r"number"):
+            order(vehicle)
+        assert str(vehicle.home_location) == before
+
+
 def test_next_without_confirmation_is_sent_once(three: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message that is not answered could be repeated against a pilot: the order that follows has an answer."""
     monkeypatch.setattr("aerokit.dronekit.flight_orders.MISSION_CURRENT_TIMEOUT_S", 2.5)

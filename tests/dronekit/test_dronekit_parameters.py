@@ -208,6 +208,13 @@ def test_parameter_set_without_retries_returns_immediately(vehicle: dronekit.Veh
     assert vehicle.parameters["FOO"] == 6.0
 
 
+def test_failed_parameter_set_without_retries_is_logged(
+    vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
+) -> None:
+    vehicle.parameters.set("FOO", float("nan"), retries=0)
+    vehicle.wait_for(lambda: "parameter FOO: FOO = nan must be a finite number" in caplog.text, LIMIT_S, 0.01)
+
+
 def test_parameter_set_in_listener(vehicle: dronekit.Vehicle, fc: FlightController) -> None:
     results: list[object] = []
     done = threading.Event()

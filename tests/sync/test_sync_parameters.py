@@ -51,6 +51,18 @@ def test_parameter_blocks_restore_values(vehicle: aerokit.sync.Vehicle, copter: 
     assert copter.parameters["RTL_ALT"] == 1500
 
 
+def test_vehicle_closed_in_block_names_unrestored_values(vehicle: aerokit.sync.Vehicle) -> None:
+    with pytest.raises(RollbackFailed) as raised, vehicle.parameters.temporarily({"RTL_ALT": 2000}):
+        vehicle.close()
+    assert raised.value.not_restored == {"RTL_ALT": 1500}
+
+
+def test_vehicle_closed_in_successful_transaction_is_no_error(vehicle: aerokit.sync.Vehicle) -> None:
+    with vehicle.parameters.transaction() as transaction:
+        transaction.set("RTL_ALT", 2000)
+        vehicle.close()
+
+
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs POSIX signals")
 def test_ctrl_c_in_block_restores_values(vehicle: aerokit.sync.Vehicle, copter: SimulatedCopter) -> None:
     main = threading.main_thread().ident

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, ClassVar
 
 from aerokit.errors import FileFormatError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from typing_extensions import Self
 
 MAX_FILE_SIZE = 16 << 20
 """Size limit in bytes for files of parameters, metadata, plans and definitions; real files have at most 5 MB."""
@@ -95,13 +98,26 @@ def read_text(path: str | os.PathLike[str]) -> str:
 class PartFile:
     """A download in progress: until :meth:`finish`, ``<destination><mark>.part`` holds the beginning of the file.
 
-    ``mark`` identifies the file that is downloaded, so that a partial file of another one is not continued.
+    ``mark`` identifies the file that is downloaded, so that a partial file of another one is not continued. Use it in a
+    `with` statement, which raises OSError while another download of this program writes the file.
     """
+
+    _claimed: ClassVar[set[str]] = set()  # absolute paths of the partial files that downloads write
 
     def __init__(self, destination: str | os.PathLike[str], mark: str = "") -> None:
         self._destination = os.fspath(destination)
         self.path: Path = Path(f"{self._destination}{mark}.part")
         """Path of the partial file."""
+
+    def __enter__(self) -> Self:
+        self._claim = os.path.abspath(self.path)
+        if self._claim in self._claimed:
+            raise OSError(errno.EBUSY, "another download is writing this file", self._claim)
+        self._claimed.add(self._claim)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._claimed.discard(self._claim)
 
     @property
     def size(self) -> int:

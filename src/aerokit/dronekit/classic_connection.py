@@ -18,6 +18,7 @@ from aerokit.dronekit.exceptions import classic_errors
 from aerokit.dronekit.listener_thread import ListenerThread
 from aerokit.errors import AerokitError, CommandRejected, ConnectionClosed
 from aerokit.mavlink.messages import RcChannelsOverride
+from aerokit.sync.thread_future import ThreadFuture
 
 if TYPE_CHECKING:
     from aerokit.connection.connection import Connection
@@ -63,7 +64,7 @@ class ClassicConnection:
         """Called on the loop with each sent message, because a message may overrule earlier orders."""
         self.vehicle: Any = None
         """The vehicle on this connection; None before it is connected."""
-        self._is_closed = threading.Event()  # set when close() was called
+        self._closed: ThreadFuture[None] = ThreadFuture()  # finished when close() was called
         self._closing = threading.Lock()  # held while one thread decides to close
         self._close_callbacks: list[Callable[[], object]] = []
         # Closes the connection when the interpreter exits, without keeping this object alive until then.
@@ -98,9 +99,9 @@ class ClassicConnection:
         Idempotent. Can be called from any thread and callback, at interpreter exit, and after the link was lost.
         """
         with self._closing:
-            if self._is_closed.is_set():
+            if self._closed.is_done:
                 return
-            self._is_closed.set()
+            self._closed.finish()
         atexit.unregister(self._exit_callback)
         try:
             self.calls.wait(CLOSE_TIMEOUT_S)
@@ -119,11 +120,11 @@ class ClassicConnection:
 
     def wait_closed(self, timeout: float) -> bool:
         """Wait at most ``timeout`` seconds until :meth:`close` is called; return True if it was."""
-        return self._is_closed.wait(timeout)
+        return self._closed.wait(timeout)
 
     @property
     def is_closed(self) -> bool:
-        return self._is_closed.is_set()
+        return self._closed.is_done
 
     def is_of_another_vehicle(self, system_id: int) -> bool:
         """Return True if the system with this id has an autopilot but is not the connected vehicle."""
@@ -162,6 +163,10 @@ class BackgroundCall(concurrent.futures.Future[None]):
         super().__init__()
         self.kind = kind
         self.task: asyncio.Task[None] | None = None
+
+    def done(self) -> bool:
+        # Without the lock of Future, which Ctrl-C could leave acquired: waits call this method again and again.
+        return self._state not in ("PENDING", "RUNNING")
 
 
 class BackgroundCalls:

@@ -16,6 +16,7 @@ from aerokit.dronekit.observers import EVERY_NAME, HasObservers, Listeners
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.message import Message, decoder_of
 from aerokit.protocols.command import allowed_attempts
+from aerokit.sync.thread_future import ThreadFuture
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -44,28 +45,33 @@ class Readiness:
         self.fetchers: dict[str, Callable[[], None]] = {}
         """Maps attributes to functions that request the value; called repeatedly while a program waits for it."""
         self._failures: dict[str, APIException] = {}  # errors with which reading an attribute has failed
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._changed: ThreadFuture[None] = ThreadFuture()  # finished and replaced at the next value or failure
 
     def mark(self, name: str) -> None:
         """Record that the attribute has a value."""
         if name in self.names and name not in self._failures:
             return
-        with self._changed:
+        with self._lock:
             self._failures.pop(name, None)
             self.names.add(name)
-            self._changed.notify_all()
+            self._notify()
 
     def unmark(self, name: str) -> None:
         """Record that the attribute is being read again, so that programs wait for the new value."""
-        with self._changed:
+        with self._lock:
             self._failures.pop(name, None)
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
         """Record that reading the attribute has failed. Programs that wait for the attribute raise this error."""
-        with self._changed:
+        with self._lock:
             self._failures[name] = error
-            self._changed.notify_all()
+            self._notify()
+
+    def _notify(self) -> None:
+        changed, self._changed = self._changed, ThreadFuture()
+        changed.finish()
 
     def failure_of(self, names: set[str]) -> APIException | None:
         """Return the error with which reading one of these attributes has failed, or None."""
@@ -79,10 +85,11 @@ class Readiness:
 
         Returns at once if none of these attributes is missing, or if one of the missing ones has failed.
         """
-        with self._changed:
-            missing = names - self.names
-            if missing and self.failure_of(missing) is None:
-                self._changed.wait(min(WAIT_STEP_S, max_wait_s))
+        with self._lock:
+            missing, changed = names - self.names, self._changed
+            must_wait = missing and self.failure_of(missing) is None
+        if must_wait:
+            changed.wait(min(WAIT_STEP_S, max_wait_s))
 
 
 class LatestMessage(Generic[MessageT]):
@@ -198,6 +205,12 @@ class Core:
         if self.heartbeat_limit_s and age > self.heartbeat_limit_s:
             raise APIException(f"no heartbeat from the vehicle for {age:.0f} s")
         return aio
+
+    def check_may_wait(self) -> None:
+        """Raise APIException if the link is down, or on the loop's thread, which must receive what is waited for."""
+        self.check_link()
+        with classic_errors():
+            self.handler.loop.check_may_wait()
 
     # ----------------------------------------------------------------------------- receiving
 
@@ -371,7 +384,7 @@ class VehicleCore(HasObservers):
                     error = TimeoutError(f"wait_ready experienced a timeout after {timeout} seconds.")
                     raise error from LookupError(f"not received: {', '.join(sorted(missing))}")
                 return False
-            self._dk.check_link()
+            self._dk.check_may_wait()
             if (failure := ready.failure_of(missing)) is not None:
                 if raise_exception:  # Several threads may raise it, so each raises a copy.
                     raise type(failure)(str(failure)) from failure.__cause__

@@ -158,7 +158,7 @@ class FlightMethods(VehicleAttributes):
 
     def _dk_take_off(self, altitude: float) -> BackgroundCall:
         """Start the take-off order of this autopilot. ``altitude`` is in metres above home."""
-        if not math.isfinite(altitude):
+        if not abs(altitude) <= flight_orders.MAX_FLOAT:
             raise ValueError("Altitude was NaN or Infinity. Please provide a real number")
         aio = self._dk.check_link()
         order_take_off = functools.partial(self._dk.order, "takeoff", flight_orders.take_off, aio)
@@ -280,11 +280,14 @@ class FlightMethods(VehicleAttributes):
         home = {"frame": MavFrame.GLOBAL, "x": latitude, "y": longitude, "z": altitude}
         order = self._dk.order("home", aio.command_int, MavCmd.DO_SET_HOME, 0, **home, component_id=0, or_long=True)
         self._home_location = LocationGlobal(pos.lat, pos.lon, altitude)
-        order.add_done_callback(self._dk_on_home_answer)
+        order.add_done_callback(functools.partial(self._dk_on_home_answer, self._home_location))
 
-    def _dk_on_home_answer(self, order: Future[None]) -> None:
-        """Restore the reported home if the vehicle has rejected the new home, or has not answered."""
-        if not order.cancelled() and isinstance(order.exception(), (CommandRejected, OperationTimeout)):
+    def _dk_on_home_answer(self, new: LocationGlobal, order: Future[None]) -> None:
+        """Restore the last home of the vehicle if it has rejected the new home, or has not answered."""
+        error = order.exception()
+        if error is None:
+            self._dk_reported_home = new
+        elif isinstance(error, (CommandRejected, OperationTimeout)):
             self._home_location = self._dk_reported_home
 
     def _dk_home_altitude(self) -> float:
@@ -317,7 +320,7 @@ class FlightMethods(VehicleAttributes):
         """
         deadline = math.inf if not timeout else time.monotonic() + timeout
         while not condition():
-            self._dk.check_link()
+            self._dk.check_may_wait()
             if time.monotonic() >= deadline:
                 raise TimeoutError(errmsg or f"the condition was not true within {timeout:g} s")
             self._handler.wait_closed(min(interval, max(deadline - time.monotonic(), 0.0)))

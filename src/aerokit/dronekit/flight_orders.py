@@ -26,6 +26,7 @@ from aerokit.mavlink.enums import (
     MissionState,
 )
 from aerokit.mavlink.messages import PlayTune
+from aerokit.parameters import ParameterType
 from aerokit.protocols.command import command_long
 from aerokit.vehicle.commanding.arbiter import MODE_MAX_AGE_S
 
@@ -43,6 +44,8 @@ ARMED_TIMEOUT_S = 10.0
 MISSION_CURRENT_TIMEOUT_S = 1.5  # how long to wait for MISSION_CURRENT after MISSION_SET_CURRENT
 
 MAX_SEQ = 0xFFFF
+
+MAX_FLOAT = ParameterType.REAL32.maximum  # the largest number that a field of a command can hold
 
 NO_MISSION = 0xFFFF  # MISSION_CURRENT.total of a vehicle without a mission
 
@@ -181,20 +184,20 @@ def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple
 
     Raises InvalidArgument, whose text names the wrong attribute.
     """
-    for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", math.inf)):
+    for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", MAX_FLOAT)):
         value = getattr(location, name)
         try:
-            is_good = math.isfinite(value) and abs(value) <= limit
+            is_good = abs(value) <= limit
         except TypeError:
             is_good = False
         if not is_good:
-            allowed = "a finite number" if limit == math.inf else f"-{limit:g} to {limit:g} degrees"
+            allowed = "a finite number" if limit == MAX_FLOAT else f"-{limit:g} to {limit:g} degrees"
             raise InvalidArgument(f"location.{name} = {value!r} is not allowed: it must be {allowed}")
     return round(location.lat * 1e7), round(location.lon * 1e7), float(location.alt)
 
 
 def check_speed(name: str, speed: float | None) -> None:
-    if speed is not None and not math.isfinite(speed):
+    if speed is not None and not abs(speed) <= MAX_FLOAT:
         raise InvalidArgument(f"{name} = {speed!r} is not allowed: it must be a finite number of m/s")
 
 

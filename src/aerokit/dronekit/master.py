@@ -20,6 +20,7 @@ from aerokit.mavlink.dialect import STANDARD
 from aerokit.mavlink.enums import MavAutopilot, MavCmd, MavModeFlag, MavParamType
 from aerokit.mavlink.message_factory import MessageFactory
 from aerokit.mavlink.pymavlink import from_pymavlink
+from aerokit.sync.thread_future import ThreadFuture
 
 if TYPE_CHECKING:
     from aerokit.dronekit.classic_connection import ClassicConnection
@@ -266,7 +267,8 @@ class Inbox(Mapping[str, Any]):
         self._latest: dict[int, Frame] = {}  # last frame by message id
         # Frames that `next_match` has not returned yet, oldest first.
         self._frames: deque[Frame] = deque(maxlen=MAX_MESSAGES)
-        self._frame_arrived = threading.Condition()  # notified for each frame; also protects the other attributes
+        self._lock = threading.Lock()  # protects the other attributes
+        self._arrived: ThreadFuture[None] = ThreadFuture()  # finished and replaced when a frame arrives
         self._started_at: float | None = None  # time of the first access; None before
 
     def next_match(self, names: Collection[str] | None, condition: Any, timeout: float | None) -> Any:
@@ -291,9 +293,7 @@ class Inbox(Mapping[str, Any]):
         self._start()
         message_id = _id_of(name)
         while (frame := self._latest.get(message_id)) is None and self._may_wait():
-            with self._frame_arrived:
-                # The wait is short, so that `_may_wait` ends the loop in time.
-                self._frame_arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)
+            self._arrived.wait(SIGNAL_CHECK_INTERVAL_S / 10)  # It is short, so that `_may_wait` ends the loop in time.
         if frame is None:
             raise KeyError(name)
         return message_of(frame)
@@ -308,7 +308,7 @@ class Inbox(Mapping[str, Any]):
 
     def _start(self) -> None:
         """Start receiving at the first access."""
-        with self._frame_arrived:
+        with self._lock:
             if self._started_at is not None:
                 return
             self._started_at = time.monotonic()
@@ -327,16 +327,17 @@ class Inbox(Mapping[str, Any]):
         # This runs on the loop's thread.
         if self._connection.is_of_another_vehicle(frame.system_id):
             return
-        with self._frame_arrived:
+        with self._lock:
             self._latest[frame.message_id] = frame
             self._frames.append(frame)
-            self._frame_arrived.notify_all()
+            arrived, self._arrived = self._arrived, ThreadFuture()
+            arrived.finish()
 
     def _pop(self, deadline: float | None) -> Frame | None:
         """Remove and return the oldest frame that is not too old; wait for one until the deadline, then return None."""
         now = self._connection.connection.now
         while True:
-            with self._frame_arrived:
+            with self._lock:
                 while self._frames:
                     frame = self._frames.popleft()
                     if now() - frame.received_at < MESSAGE_MAX_AGE_S:
@@ -347,7 +348,8 @@ class Inbox(Mapping[str, Any]):
                     wait_s = min(wait_s, deadline - time.monotonic())
                 if wait_s <= 0:
                     return None
-                self._frame_arrived.wait(wait_s)
+                arrived = self._arrived
+            arrived.wait(wait_s)
 
     def _raise_if_closed(self) -> None:
         if self._connection.is_closed or not self._connection.connection.is_open:

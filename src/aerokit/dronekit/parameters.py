@@ -209,6 +209,13 @@ async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int
     return None
 
 
+async def set_once(aio: AsyncVehicle, name: str, value: float) -> None:
+    """Like :func:`set_parameter` without retries, but raise the error."""
+    failure = await set_parameter(aio, name, value, 0)
+    if failure is not None:
+        raise failure
+
+
 def convert_to_type(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
     """Convert a value to a parameter type; InvalidArgument if that is impossible."""
     if type.is_integer and isinstance(value, float) and abs(value) < float("inf"):
@@ -309,7 +316,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
             name: in any case.
             value: any number.
             retries: how often the value is requested again, once a second, if the vehicle does not answer. With 0, the
-                method returns False at once, and the confirmation is checked in the background.
+                method returns False at once, and a failure is logged as a warning later.
             wait_ready: wait for the download of all parameters first, which is not necessary.
 
         Returns:
@@ -330,7 +337,7 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
                 warn_of_rename(resolved.renamed)
         core = self._core
         if retries <= 0:
-            core.order(f"parameter {vehicle_name}", set_parameter, core.aio, vehicle_name, converted, 0)
+            core.order(f"parameter {vehicle_name}", set_once, core.aio, vehicle_name, converted)
             return False
         failure = core.run(set_parameter, core.aio, vehicle_name, converted, retries)
         if isinstance(failure, ParameterTimeout):

@@ -261,7 +261,10 @@ class ShieldedBlockTwin(TwinOf[ShieldedT]):
     """Twin of a block whose exit cannot be interrupted by Ctrl-C."""
 
     def __exit__(self, exc_type: Any, exc: Any, traceback: Any) -> None:
-        self._loop.run_shielded(self.aio.__aexit__, exc_type, exc, traceback)
+        try:
+            self._loop.run_shielded(self.aio.__aexit__, exc_type, exc, traceback)
+        except ConnectionClosed as error:
+            self.aio._abandon(error, exc)
 
 
 class TemporarilyTwin(ShieldedBlockTwin["TemporaryParameters"]):

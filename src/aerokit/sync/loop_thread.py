@@ -224,17 +224,22 @@ class LoopThread:
 
     def wait_for(self, future: ThreadFuture[Any]) -> None:
         """Wait for a future; Ctrl-C interrupts the wait on every system. ConnectionClosed if the loop ends first."""
+        self.check_may_wait()
         while not future.wait(SIGNAL_CHECK_INTERVAL_S):
             if not self._thread.is_alive() and not future.is_done:
                 raise ConnectionClosed(CLOSED_DURING_CALL)
 
-    def _start(self, call: _Call[Any]) -> None:
-        """Schedule the start of a call on the loop."""
+    def check_may_wait(self) -> None:
+        """Raise BusyError on the loop's own thread, where a wait for the loop would be a deadlock."""
         if self.is_current:
             raise BusyError(
                 "a blocking call on the event loop's own thread would be a deadlock; predicates and callbacks run"
                 " there: make the call on another thread"
             )
+
+    def _start(self, call: _Call[Any]) -> None:
+        """Schedule the start of a call on the loop."""
+        self.check_may_wait()
         with self._lock:
             self._check_open()
             call.is_scheduled = True

@@ -1476,7 +1476,7 @@ class Files(TwinOf["AsyncFiles"]):
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
-            OSError: the local file cannot be written.
+            OSError: the local file cannot be written, or another download of this program is writing it.
         """
         self._loop.run(
             self.aio.download,
@@ -1618,7 +1618,7 @@ class LogStream(LogStreamTwin):
     """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
     If you append all bytes to a file, the file is a valid ULog file at any time. Lost messages are marked in the log as
-    dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 streams its log to one station at a time.
+    dropouts; ``lost`` counts them. PX4 streams its log to one station at a time.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot. Nothing was sent.
@@ -1683,7 +1683,7 @@ class Logs(TwinOf["AsyncLogs"]):
             InvalidArgument: an argument is invalid. Nothing was sent.
             FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
-            OSError: the local file cannot be written.
+            OSError: the local file cannot be written, or another download of this program is writing it.
         """
         self._loop.run(
             self.aio.download,

@@ -93,6 +93,16 @@ def test_load_outside_range_is_refused(metadata: str, tmp_path: Path, capsys: py
     assert "RTL_ALT = 9000 is not in 200..8000 cm" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("line", "has_note"), [("NO_SUCH,1", False), ("RTL_ALT,2000", True)])
+def test_load_without_writes_does_not_mention_ranges(
+    line: str, has_note: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.param"
+    file.write_text(f"{line}\n")
+    run_with(SimulatedCopter(boot_time_s=0.0), ["params", "load", str(file)])
+    assert ("ranges were not checked" in capsys.readouterr().out) is has_note
+
+
 def test_get_and_list_show_metadata(metadata: str, capsys: pytest.CaptureFixture[str]) -> None:
     copter = SimulatedCopter(boot_time_s=0.0)
     get = ["params", "get", "RTL_ALT", "FS_THR_ENABLE", "--metadata", metadata]

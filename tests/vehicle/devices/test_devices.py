@@ -287,6 +287,24 @@ async def test_log_stream_is_valid_ulog() -> None:
         assert len(params(flight, C.LOGGING_START)) == len(params(flight, C.LOGGING_STOP)) == 1
 
 
+async def test_log_stream_read_ends_with_vehicle_block() -> None:
+    px4 = SimulatedPx4(boot_time_s=0.0)
+    async with simulated_link(px4) as link, aerokit.open_connection(link) as connection:
+        async with aerokit.connect(connection) as vehicle:
+
+            async def read() -> None:
+                async with vehicle.logs.stream() as stream:
+                    async for _ in stream:
+                        pass
+
+            reading = asyncio.create_task(read())
+            await anyio.sleep(2.0)
+        await asyncio.wait([reading], timeout=0.1)
+        assert reading.done()
+        with pytest.raises(ConnectionClosed, match="block of this vehicle was left"):
+            await reading
+
+
 async def wait_for_end(task: asyncio.Task[Any]) -> None:
     with contextlib.suppress(ConnectionClosed):
         await task

@@ -135,6 +135,17 @@ async def test_download_by_mavftp(ardupilot: Bench, tmp_path: Path) -> None:
     assert (tmp_path / "b.bin").read_bytes() == ardupilot.content(1)
 
 
+async def test_two_downloads_to_one_file_do_not_mix(ardupilot: Bench, tmp_path: Path) -> None:
+    first, second = await ardupilot.logs.list()
+    to = tmp_path / "b.bin"
+    calls = (ardupilot.logs.download(entry, to, method="ftp") for entry in (first, second))
+    _, refused = await asyncio.gather(*calls, return_exceptions=True)
+    assert isinstance(refused, OSError)
+    assert to.read_bytes() == ardupilot.content(0)
+    await ardupilot.logs.download(second, to, method="ftp")
+    assert to.read_bytes() == ardupilot.content(1)
+
+
 async def test_missing_log_is_file_error(bench: Bench) -> None:
     with pytest.raises(FileError, match="log 77: there is no such log"):
         await bench.logs.read(77)
@@ -266,6 +277,22 @@ async def test_erase_without_effect_times_out(ardupilot: Bench) -> None:
     ardupilot.simulated.on(m.LogErase, lambda *_: None)
     with pytest.raises(FileTimeout, match=r"logs still exist, and none has gone for 3 s"):
         await ardupilot.logs.erase(idle_timeout_s=3.0)
+
+
+async def test_erase_lost_while_log_grows_is_repeated(ardupilot: Bench) -> None:
+    server, requests = ardupilot.server, []
+    del server.logs[:-1]
+
+    def lose_first(*_: object) -> None:
+        requests.append(len(server.logs))
+        if len(requests) == 1:
+            server.write_on(500, server.logs[-1].time_utc + 1)
+        else:
+            server.logs.clear()
+
+    ardupilot.simulated.on(m.LogErase, lose_first)
+    await ardupilot.logs.erase()
+    assert requests == [1, 1]
 
 
 async def test_erase_waits_for_board_that_does_not_answer_meanwhile(ardupilot: Bench) -> None:

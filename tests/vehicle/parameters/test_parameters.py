@@ -256,6 +256,25 @@ async def test_reboot_clears_the_table() -> None:
         assert len(await parameters.download()) == 120
 
 
+async def test_list_from_before_a_reboot_is_downloaded_again() -> None:
+    simulated = copter()
+    first = next(iter(simulated.parameters))
+    async with open_flight(simulated) as flight:
+        session, reboots = flight.vehicle._session, []
+
+        def reboot_once(progress: TransferProgress) -> None:
+            if progress.done == 60 and not reboots:
+                reboots.append(progress)
+                simulated.parameters[first] += 1
+                for function in session.on_reboot:
+                    function()
+
+        table = await flight.vehicle.parameters.download(method="list", on_progress=reboot_once)
+        assert table[first].value == simulated.parameters[first]
+        assert len(reboots) == 1
+        assert flight.vehicle.parameters.is_complete
+
+
 async def test_changes_by_others_update_the_table() -> None:
     simulated = copter()
     async with open_flight(simulated) as flight:

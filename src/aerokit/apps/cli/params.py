@@ -216,7 +216,7 @@ async def _load(options: argparse.Namespace) -> int:
     failed_count = sum(result.error is not None for result in changed)
     not_set = f", {failed_count} were not set" if failed_count else ""
     print(f"{len(results)} parameters in {options.file}, {len(changed) - failed_count} of them differed{not_set}")
-    if changed and metadata is None and not options.force:
+    if len(changed) > failed_count and metadata is None and not options.force:
         print(metadata_source(vehicle))
     return code
 

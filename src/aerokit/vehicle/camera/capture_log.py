@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 MAX_CAPTURES = 20_000
 FETCH_ATTEMPTS, REQUEST_TIMEOUT_S = 12, 1.0
-# Interval at which a wait for a capture checks whether the vehicle's block or the connection has ended.
-END_POLL_INTERVAL_S = 1.0
 # PX4 may send CAMERA_IMAGE_CAPTURED, which has the position, up to this many seconds after CAMERA_TRIGGER.
 TRIGGER_GRACE_S = 0.3
 # Two messages of different types with the same index report the same picture if they arrive within this time.
@@ -92,6 +90,7 @@ class CaptureLog:
 
     def __init__(self, link: CameraLink) -> None:
         self._link = link
+        self.end = link.end
         self._by_index: dict[int, _Entry] = {}
         # Indices of the captures that are being requested; an index that two calls request occurs twice.
         self._requested: list[int] = []
@@ -308,11 +307,13 @@ class CaptureQueue:
 
     def __enter__(self) -> CaptureQueue:
         self._log.on_capture.append(self._add)
+        self._detach = self._log.end.on_end(lambda _: self._event.set())
         return self
 
     def __exit__(self, *_: Any) -> None:
         if self._add in self._log.on_capture:
             self._log.on_capture.remove(self._add)
+            self._detach()
 
     def pop(self) -> Capture | None:
         """Return the oldest capture in the queue and remove it; None if the queue is empty."""
@@ -322,10 +323,9 @@ class CaptureQueue:
         """Wait for a capture; return False if none arrives in time."""
         with anyio.move_on_after(seconds):
             while not self._queue:
-                self._log.cell._raise_if_closed()
+                self._log.end.raise_if_ended()
                 self._event = anyio.Event()
-                with anyio.move_on_after(END_POLL_INTERVAL_S):
-                    await self._event.wait()
+                await self._event.wait()
         return bool(self._queue)
 
     def _add(self, capture: Capture) -> None:

@@ -53,6 +53,7 @@ class CameraLink(CameraOrders):
     ) -> None:
         self._context = context
         self._session = context.session
+        self.end = context.session.end
         self._component_of = component_of
         # Called with the number of the camera as soon as it is known.
         self._on_bound = on_bound

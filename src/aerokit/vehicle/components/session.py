@@ -68,6 +68,7 @@ class ComponentSession:
             autopilot=Autopilot(session.vehicle_type),  # The autopilot's special rules do not apply to a component.
             version=version,
             background=session.background,
+            end=session.end,
             describe=self.describe_link,
             round_trip_s=lambda: session.link_watch.round_trip_s,
             request_version=self._request_version,
@@ -78,7 +79,7 @@ class ComponentSession:
         for function in (self.rates.run, self.rates.watch):
             session.background.start(function, f"aerokit {function.__qualname__} of component {component_id}")
         session.on_reboot.append(self.rates.request_again)
-        session.at_close(self._close)
+        session.at_close(self.rates.close)
 
     def at_close(self, *functions: Detach) -> None:
         self._session.at_close(*functions)
@@ -95,10 +96,6 @@ class ComponentSession:
         signatures = self.connection.describe_signature_problems(self.system_id)
         prefix = f"{signatures}; " if signatures else ""
         return f"{prefix}last heartbeat of component {self.component_id} {age:.1f} s ago"
-
-    def _close(self) -> None:
-        self.transfers.close()
-        self.rates.close()
 
 
 _MAVFTP = re.compile(r"(?:mftp|mavlinkftp)://(?:\[;comp=([0-9]{1,3})\])?(.+)", re.IGNORECASE)

@@ -107,21 +107,21 @@ class Files:
 
         Raises:
             RemoteProtocolError: as for :meth:`read`.
-            OSError: the local file cannot be written.
+            OSError: the local file cannot be written, or another download of this program is writing it.
         """
         path_bytes(path)  # Raises InvalidArgument before anything is written or sent.
-        part = PartFile(to)
-        start = part.size if resume and not is_virtual(path) else 0
-        try:
-            await self._fetch_to(part, path, start, idle_timeout_s, timeout, on_progress)
-            # A resumed copy may consist of parts of two different files, so its checksum is compared with that of the
-            # vehicle's file.
-            is_correct = not start or await self._has_same_crc(path, part, idle_timeout_s, timeout)
-        except _ShorterError:  # The vehicle's file is shorter than the part, so the download starts again.
-            is_correct = False
-        if not is_correct:
-            await self._fetch_to(part, path, 0, idle_timeout_s, timeout, on_progress)
-        part.finish()
+        with PartFile(to) as part:
+            start = part.size if resume and not is_virtual(path) else 0
+            try:
+                await self._fetch_to(part, path, start, idle_timeout_s, timeout, on_progress)
+                # A resumed copy may consist of parts of two different files, so its checksum is compared with that of
+                # the vehicle's file.
+                is_correct = not start or await self._has_same_crc(path, part, idle_timeout_s, timeout)
+            except _ShorterError:  # The vehicle's file is shorter than the part, so the download starts again.
+                is_correct = False
+            if not is_correct:
+                await self._fetch_to(part, path, 0, idle_timeout_s, timeout, on_progress)
+            part.finish()
 
     async def list(
         self, path: str, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None

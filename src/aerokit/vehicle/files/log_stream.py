@@ -98,7 +98,7 @@ class LogStream(ReadOnly):
     """PX4's flight log, received while PX4 writes it (LOGGING_DATA): an async iterator over bytes.
 
     If you append all bytes to a file, the file is a valid ULog file at any time. Lost messages are marked in the log as
-    dropouts; ``lost`` counts them. The iterator ends with the connection. PX4 streams its log to one station at a time.
+    dropouts; ``lost`` counts them. PX4 streams its log to one station at a time.
 
     Entering raises:
         NotSupported: the vehicle runs ArduPilot. Nothing was sent.
@@ -125,6 +125,7 @@ class LogStream(ReadOnly):
         self._messages.__enter__()
         session = self._context.session
         self._detach = session.connection.bus.attach(LoggingDataAcked, self._acknowledge, system_id=session.system_id)
+        self._detach_end = session.end.on_end(self._messages.close)
         self._detach_finish = self._context.on_finish(self._stop_soon)
         try:
             await START.send(self._context)
@@ -139,6 +140,7 @@ class LogStream(ReadOnly):
     def _close(self) -> None:
         self._messages.close()
         self._detach()
+        self._detach_end()
         self._detach_finish()
 
     def _stop_soon(self) -> None:
@@ -175,6 +177,7 @@ class LogStream(ReadOnly):
 
         Raises:
             InvalidArgument: the block is not open.
+            ConnectionClosed, LinkLost: the connection or the vehicle's block has ended.
             OperationTimeout: nothing was received for ``idle_timeout_s`` seconds.
         """
         connection = self._context.session.connection

@@ -148,7 +148,7 @@ class Logs:
             InvalidArgument: an argument is invalid. Nothing was sent.
             FileError: there is no such log, or ``method`` is ``"ftp"`` and the file of the log cannot be identified.
             FileTimeout: the log did not arrive completely; ``missing`` has the missing ranges.
-            OSError: the local file cannot be written.
+            OSError: the local file cannot be written, or another download of this program is writing it.
         """
         _check_id(log)
         path, entry = await self._locate(log, method, idle_timeout_s, timeout)
@@ -160,15 +160,15 @@ class Logs:
             )
             growth.report()
             return
-        part = PartFile(to, _part_suffix(entry))
-        # The time of the log is part of the file name's suffix. If the time is unknown, the part file may belong to
-        # another flight, so it must not be continued.
-        has_time = entry.time_utc is not None
-        start = part.size if resume and has_time and part.size <= entry.size else 0
-        with part.writing(start) as disk:
-            into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
-            await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
-        part.finish()
+        with PartFile(to, _part_suffix(entry)) as part:
+            # The time of the log is part of the file name's suffix. If the time is unknown, the part file may belong
+            # to another flight, so it must not be continued.
+            has_time = entry.time_utc is not None
+            start = part.size if resume and has_time and part.size <= entry.size else 0
+            with part.writing(start) as disk:
+                into = Reassembly(disk.write, block_size=LOG_BLOCK, start=start)
+                await self._channel.download(entry.id, entry.size, into, idle_timeout_s, timeout, growth)
+            part.finish()
         growth.report()
 
     async def read(
@@ -211,15 +211,14 @@ class Logs:
             FileTimeout: some of the old logs still exist.
         """
         async with self._channel.operation("erase logs", timeout):
-            # Identify logs by time and size, because a new log may get the id of an erased log.
-            remaining = {(entry.time_utc, entry.size) for entry in await self._entries(IDLE_TIMEOUT_S)}
+            remaining = await self._entries(IDLE_TIMEOUT_S)
             progress_at = self._transfers.connection.now()
             while remaining:
                 self._transfers.connection.send(LogErase(self._transfers.system_id, self._transfers.component_id))
                 await anyio.sleep(ERASE_RETRY_INTERVAL_S)
                 count_before = len(remaining)
                 # Some boards do not answer while they erase.
-                remaining &= {(entry.time_utc, entry.size) for entry in await self._entries(idle_timeout_s)}
+                remaining = _still_listed(remaining, await self._entries(idle_timeout_s))
                 now = self._transfers.connection.now()
                 if len(remaining) < count_before:
                     progress_at = now
@@ -345,6 +344,21 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
     if old.time_utc is None:
         return False
     return new.time_utc is None or new.time_utc < old.time_utc - MAX_CLOCK_DIFFERENCE
+
+
+def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
+    """Return those of ``logs`` that a newer list still has.
+
+    Logs are identified by time and size, because a new log may get the id of an erased one. The newest may still be
+    written, so it is also the same log if it has its id and has grown.
+    """
+    newest = logs[-1]
+    kinds = {(entry.time_utc, entry.size) for entry in logs}
+    return tuple(
+        entry
+        for entry in listed
+        if (entry.time_utc, entry.size) in kinds or (entry.id == newest.id and not _is_different_log(newest, entry))
+    )
 
 
 def _no_such_log(log_id: int, text: str) -> FileError:

@@ -109,6 +109,8 @@ class ParameterAccess:
                 if is_loaded:
                     return self.store.table
             await self._download(method, idle_timeout_s, on_progress)
+            while not self.store.is_complete:  # The vehicle has rebooted meanwhile.
+                await self._download(method, idle_timeout_s, on_progress)
             if cached_list is not None:
                 await cached_list.save()
             return self.store.table
@@ -441,7 +443,7 @@ class _CachedList:
         if table is None:
             return False
         store.replace(table, updates_before=updates_before)
-        return True
+        return store.is_complete
 
     async def save(self) -> None:
         """Save the downloaded list if the hash was known before the download and is still the same."""

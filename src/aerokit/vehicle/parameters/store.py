@@ -40,8 +40,9 @@ class ParameterStore:
         self._table: ParameterTable | None = ParameterTable()
         # True once the whole list has arrived since the vehicle started.
         self.is_complete: bool = False
-        # Number of values that have arrived in messages.
+        # Number of values that have arrived in messages, and of reboots.
         self.updates: int = 0
+        self._forgotten_at = 0  # value of `updates` after the last reboot
         # Number of parameters according to the last message. ArduPilot may show and hide parameters at any time.
         self.count: int | None = None
         # Maps each name to the value of `updates` after the last message with this parameter.
@@ -92,6 +93,8 @@ class ParameterStore:
         return transfers.connection.bus.attach(ParamValue, self._on_param_value, system_id=transfers.system_id)
 
     def forget(self) -> None:
+        self.updates += 1
+        self._forgotten_at = self.updates
         self._known.clear()
         self._last_updates.clear()
         self._replaced.clear()
@@ -103,8 +106,11 @@ class ParameterStore:
         """Replace all parameters by a downloaded list.
 
         ``updates_before`` is the value of ``updates`` when the list was requested. Messages that have arrived after
-        that take precedence over the list.
+        that take precedence over the list. If the vehicle has rebooted since then, it may have other values, and the
+        list is ignored.
         """
+        if updates_before < self._forgotten_at:
+            return
         newer_names = {name for name, last_update in self._last_updates.items() if last_update > updates_before}
         old, self._known = self._known, {}
         for name, parameter in table.items():

@@ -136,10 +136,15 @@ class _Block:
                 answers = await self._access.write(to_write, self._idle_timeout_s)
             except AerokitError as error:
                 reason = f" ({error})"
-        not_restored = {param.name: param.value for param in saved if not _is_restored(param, answers.get(param.name))}
-        if not_restored:
-            values = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
-            raise RollbackFailed(f"could not restore{reason}: {values}", not_restored=not_restored) from cause
+        _raise_not_restored(
+            [param for param in saved if not _is_restored(param, answers.get(param.name))], reason, cause
+        )
+
+    def _abandon(self, error: AerokitError, cause: BaseException | None) -> None:
+        """End the block after the loop of its connection has ended: nothing can be restored."""
+        if self._has_ended:
+            raise error
+        _raise_not_restored(self._take_saved(), f" ({error})", cause)
 
     async def _unreadable_and_changed(self, saved: list[Parameter]) -> tuple[set[str], set[str]]:
         """Return the names that cannot be read, and those that another station has changed since the write.
@@ -273,11 +278,22 @@ class Transaction(_Block):
         else:
             await self._restore(error)
 
+    def _abandon(self, error: AerokitError, cause: BaseException | None) -> None:
+        if cause is not None:
+            super()._abandon(error, cause)
+
 
 def _raise_first_error(results: Mapping[str, ParameterWrite]) -> None:
     for result in results.values():
         if result.error is not None:
             raise result.error
+
+
+def _raise_not_restored(parameters: list[Parameter], reason: str, cause: BaseException | None) -> None:
+    not_restored = {param.name: param.value for param in parameters}
+    if not_restored:
+        values = ", ".join(f"{name} = {value!r}" for name, value in not_restored.items())
+        raise RollbackFailed(f"could not restore{reason}: {values}", not_restored=not_restored) from cause
 
 
 def _is_restored(saved: Parameter, answer: object) -> bool:

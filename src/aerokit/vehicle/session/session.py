@@ -173,6 +173,7 @@ class VehicleSession:
             autopilot=self.autopilot,
             version=self.telemetry.version,
             background=self.background,
+            end=self.end,
             describe=self.describe_link,
             round_trip_s=lambda: self.link_watch.round_trip_s,
             send_command=self.commands.send_long,
@@ -204,7 +205,6 @@ class VehicleSession:
     def close(self) -> None:
         """Stop sending and receiving; waiting calls raise ConnectionClosed."""
         self.is_closed = True
-        self.transfers.close()
         self._on_end(ConnectionClosed("the async with block of this vehicle was left"))
         for detach in self._detach_callbacks:
             detach()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import anyio
 
 from aerokit.connection.exchanges import run_exchange
-from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, ConnectionClosed, OperationTimeout
+from aerokit.errors import AerokitError, CommandRejected, CommandTimeout, OperationTimeout
 from aerokit.protocols.exchange import RoundTrip, Transfer, TransferProgress
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from aerokit.autopilots.base import Autopilot
     from aerokit.autopilots.telemetry import AutopilotVersion
-    from aerokit.connection.bus import Detach
+    from aerokit.connection.bus import Detach, EndSignal
     from aerokit.connection.cells import StateCell
     from aerokit.connection.connection import Connection
     from aerokit.connection.tasks import BackgroundTasks
@@ -70,6 +70,7 @@ class Transfers:
         autopilot: Autopilot,
         version: StateCell[AutopilotVersion],
         background: BackgroundTasks,
+        end: EndSignal,
         describe: Callable[[], str],
         round_trip_s: Callable[[], float | None] = lambda: None,
         send_command: Callable[..., Awaitable[object]] | None = None,
@@ -87,9 +88,7 @@ class Transfers:
         self.background = background
         self.round_trip: RoundTrip = RoundTrip()
         """Round-trip time: measured by TIMESYNC at first, and by transfers from the first one on."""
-        self.is_closed: bool = False
-        # Cancels each running exchange.
-        self._scopes: set[anyio.CancelScope] = set()
+        self._end = end
         # True once a component has not answered the request for its version.
         self._is_version_unavailable = False
         self._send_command = send_command
@@ -99,38 +98,32 @@ class Transfers:
         self._describe = describe
         self._round_trip_s = round_trip_s
 
-    def close(self) -> None:
-        """End all exchanges: they raise ConnectionClosed, as do later ones."""
-        self.is_closed = True
-        for scope in tuple(self._scopes):
-            scope.cancel()
-
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
 
         Cancellation ends the exchange at once. :class:`OperationTimeout` is raised after ``timeout`` seconds, or when
         the exchange itself times out; the error text describes the link.
         """
-        if self.is_closed:
-            raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
+        self._end.raise_if_ended()
         with self.limit(timeout), anyio.CancelScope() as scope:
             self._init_round_trip()
             if isinstance(exchange, Transfer) and exchange.on_progress is not None:
                 exchange.on_progress = _without_errors(exchange.on_progress)
-            self._scopes.add(scope)
+            detach = self._end.on_end(lambda _: scope.cancel())
             try:
                 result = await run_exchange(self.connection, self.system_id, exchange)
             except OperationTimeout as error:
                 self._explain(error)
                 raise
             finally:
-                self._scopes.remove(scope)
+                detach()
             if isinstance(result, dict):  # A request for several names returns one value or exception for each name.
                 for answer in result.values():
                     if isinstance(answer, OperationTimeout):
                         self._explain(answer)
             return result
-        raise ConnectionClosed("the async with block of this vehicle was left before the operation was done")
+        self._end.raise_if_ended()
+        raise AssertionError("the scope is cancelled only at the end")
 
     def _explain(self, error: OperationTimeout) -> None:
         error.args = (f"{error}; {self._describe()}",)
@@ -163,7 +156,7 @@ class Transfers:
                 with suppress(AerokitError), anyio.move_on_after(BACKGROUND_COMMAND_TIMEOUT_S):
                     await send(command, *params, was_just_sent=was_just_sent)
 
-        if not self.is_closed:
+        if self._end.error is None:
             self.background.start(send_command, "aerokit command of a transfer")
 
     @property
