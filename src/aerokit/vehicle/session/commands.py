@@ -206,7 +206,9 @@ class CommandSender:
                 raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
             if order_status is not None and order_status.end != earlier_end and not was_just_sent:
                 # The order ended while this call waited for an earlier command to complete.
-                raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
+                unsent = CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
+                unsent.was_sent = False
+                raise unsent
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
@@ -234,7 +236,8 @@ class CommandSender:
             try:
                 return await run.result()
             except CommandTimeout as error:
-                raise CommandTimeout(f"{error}; {self._describe()}") from None
+                error.args = (f"{error}; {self._describe()}",)
+                raise
             finally:
                 del self._runs[key], self._order_statuses[key]
                 # Acks arrive in the order of their commands, so those received now belong to the oldest records.
