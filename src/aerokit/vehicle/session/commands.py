@@ -170,6 +170,11 @@ class CommandSender:
         """Return True if the vehicle's last answer to this command was one of `UNSUPPORTED_RESULTS`."""
         return self.last_result(command, component_id) in UNSUPPORTED_RESULTS
 
+    def may_get_late_ack(self, command: int, component_id: int) -> bool:
+        """Return True if the ack of an earlier command may arrive and be taken for that of one sent now, only once."""
+        earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
+        return any(recorded_at >= earliest for recorded_at in self._pending_acks.get((component_id, command), ()))
+
     def accepted_at(self, command: int) -> float:
         """Return the time of the autopilot's last ACCEPTED ack that was addressed to us; −inf if there was none."""
         return self._accepted_at.get((self._component_id, command), -math.inf)
