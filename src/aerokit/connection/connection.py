@@ -24,7 +24,7 @@ from aerokit.connection.heartbeats import (
 )
 from aerokit.connection.loop_watch import loop_clock
 from aerokit.connection.routes import EVERY_PEER, MAX_ROUTES, Routes
-from aerokit.connection.signatures import SignatureGate, check_signing
+from aerokit.connection.signatures import SignatureGate
 from aerokit.connection.tasks import BackgroundTasks, Deadlines
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.events import (
@@ -244,7 +244,7 @@ class Connection:
     @mavlink_version.setter
     def mavlink_version(self, version: int) -> None:
         _check_version(version)
-        check_signing(self.signing, version)
+        self._gate.check_version(version)
         self._encoder.version = version
 
     @property
