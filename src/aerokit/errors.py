@@ -79,6 +79,9 @@ class OperationTimeout(AerokitError, TimeoutError):
 class CommandTimeout(OperationTimeout):
     """The vehicle did not acknowledge a command (COMMAND_ACK), despite retries."""
 
+    was_sent: bool = True
+    """False if the vehicle certainly does not execute the command, because it was not sent."""
+
 
 class HeartbeatTimeout(OperationTimeout):
     """The vehicle did not send a heartbeat in time."""

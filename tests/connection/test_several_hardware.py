@@ -15,7 +15,7 @@ from aerokit import events
 from aerokit import messages as m
 from aerokit.connection.multilink.link_choice import MAX_ANSWERS_WITHOUT_HARDWARE, MIN_CLOCK_MATCHES, LinkChoice
 from aerokit.connection.multilink.vehicle_clock import HardwareId
-from aerokit.errors import AerokitError
+from aerokit.errors import AerokitError, CommandTimeout
 from aerokit.sim import SimulatedCopter
 from aerokit.testing import VIRTUAL_BACKEND
 
@@ -159,6 +159,8 @@ async def test_wrongly_used_vehicle_is_ignored_once_known(tmp_path: Path) -> Non
         assert twins.reported.of(m.CommandLong) == []
         assert taken == []
         assert not twins.theirs.is_armed
+        with pytest.raises(CommandTimeout, match="was not sent, because there was no usable link"):
+            await flying.terminate(intent="terminate flight")
     recorded = (tmp_path / "flight.tlog").read_bytes()
     assert order.encode().rstrip(b"\0") not in b"".join(sent) + recorded
     assert sent

@@ -229,6 +229,20 @@ async def test_one_key_handover_at_a_time() -> None:
     assert copter.signing.key == KEY
 
 
+async def test_mavlink_1_is_refused_during_key_handover() -> None:
+    """Otherwise the vehicle's first signed frame would close the connection."""
+    copter = radio_copter()
+    async with connected(copter) as vehicle:
+        await vehicle.wait_ready()
+        copter.faults.drop_incoming = 1
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(vehicle.setup_signing, Signing(KEY))
+            await anyio.wait_all_tasks_blocked()
+            with pytest.raises(InvalidArgument, match="signing needs MAVLink 2"):
+                vehicle.connection.mavlink_version = 1
+        assert vehicle.connection.signing is not None
+
+
 async def test_setup_over_a_lossy_link() -> None:
     copter = radio_copter(seed=3)
     async with connected(copter) as vehicle:

@@ -77,6 +77,20 @@ def test_unanswered_arming_warns_about_late_effect(
     assert record.message.endswith("; the vehicle may still execute the command, which is not monitored any more")
 
 
+def test_arming_that_was_not_sent_warns_of_no_late_effect(
+    copter: FlightController,
+    vehicle: dronekit.Vehicle,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("aerokit.connection.routes.Routes.peers_of", lambda *_: ())  # no link leads to the vehicle
+    vehicle.armed = True
+    vehicle._handler.calls.wait(LIMIT_S)
+    (record,) = caplog.records
+    assert "was not sent, because there was no usable link" in record.message
+    assert "may still" not in record.message
+
+
 def test_pilot_takeover_before_order_arrives_is_kept(
     copter: FlightController, vehicle: dronekit.Vehicle, caplog: pytest.LogCaptureFixture
 ) -> None:

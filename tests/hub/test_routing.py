@@ -122,6 +122,16 @@ def test_vehicle_on_two_links_gets_an_order_once(stage: Stage) -> None:
     assert stage.receive("c", order(1), 255, 190) == {"a"}
 
 
+def test_station_with_ids_of_vehicle_gets_no_orders(stage: Stage) -> None:
+    stage.receive("a", COPTER)
+    stage.receive("b", STATION)
+    assert stage.receive("c", order(1), 255, 190) == {"a"}
+    assert stage.receive("c", order(1, 0), 255, 190) == {"a"}
+    stage.now += ROUTE_TIMEOUT_S + 0.1
+    stage.receive("b", STATION)
+    assert stage.receive("c", order(1), 255, 190) == {"a", "b"}  # The ids are those of the station now.
+
+
 def test_copy_at_other_port_is_dropped_without_effect(stage: Stage) -> None:
     raw = FrameEncoder(1, 1).encode(COPTER)
     assert stage.pass_on("a", raw) == set("bcd")

@@ -136,6 +136,38 @@ def test_command_first_result_counts() -> None:
     assert machine.result().result == MavResult.ACCEPTED
 
 
+@pytest.mark.parametrize("attempts", [1, 4])
+def test_command_that_no_link_accepted_takes_no_ack(attempts: int) -> None:
+    """An acknowledgement can only be that of an earlier command, which the other end executes."""
+    machine = exchange(attempts)
+    machine.start(0.0)
+    machine.take_outbox()
+    machine.message_dropped()
+    machine.receive(ack(MavResult.ACCEPTED), 0.1)
+    assert not machine.done
+    assert machine.pending_answers == 0
+    for _ in range(attempts):
+        assert machine.deadline is not None
+        machine.expire(machine.deadline)
+        for _ in machine.take_outbox():
+            machine.message_dropped()
+    with pytest.raises(CommandTimeout, match=r"^MAV_CMD_COMPONENT_ARM_DISARM was not sent, because") as raised:
+        machine.result()
+    assert not raised.value.was_sent
+
+
+def test_command_counts_only_transmissions_that_link_accepted() -> None:
+    machine = exchange(attempts=2)
+    machine.start(0.0)
+    machine.take_outbox()
+    machine.message_dropped()
+    for now in (1.0, 2.0):
+        machine.expire(now)
+    with pytest.raises(CommandTimeout, match=r"^no COMMAND_ACK for .*, sent once within 2.0 s") as raised:
+        machine.result()
+    assert raised.value.was_sent
+
+
 def test_command_abort() -> None:
     machine = exchange()
     machine.start(0.0)

@@ -17,7 +17,7 @@ from aerokit import events, messages, open_connection
 from aerokit.connection.connection import Connection
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.testing import FaultyLink
-from aerokit.transport import Link, ReconnectingLink, SerialLink, TcpConnect, memory_link_pair, outbox
+from aerokit.transport import Link, ReconnectingLink, SerialLink, TcpConnect, memory_link_pair, outbox, tcp
 from aerokit.transport.outbox import WRITE_TIMEOUT_S, Outbox
 
 pytestmark = pytest.mark.anyio
@@ -398,6 +398,23 @@ async def test_closing_a_stalled_tcp_connection_discards_its_bytes(
         with pytest.raises(ConnectionResetError):
             while connection.recv(65536):
                 pass
+
+
+@on_linux
+@each_loop
+async def test_tcp_link_is_lost_if_closed_server_reads_nothing(
+    deaf: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that closes its direction of the connection without reading must not leave a dead link open."""
+    monkeypatch.setattr(tcp, "LINGER_S", 0.0)
+    client, recorder = TcpConnect(*deaf.getsockname()), Recorder()
+    await client.open(recorder)
+    connection, _ = deaf.accept()
+    with connection:
+        client.write(bytes(1_000_000))  # more than both buffers of the system take
+        connection.shutdown(socket.SHUT_WR)
+        await recorder.until_lost()
+        await client.wait_closed()
 
 
 @on_linux

@@ -23,8 +23,8 @@ from aerokit.connection.heartbeats import (
     discovery_event,
 )
 from aerokit.connection.loop_watch import loop_clock
-from aerokit.connection.routes import MAX_ROUTES, Routes
-from aerokit.connection.signatures import SignatureGate, check_signing
+from aerokit.connection.routes import EVERY_PEER, MAX_ROUTES, Routes
+from aerokit.connection.signatures import SignatureGate
 from aerokit.connection.tasks import BackgroundTasks, Deadlines
 from aerokit.errors import AerokitError, BusyError, ConnectionClosed, InvalidArgument, LinkLost
 from aerokit.events import (
@@ -244,7 +244,7 @@ class Connection:
     @mavlink_version.setter
     def mavlink_version(self, version: int) -> None:
         _check_version(version)
-        check_signing(self.signing, version)
+        self._gate.check_version(version)
         self._encoder.version = version
 
     @property
@@ -550,11 +550,17 @@ class Connection:
         self.deadlines.close()
         self._background.cancel()
 
-    def _encode_and_write(self, encoder: FrameEncoder, message: Message, to: int | None) -> None:
+    def _try_to_send(self, message: Message) -> bool:
+        """Like :meth:`send`. Return False if the message was certainly not sent, because no link accepted it."""
+        return self._encode_and_write(self._encoder, message, None)
+
+    def _encode_and_write(self, encoder: FrameEncoder, message: Message, to: int | None) -> bool:
         self.raise_if_ended()
         data = self._encode(encoder, message)
-        if self._write(data, message, to):
+        is_written = self._write(data, message, to)
+        if is_written:
             self._observers.notify_sent(data)
+        return is_written
 
     def _encode(self, encoder: FrameEncoder, message: Message) -> bytes:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
@@ -563,15 +569,18 @@ class Connection:
         """Write a frame to the peers that lead to the target of ``message``.
 
         With ``to``, write it to the peers that lead to this system instead. The frame itself is unchanged. A frame
-        without a target goes to all peers. Return False if no peer leads to the target: nothing was sent.
+        without a target goes to all peers. Return False if nothing was sent, because no peer leads to the target, or
+        because the link is lost.
         """
         system_id = getattr(message, "target_system", 0) if to is None else to
         peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)
+        dropped_before = self.link.dropped_writes
         for peer in peers:
             self.link.write(data, peer)
         if peers:
             self._observers.record_sent(data, self._clock())
-        return bool(peers)
+        # EVERY_PEER is any number of peers: one of them may have got the frame although a write to another was dropped.
+        return peers is EVERY_PEER or self.link.dropped_writes - dropped_before < len(peers)
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
         """Encode a message with the next sequence number, and write it to one peer, e.g. to probe one of the links."""

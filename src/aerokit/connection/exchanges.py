@@ -91,7 +91,8 @@ class ExchangeRun(Generic[ResultT]):
         exchange = self._exchange
         try:
             for message in exchange.take_outbox():
-                self._connection.send(message)
+                if not self._connection._try_to_send(message):
+                    exchange.message_dropped()
         except Exception as error:  # The exchange ends, and result() raises this error.
             exchange.abort(error)
         if exchange.done:

@@ -54,6 +54,12 @@ class SignatureGate:
         self._encoder.signing = signing
         self._update()
 
+    def check_version(self, mavlink_version: int) -> None:
+        """Raise InvalidArgument if the key, or the new key of a handover, cannot be used with this MAVLink version."""
+        check_signing(self._encoder.signing, mavlink_version)
+        if self._handover is not None:
+            check_signing(self._handover.signing, mavlink_version)
+
     @contextmanager
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
         """Switch to ``signing`` when frames received during the block show that the component uses the new key.

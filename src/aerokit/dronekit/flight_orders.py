@@ -116,7 +116,8 @@ async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
     except CommandRejected:  # The vehicle certainly does not execute the command.
         raise
     except (OperationRejected, OperationTimeout) as error:
-        error.args = (f"{error}; the vehicle may still execute the command, which is not monitored any more",)
+        if getattr(error, "was_sent", True):
+            error.args = (f"{error}; the vehicle may still execute the command, which is not monitored any more",)
         raise
 
 

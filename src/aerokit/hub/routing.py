@@ -335,8 +335,10 @@ class Router(Generic[PortT]):
 
     def _record_heartbeat(self, sender: Sender, node: RouterPort[PortT], body: bytes) -> None:
         """Record the type of a sender, and report an autopilot that is received at a port for the first time."""
+        is_first = sender.source in self._unproven
         self._unproven.pop(sender.source, None)
-        if sender.record_heartbeat(body):
+        # At another port, a second sender with the same ids must not turn a vehicle into a ground station.
+        if (is_first or sender.port_number == node.number) and sender.record_heartbeat(body):
             self.forget_plans()
         if sender.is_autopilot and node.number not in sender.reported:
             sender.reported.add(node.number)

@@ -245,6 +245,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._order_status = order_status
         self._is_sent = is_sent
         self._sent_count = 0  # number of transmissions, including a first one by the caller
+        self._dropped_count = 0  # number of these transmissions that no link accepted
         self._answer_count = 0
         self._in_progress = False
 
@@ -261,8 +262,10 @@ class CommandExchange(Exchange[CommandAck]):
         # The first `_earlier_answers` acknowledgements may belong to earlier commands, so they are ignored until the
         # command is repeated. A command with a single attempt ignores none, because it would wait in vain if it ignored
         # its own acknowledgement.
-        may_ignore = self._sent_count == 1 and self._attempts > 1
-        is_to_earlier_command = may_ignore and self._answer_count < self._earlier_answers
+        may_ignore = self._transmitted_count == 1 and self._attempts > 1
+        is_to_earlier_command = not self._transmitted_count or (
+            may_ignore and self._answer_count < self._earlier_answers
+        )
         if message.result != MavResult.IN_PROGRESS:
             self._answer_count += 1
         if is_to_earlier_command:
@@ -278,14 +281,17 @@ class CommandExchange(Exchange[CommandAck]):
     def pending_answers(self) -> int:
         """Number of acknowledgements that may still arrive, which the next command with this MAV_CMD must ignore."""
         # Once the command was repeated, every acknowledgement counts as an answer to this command; see `receive`.
-        ignored_answers = self._earlier_answers if self._sent_count == 1 else 0
+        ignored_answers = self._earlier_answers if self._transmitted_count <= 1 else 0
         own_answers = max(0, self._answer_count - ignored_answers)
-        return max(0, self._sent_count * self._acks_per_sending - own_answers)
+        return max(0, self._transmitted_count * self._acks_per_sending - own_answers)
 
     @property
     def answers(self) -> int:
         """Number of acknowledgements received, including those to earlier commands with the same MAV_CMD."""
         return self._answer_count
+
+    def message_dropped(self) -> None:
+        self._dropped_count += 1
 
     def expire(self, now: float) -> None:
         """After the deadline, repeat the command. Fail after the last attempt, or if progress reports have stopped.
@@ -295,23 +301,23 @@ class CommandExchange(Exchange[CommandAck]):
         if self.deadline is None or now < self.deadline:
             return
         if self._in_progress:
-            self._fail(CommandTimeout(self._timeout_text(now)))
+            self._time_out(now)
         elif self._order_status is not None:
             self._expire_order(self._order_status, now)
         elif self._sent_count < self._attempts:
             self._send(now)
         else:
-            self._fail(CommandTimeout(self._timeout_text(now)))
+            self._time_out(now)
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
         """Repeat an order after a new HEARTBEAT. Fail if the order has an ``end``, or if its time is over."""
         if order_status.end:
-            self._fail(CommandTimeout(f"{self._timeout_text(now)}; not sent again: {order_status.end}"))
+            self._time_out(now, f"; not sent again: {order_status.end}")
             return
         # The time is checked first: if the event loop was blocked, a recent HEARTBEAT must not cause a late repetition.
         give_up_at = self._started_at + self._attempts * self._attempt_timeout
         if now >= give_up_at:
-            self._fail(CommandTimeout(self._timeout_text(now) + self._why_not_repeated()))
+            self._time_out(now, self._why_not_repeated())
             return
         # A HEARTBEAT after this time shows that the link to the vehicle works, so the order may be repeated.
         min_heartbeat_at = max(self._sent_at + MIN_RESEND_FRACTION * self._attempt_timeout, now - MAX_HEARTBEAT_AGE_S)
@@ -366,11 +372,23 @@ class CommandExchange(Exchange[CommandAck]):
         if self._on_progress is not None:
             self._on_progress(ack.progress if 0 < ack.progress <= 100 else None)
 
+    @property
+    def _transmitted_count(self) -> int:
+        return self._sent_count - self._dropped_count
+
+    def _time_out(self, now: float, why_not_repeated: str = "") -> None:
+        """Fail; the end of the error text says why the command was not sent again."""
+        error = CommandTimeout(self._timeout_text(now) + (why_not_repeated if self._transmitted_count else ""))
+        error.was_sent = self._transmitted_count > 0
+        self._fail(error)
+
     def _timeout_text(self, now: float) -> str:
         name = command_name(self._message.command)
+        if not self._transmitted_count:
+            return f"{name} was not sent, because there was no usable link to the vehicle"
         if self._in_progress:
             return f"{name} was in progress, then no COMMAND_ACK for {self._progress_timeout:g} s"
-        times = "once" if self._sent_count == 1 else f"{self._sent_count} times"
+        times = "once" if self._transmitted_count == 1 else f"{self._transmitted_count} times"
         return f"no COMMAND_ACK for {name}, sent {times} within {now - self._started_at:.1f} s"
 
 

@@ -67,6 +67,10 @@ class Exchange(ABC, Generic[ResultT]):
         """
         return
 
+    def message_dropped(self) -> None:
+        """Called if a message of `take_outbox` was certainly not sent, because no link accepted it."""
+        return
+
     def abort(self, error: Exception) -> None:
         """End the exchange with this error, unless it is already done."""
         self._fail(error)

@@ -360,6 +360,10 @@ class _Stream(asyncio.Protocol):
         peer = self.peer if isinstance(self._link, TcpListen) else None
         self._link._deliver(data, peer)
 
+    def eof_received(self) -> None:
+        """Close the connection: asyncio alone would wait without limit until the other end reads what was written."""
+        self.close()
+
     def pause_writing(self) -> None:
         if self._outbox is not None:
             self._outbox.pause()

@@ -9,7 +9,7 @@ from typing import Any
 import anyio
 import pytest
 from device_calls import components_of
-from flight_harness import Px4Flight
+from flight_harness import Px4Flight, open_flight
 from test_actuators import on_ground, on_px4, params
 
 import aerokit
@@ -24,6 +24,7 @@ from aerokit.errors import (
 )
 from aerokit.mavlink.encoder import FrameEncoder
 from aerokit.mavlink.enums import MavCmd as C
+from aerokit.mavlink.enums import MavResult
 from aerokit.sim import SimulatedCopter, SimulatedPx4, simulated_link
 from aerokit.vehicle.commanding.simple_orders import receive_once
 from aerokit.vehicle.files.log_stream import UlogAssembler
@@ -83,6 +84,20 @@ async def test_receive_once_ends_despite_messages_of_others() -> None:
         with anyio.fail_after(5.0):
             assert await receive_once(flight.vehicle._context, m.WinchStatus) is None
         tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("is_component_request", [True, False], ids=["Component.request", "receive_once"])
+async def test_late_refusal_of_cancelled_request_refuses_no_other(is_component_request: bool) -> None:
+    async with open_flight(rates={}, latency_s=0.3) as flight:
+        await anyio.sleep(15.0)
+        component = flight.vehicle.component(1)
+        flight.copter.faults.refuse(C.REQUEST_MESSAGE, MavResult.UNSUPPORTED, times=1)
+        with anyio.move_on_after(0.2):
+            await component.request(m.WinchStatus)
+        if is_component_request:
+            assert await component.request(m.AutopilotVersion)
+        else:
+            assert await receive_once(flight.vehicle._context, m.AutopilotVersion)
 
 
 @pytest.mark.parametrize("lost", ["acknowledgement", "message"])

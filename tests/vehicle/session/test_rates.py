@@ -310,6 +310,26 @@ async def test_refused_rate_is_requested_again_by_next_subscriber(
         assert interval(grounded, m.RawImu) == pytest.approx(0.05)
 
 
+async def test_slower_rate_than_refused_one_is_requested(grounded: Flight) -> None:
+    grounded.copter.faults.refuse(SET_INTERVAL, MavResult.DENIED, times=2)
+    with grounded.vehicle.rate(m.RawImu, 500.0):
+        await anyio.sleep(1.0)
+        with grounded.vehicle.rate(m.RawImu, 20.0):
+            await anyio.sleep(1.0)
+            assert interval(grounded, m.RawImu) == pytest.approx(0.05)
+
+
+async def test_accepted_rate_is_released_after_refused_one(grounded: Flight) -> None:
+    before = interval(grounded, m.RawImu)
+    with grounded.vehicle.rate(m.RawImu, 20.0):
+        await anyio.sleep(1.0)
+        grounded.copter.faults.refuse(SET_INTERVAL, MavResult.DENIED, times=1)
+        with grounded.vehicle.rate(m.RawImu, 500.0):
+            await anyio.sleep(1.0)
+    await anyio.sleep(1.0)
+    assert interval(grounded, m.RawImu) == before
+
+
 # ----------------------------------------------------------------- firmware without the command
 
 

@@ -222,6 +222,8 @@ class ArmingActions(VehicleBase):
             except CommandRejected:  # The vehicle will not execute the command, so no cleanup is needed.
                 raise
             except CommandTimeout as error:
+                if not error.was_sent:
+                    raise
                 self._arm_cleanup.watch(order, was_armed)
                 raise CommandTimeout(f"{error}; {self._arm_cleanup.hint()}") from None
             except (anyio.get_cancelled_exc_class(), AerokitError):
@@ -362,6 +364,8 @@ class ArmingActions(VehicleBase):
             try:
                 await self._order_reboot(force)
             except CommandTimeout as error:
+                if not error.was_sent:
+                    raise
                 unanswered = error
             # A command that was not acknowledged was probably lost, so a wait shorter than the time-out is enough.
             wait_s = timeout if unanswered is None else min(timeout, LATE_REBOOT_TIMEOUT_S)

@@ -249,17 +249,21 @@ async def receive_once(
     """
     session = context.session
     target = session.component_id if component_id is None else component_id
-    with (
-        session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages,
-        suppress(CommandRejected),
-    ):
+    with session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages:
         for _ in range(RECEIVE_ATTEMPTS):
-            with suppress(CommandTimeout):  # The message may arrive although the acknowledgement was lost.
+            is_refused, is_doubtful = False, session.commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, target)
+            try:
                 await session.commands.send_long(
                     MavCmd.REQUEST_MESSAGE, message_type.ID, component_id=target, attempts=1, attempt_timeout=0.5
                 )
-            with anyio.move_on_after(0.5):
+            except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
+                pass
+            except CommandRejected:
+                is_refused = not is_doubtful  # The refusal of an earlier request does not count.
+            with anyio.move_on_after(0 if is_refused else 0.5):
                 async for message in messages:  # Other components may send this message, too.
                     if message.received_frame is None or message.received_frame.component_id == target:
                         return message
+            if is_refused:
+                return None
     return None

@@ -54,6 +54,8 @@ class TerminationActions(VehicleBase):
             command = MavCmd.DO_FLIGHTTERMINATION
             await self._sender.send_long(order, command, TERMINATE, modes=modes, armed=False, **SEND_ONCE)
         except CommandTimeout as error:
+            if not error.was_sent:
+                raise
             raise CommandTimeout(f"{error}; the flight may have been terminated nevertheless") from None
         armed, state = self.telemetry.armed, self.telemetry.system_status
 
@@ -98,6 +100,8 @@ class TerminationActions(VehicleBase):
         try:
             await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
         except CommandTimeout as error:
+            if not error.was_sent:
+                raise
             raise CommandTimeout(f"{error}; the autopilot may have switched off nevertheless") from None
         with suppress(LinkLost):  # The link may go down with the autopilot.
             await await_progress(

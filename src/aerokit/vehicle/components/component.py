@@ -260,9 +260,11 @@ class Component(ReadOnly):
         with subscriber.subscribe((message_type,), capacity=100, overflow="drop_oldest", rate_hz=None) as answers:
             refusal: CommandRejected | None = None
             with anyio.move_on_after(timeout):
+                commands = self._session.commands
                 for attempts_left in reversed(range(REQUEST_ATTEMPTS)):
+                    is_doubtful = commands.may_get_late_ack(MavCmd.REQUEST_MESSAGE, self.component_id)
                     try:
-                        await self._session.commands.send_long(
+                        await commands.send_long(
                             MavCmd.REQUEST_MESSAGE,
                             message_type.ID,
                             *params,
@@ -272,7 +274,8 @@ class Component(ReadOnly):
                     except CommandTimeout:  # The message may arrive although the acknowledgement was lost.
                         pass
                     except CommandRejected as error:
-                        refusal = error
+                        # A refusal that may be that of an earlier request does not count before the last attempt.
+                        refusal = None if is_doubtful and attempts_left else error
                     # After the last request, wait until the time-out. After a refusal, return the message if it has
                     # already arrived, but do not wait for it.
                     limit_s = ATTEMPT_TIMEOUT_S if attempts_left else math.inf

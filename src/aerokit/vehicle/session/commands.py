@@ -170,6 +170,11 @@ class CommandSender:
         """Return True if the vehicle's last answer to this command was one of `UNSUPPORTED_RESULTS`."""
         return self.last_result(command, component_id) in UNSUPPORTED_RESULTS
 
+    def may_get_late_ack(self, command: int, component_id: int) -> bool:
+        """Return True if the ack of an earlier command may arrive and be taken for that of one sent now, only once."""
+        earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
+        return any(recorded_at >= earliest for recorded_at in self._pending_acks.get((component_id, command), ()))
+
     def accepted_at(self, command: int) -> float:
         """Return the time of the autopilot's last ACCEPTED ack that was addressed to us; −inf if there was none."""
         return self._accepted_at.get((self._component_id, command), -math.inf)
@@ -206,7 +211,9 @@ class CommandSender:
                 raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
             if order_status is not None and order_status.end != earlier_end and not was_just_sent:
                 # The order ended while this call waited for an earlier command to complete.
-                raise CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
+                unsent = CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
+                unsent.was_sent = False
+                raise unsent
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
@@ -234,7 +241,8 @@ class CommandSender:
             try:
                 return await run.result()
             except CommandTimeout as error:
-                raise CommandTimeout(f"{error}; {self._describe()}") from None
+                error.args = (f"{error}; {self._describe()}",)
+                raise
             finally:
                 del self._runs[key], self._order_statuses[key]
                 # Acks arrive in the order of their commands, so those received now belong to the oldest records.

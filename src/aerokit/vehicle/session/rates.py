@@ -65,7 +65,8 @@ class _Stream:
         self.required: set[object] = set()
         # The rate last requested; None if the needed rate must be requested again.
         self.requested_hz: float | None = None
-        self.is_refused = False
+        # The rates that the vehicle has refused. A refusal leaves the rate of the stream as it was.
+        self.refused_hz: set[float] = set()
         self.is_slow = False
         # Number of messages received so far, and this number at each of the last checks.
         self.received = 0
@@ -80,8 +81,8 @@ class _Stream:
 
     @property
     def needed_hz(self) -> float:
-        """The highest rate needed; 0 (the autopilot's own rate) if no rate is needed."""
-        return max(self.requests.values(), default=AUTOPILOT_DEFAULT)
+        """The highest rate needed that was not refused; 0 (the autopilot's own rate) if there is none."""
+        return max((hz for hz in self.requests.values() if hz not in self.refused_hz), default=AUTOPILOT_DEFAULT)
 
     @property
     def is_optional(self) -> bool:
@@ -90,8 +91,8 @@ class _Stream:
 
     @property
     def is_due(self) -> bool:
-        """True if the needed rate must be requested: it is not the one last requested, and was not refused."""
-        return not self.is_refused and self.requested_hz != self.needed_hz
+        """True if the needed rate must be requested, because it is not the one last requested."""
+        return self.requested_hz != self.needed_hz
 
     def achieved_hz(self) -> float:
         """Return the average rate in the window of the last checks."""
@@ -151,9 +152,7 @@ class MessageRates:
         if stream is None:
             stream = self._new_stream(message_type)
             self._streams[message_type.ID] = stream
-        if stream.is_refused:  # The vehicle may accept another rate than the refused one.
-            stream.is_refused = False
-            stream.requested_hz = None
+        stream.refused_hz.clear()  # The vehicle may accept now what it has refused before.
         token = object()
         stream.requests[token] = hz
         if not is_optional:
@@ -171,7 +170,7 @@ class MessageRates:
         """Request all messages again, because the vehicle may have lost the requests, for example by a reboot."""
         for stream in self._streams.values():
             stream.requested_hz = None
-            stream.is_refused = False
+            stream.refused_hz.clear()
             stream.retry_interval_s = RETRY_INTERVAL_S
             stream.failures = 0
             stream.next_attempt_at = -math.inf
@@ -257,21 +256,25 @@ class MessageRates:
         if reset_count != self._reset_count:
             # `request_again` was called meanwhile. The answer may be from before a reboot, so the stream stays due.
             return
-        # The vehicle has accepted or refused the rate. In both cases, nothing more is sent until another rate is
+        # The vehicle has accepted or refused the rate. In both cases, it is not requested again until another rate is
         # needed, or `request_again` or `watch` makes the stream due again.
-        if refusal is not None:
-            self._mark_refused(stream, refusal)
         stream.failures = 0
-        stream.mark_requested(self._connection.now(), hz)
+        if refusal is None:
+            stream.mark_requested(self._connection.now(), hz)
+        else:
+            self._mark_refused(stream, hz, result_name(refusal.result))
 
     def _switch_to_groups(self) -> None:
         self._uses_groups = True
         for stream in self._streams.values():
             stream.requested_hz = None
 
-    def _mark_refused(self, stream: _Stream, error: CommandRejected) -> None:
-        stream.is_refused = True
-        self._publish_unavailable(stream, result_name(error.result))
+    def _mark_refused(self, stream: _Stream, hz: float, reason: str) -> None:
+        """Record that the vehicle does not send the stream at this rate. Lower rates are requested next, if needed."""
+        stream.refused_hz.add(hz)
+        if stream.requested_hz is None or not hz:
+            stream.mark_requested(self._connection.now(), AUTOPILOT_DEFAULT)
+        self._publish_unavailable(stream, reason)
 
     def _request_by_group(self) -> None:
         """Request groups of messages by REQUEST_DATA_STREAM.
@@ -284,7 +287,7 @@ class MessageRates:
                 continue
             group = self._group_of_message.get(stream.message_type.ID)
             if group is None:
-                stream.is_refused = True
+                stream.refused_hz.update(stream.requests.values())
                 self._publish_unavailable(stream, "in no group of REQUEST_DATA_STREAM")
             else:
                 rates_by_group[group] = self._rate_of_group(group)
@@ -319,7 +322,7 @@ class MessageRates:
     def _watch(self, stream: _Stream) -> None:
         """Record how many messages have arrived. If necessary, request the stream again, or report it as slow."""
         stream.counts_at_checks.append(stream.received)
-        if stream.requested_hz is None or stream.requested_hz <= 0 or stream.is_refused:
+        if stream.requested_hz is None or stream.requested_hz <= 0:
             return
         if stream.counts_at_checks[-1] == stream.counts_at_checks[0]:  # No message has arrived in the window.
             self._retry_if_due(stream)
