@@ -160,3 +160,15 @@ async def test_members_armed_by_cancelled_arming_are_not_taken_over() -> None:
         assert not stage.events(MemberTakenOver)
         assert not any(copter.is_armed for copter in stage.copters.values())
         assert (await stage.fleet.arm()).is_complete
+
+
+async def test_member_in_posted_mode_after_arming_is_not_taken_over() -> None:
+    async with open_stage(1) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.arm()).raise_for_errors()
+        vehicle = stage.fleet.vehicles[OURS]
+        mode = vehicle.autopilot.find_mode("ALT_HOLD")
+        with vehicle.posted("mode", modes=(mode,)) as posted:
+            await posted.set_mode(mode)
+        await anyio.sleep(2)
+        assert not stage.events(MemberTakenOver)

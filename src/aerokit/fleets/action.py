@@ -259,7 +259,7 @@ class FleetAction:
     def _has_failed_or_stopped(self, member: Member) -> bool:
         return member.name in self._failed or member.name in self._stopped
 
-    def _has_newer_order(self, member: Member, order: PolicyOrder) -> bool:
+    def _has_newer_order(self, member: Member) -> bool:
         """Return True if the program has given the member a newer order, which this order of the policy must not end.
 
         This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
@@ -267,9 +267,7 @@ class FleetAction:
         """
         # The landing may also be a part of the action, if it is a function of the program that still runs.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
-        if _is_ending_flight(member) and order != "land" and not is_ordered_by_action:
-            return True
-        return self._has_newer_action(member)
+        return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
 
     def _has_newer_action(self, member: Member) -> bool:
         """Return True if a newer action of the fleet moves the member or has moved it.
@@ -348,7 +346,7 @@ class FleetAction:
             order = orders.get(member.name)
             if order is None:
                 continue
-            if self._has_newer_order(member, order):
+            if self._has_newer_order(member):
                 skipped[member.name] = "it has a newer order"
             elif member.is_flown_by_program:
                 self._policy_orders[member.name] = order
@@ -437,7 +435,7 @@ class FleetAction:
         # cancelled. Failed and stopped members get no order.
         for member in self._members if self._holds_if_cancelled else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
-            if has_finished and member.is_flown_by_program and not self._has_newer_order(member, "hold"):
+            if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:

@@ -215,8 +215,9 @@ class CommandArbiter:
         disarms = armed is False
         if is_steering:
             self._notify_steering()
-            if self.newest is not None:  # A change to a mode of the posted order is not a takeover.
-                self.newest.expect(modes)
+            for previous in (self.newest, self._arming_order):
+                if previous is not None:  # A change to a mode of the posted order is not a takeover.
+                    previous.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
         recent_modes = {mode for ordered_at, mode in self._ordered_modes if ordered_at > now - OWN_MODES_MAX_AGE_S}
