@@ -10,7 +10,8 @@ import pytest
 from fleet_stage import HOME, Stage, open_stage
 from flight_harness import block_loop, suspend_computer
 
-from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected
+from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, SetpointStreamStopped
+from aerokit.fleets.formation import Formation
 from aerokit.fleets.members import Member
 from aerokit.fleets.separation import Deconfliction
 from aerokit.fleets.show import Show
@@ -262,4 +263,16 @@ async def test_show_does_not_overrule_newer_landing_that_waits() -> None:
         with pytest.raises(OperationRejected, match="got a newer order meanwhile; the show was not started"):
             await flight
         assert (await landing).is_complete
+        assert stage.modes_ordered("north/2") == ["LAND"]
+
+
+@pytest.mark.parametrize("by_fleet", [True, False])
+async def test_following_does_not_overrule_landing_of_same_moment(by_fleet: bool) -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2"], 8.0, frame="north")
+        async with stage.fleet.following(line, leader="north/1") as following:
+            await (stage.fleet if by_fleet else stage.fleet.vehicles["north/2"]).land()
+            with pytest.raises(SetpointStreamStopped, match="north/2 got a newer order before it started"):
+                following.raise_if_stopped()
         assert stage.modes_ordered("north/2") == ["LAND"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
@@ -92,6 +93,9 @@ class FleetAction:
         for member in requested:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
+        self._number = next(context.action_numbers)
+        self._newer_order_checks = {member.name: self._newer_order_check(member) for member in self._members}
+        self._starts = Counter(context.starts)
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
@@ -117,9 +121,12 @@ class FleetAction:
         if not self._members:
             return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
+        for action in self._context.actions:
+            older, newer = (self, action) if action._number > self._number else (action, self)
+            if newer._moves_members:
+                older._newer_actions.append(newer)
+        was_called_late = bool(self._newer_actions)
         if self._moves_members:
-            for action in self._context.actions:
-                action._newer_actions.append(self)
             self._context.moves.update(member.name for member in self._members)
         self._moves = Counter(self._context.moves)
         self._context.actions.append(self)
@@ -127,10 +134,8 @@ class FleetAction:
             delays_s = {} if self._corridors is None else self._corridors.delays_s
             for index, member in enumerate(self._members):
                 delay_s = index * self._stagger_s + delays_s.get(member.name, 0.0)
-                has_newer_order, starts = self._newer_order_check(member), self._context.starts[member.name]
                 tasks.start(
-                    partial(self._run_member, member, delay_s, has_newer_order, starts),
-                    f"aerokit {self.name} {member.name}",
+                    partial(self._run_member, member, delay_s, was_called_late), f"aerokit {self.name} {member.name}"
                 )
             await self._finished.wait()
         except BaseException:
@@ -184,13 +189,11 @@ class FleetAction:
 
     # --------------------------------------------------------------------------------- one member
 
-    async def _run_member(
-        self, member: Member, delay_s: float, has_newer_order: Callable[[], bool], starts_before: int
-    ) -> None:
+    async def _run_member(self, member: Member, delay_s: float, was_called_late: bool) -> None:
         """Execute the action with one member after a delay, and record its outcome.
 
-        The program may have given the member an order between the call of `run`, when ``has_newer_order`` and
-        ``starts_before`` were made, and the beginning of this task.
+        The program may have given the member an order since the action was created. With ``was_called_late``, this may
+        be a newer action.
         """
         task = asyncio.current_task()
         assert task is not None
@@ -198,9 +201,12 @@ class FleetAction:
         try:
             if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
-            if self._context.starts[member.name] != starts_before:  # An older action has ordered something in between.
+            has_newer_order, wait_s = self._newer_order_checks[member.name], delay_s
+            if self._context.starts[member.name] != self._starts[member.name]:  # An older action may have ordered this.
                 has_newer_order = self._newer_order_check(member)
-            is_overruled, wait_s = (self._moves_members or self._arms) and has_newer_order(), delay_s
+            is_overruled = (self._moves_members or self._arms) and (
+                has_newer_order() or (was_called_late and self._has_newer_action(member))
+            )
             while wait_s > START_TOLERANCE_S and not is_overruled:
                 await self._wait_to_start(member, wait_s)
                 is_overruled = has_newer_order() or self._has_newer_action(member)
@@ -480,6 +486,7 @@ class FleetContext:
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
+        self.action_numbers: Iterator[int] = itertools.count()
         self.moves: Counter[str] = Counter()  # how many actions that move each member were given
         self.starts: Counter[str] = Counter()  # how many actions each member has started
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
