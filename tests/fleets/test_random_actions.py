@@ -264,7 +264,7 @@ class RandomFlight:
         if self.rng.random() < 0.3:
             await anyio.sleep(2)
             self.fleet.reclaim(name)
-            del self.released[name]
+            self.released.pop(name, None)
 
     async def pilot_takes(self, name: str) -> None:
         self.pilots[name] = now()

@@ -289,7 +289,9 @@ class CommandArbiter:
     def _record_accepted(self, armed: bool | None, accepted_at: float | None = None) -> None:
         """Record when (by default now) an arming command was accepted, because HEARTBEAT reports the effect later."""
         if armed:
-            self._arming_accepted_at = self._now() if accepted_at is None else accepted_at
+            accepted_at = self._now() if accepted_at is None else accepted_at
+            # A newer command may have been accepted before this one was abandoned.
+            self._arming_accepted_at = max(self._arming_accepted_at, accepted_at)
 
     def _supersede_arming(self, armed: bool | None) -> None:
         """If a newer command arms or disarms (``armed`` is not None), end earlier orders to arm or disarm."""
