@@ -17,7 +17,7 @@ from flight_harness import Wire, attached_sinks, now, speed_of, waiting_on_cells
 
 from aerokit import messages as m
 from aerokit.errors import AerokitError
-from aerokit.fleets.events import MemberTakenOver, PolicyApplied
+from aerokit.fleets.events import MemberTakenOver, PolicyApplied, TooClose
 from aerokit.fleets.fleet import Fleet, Selection
 from aerokit.fleets.formation import Formation
 from aerokit.fleets.members import Member
@@ -144,7 +144,7 @@ class RandomFlight:
             (await flown.take_off(8)).raise_for_errors()
             await anyio.sleep(3)
             self.places = {name: vehicle.position.value for name, vehicle in flown.vehicles.items()}
-        for kind in (MemberTakenOver, PolicyApplied):
+        for kind in (MemberTakenOver, PolicyApplied, TooClose):
             flown._context.bus.attach_event(kind, self.events.append)
         self.wire.clear()
 
@@ -309,7 +309,9 @@ class RandomFlight:
             if isinstance(event, MemberTakenOver):
                 if event.member not in self.pilots:
                     self.faults.append(f"nobody has taken over: {event}")
-            elif any(name in self.released and event.at > self.released[name][0] for name in event.orders):
+            elif isinstance(event, PolicyApplied) and any(
+                name in self.released and event.at > self.released[name][0] for name in event.orders
+            ):
                 self.faults.append(f"a policy orders a released member: {event}")
 
     def judge(self, name: str) -> None:
@@ -357,7 +359,8 @@ class RandomFlight:
         is_ending = newest.kind in ENDING and (newest.by == "fleet" or newest.kind != "hold")
         error = newest.errors.get(name, "")
         is_protected = is_ending or (newest.by == "fleet" and newest.kind in ("go_to", "take_off"))
-        if is_protected and re.search("another order was given|got a newer order", error):
+        is_held = any(isinstance(event, TooClose) for event in self.events)  # The distance monitor overrules any call.
+        if is_protected and not is_held and re.search("another order was given|got a newer order", error):
             self.faults.append(f"the newest call was superseded: {newest}")
         if newest.kind == "disarm" and newest.by == "fleet" and newest.has_succeeded(name):
             return [order for order in sent if order[0] >= newest.last and order[2] != "disarm"]
