@@ -20,6 +20,7 @@ from aerokit.mavlink.enums import MavCmd
 from aerokit.missions import Mission, land, take_off
 from aerokit.sim import SimulatedCopter
 from aerokit.transport import memory_link_pair
+from aerokit.vehicle.vehicle import Vehicle
 
 pytestmark = pytest.mark.anyio
 
@@ -241,12 +242,29 @@ async def test_policy_of_older_action_overrules_no_newer_action(policy: str, act
         assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: [mode] for name in stage.copters}
 
 
-async def test_policy_does_not_stop_landings_of_vehicles() -> None:
+@pytest.mark.parametrize("policy", ["hold_others", "land_others"])
+async def test_policy_does_not_stop_landings_of_vehicles(policy: str) -> None:
+    async with open_stage(3, on_error=policy) as stage:
+        await stage.take_off()
+        older = asyncio.create_task(stage.fleet.go_to(north(300)))
+        await anyio.sleep(5)
+        await asyncio.gather(*(vehicle.land() for vehicle in stage.fleet.vehicles.values()))  # None was superseded.
+        assert not (await older).is_complete
+        assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: ["LAND"] for name in stage.copters}
+
+
+async def test_policy_does_not_stop_posted_landings() -> None:
     async with open_stage(3) as stage:
         await stage.take_off()
         older = asyncio.create_task(stage.fleet.go_to(north(300)))
         await anyio.sleep(5)
-        await asyncio.gather(*(vehicle.land() for vehicle in stage.fleet.vehicles.values()))
+        mode = stage.fleet.vehicles["north/1"].autopilot.find_mode("LAND")
+
+        async def post_landing(vehicle: Vehicle) -> None:
+            with vehicle.posted("mode", modes=(mode,)) as posted:
+                await posted.set_mode(mode)
+
+        await asyncio.gather(*map(post_landing, stage.fleet.vehicles.values()))
         assert not (await older).is_complete
         assert {name: stage.modes_ordered(name) for name in stage.copters} == {name: ["LAND"] for name in stage.copters}
 

@@ -7,11 +7,14 @@ from itertools import pairwise
 
 import anyio
 import pytest
-from fleet_stage import Stage, open_stage
+from fleet_stage import HOME, Stage, open_stage
 from flight_harness import block_loop, suspend_computer
 
-from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected
+from aerokit.errors import HeartbeatTimeout, InvalidArgument, OperationRejected, SetpointStreamStopped
+from aerokit.fleets.formation import Formation
+from aerokit.fleets.members import Member
 from aerokit.fleets.separation import Deconfliction
+from aerokit.fleets.show import Show
 from aerokit.mavlink.enums import MavCmd
 from aerokit.position import Position
 from aerokit.testing.track import min_distance_m, record_track
@@ -182,3 +185,94 @@ async def test_corridors_at_another_speed_are_refused() -> None:
         with pytest.raises(InvalidArgument, match="planned for 5 m/s; nothing was sent"):
             await stage.fleet.go_to(targets, separation=plan_corridors(stage, targets), speed_m_s=1.5)
         assert not any(map(stage.orders_to, stage.copters))
+
+
+async def post_landing(stage: Stage, name: str) -> None:
+    vehicle = stage.fleet.vehicles[name]
+    mode = vehicle.autopilot.find_mode("LAND")
+    with vehicle.posted("mode", modes=(mode,)) as posted:
+        await posted.set_mode(mode)
+
+
+@pytest.mark.parametrize("is_posted", [True, False])
+@pytest.mark.parametrize("stagger_s", [None, 2.0])
+async def test_landing_ordered_before_member_starts_is_not_overruled(is_posted: bool, stagger_s: float | None) -> None:
+    """The tasks of a fleet action begin after its call, so the landing may be ordered before them."""
+    async with open_stage(2, on_error="continue_others") as stage:
+        await stage.take_off()
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        result, _ = await asyncio.gather(
+            stage.fleet.go_to(targets, stagger_s=stagger_s),
+            post_landing(stage, "north/2") if is_posted else stage.fleet.vehicles["north/2"].land(),
+        )
+        assert "got a newer order before it started" in str(result.failed["north/2"])
+        assert stage.modes_ordered("north/2") == ["LAND"]
+
+
+async def test_newer_flight_overrules_landing_of_same_moment() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        targets = {name: vehicle.position.value for name, vehicle in stage.fleet.vehicles.items()}
+        _, flight = await asyncio.gather(stage.fleet.land(), stage.fleet.go_to(targets))
+        assert flight.is_complete
+
+
+async def test_staggered_arming_continues_during_change_of_mode() -> None:
+    async with open_stage(3) as stage:
+        await ready_in_guided(stage)
+        results = await asyncio.gather(stage.fleet.arm(stagger_s=1), stage.fleet.set_mode("LOITER"))
+        assert all(result.is_complete for result in results)
+        assert all(copter.is_armed for copter in stage.copters.values())
+
+
+async def test_function_named_arm_starts_after_program_armed_member() -> None:
+    started: list[str] = []
+
+    async def arm(member: Member) -> None:
+        started.append(member.name)
+
+    async with open_stage(2) as stage:
+        await ready_in_guided(stage)
+        action = asyncio.create_task(stage.fleet.do(arm, stagger_s=5))
+        await anyio.sleep(1)
+        await stage.fleet.vehicles["north/2"].arm()
+        assert (await action).is_complete
+        assert started == ["north/1", "north/2"]
+
+
+async def test_waiting_function_does_not_start_after_program_disarmed() -> None:
+    async def fly(member: Member) -> None:
+        await member.vehicle.arm()
+
+    async with open_stage(2) as stage:
+        await ready_in_guided(stage)
+        flight = asyncio.create_task(stage.fleet.do(fly, stagger_s=2))
+        await anyio.sleep(1)
+        await stage.fleet.vehicles["north/2"].disarm()
+        assert "got a newer order before it started" in str((await flight).failed["north/2"])
+        assert not stage.copters["north/2"].is_armed
+
+
+async def test_show_does_not_overrule_newer_landing_that_waits() -> None:
+    async with open_stage(2) as stage:
+        await stage.take_off()
+        show = Show.from_points({"north/2": [(0, 0, 10, 10), (4, 4, 10, 10)]})
+        flight = asyncio.create_task(stage.fleet.fly_show(show, Position(*HOME[:2])))
+        await anyio.sleep(0.1)
+        landing = asyncio.create_task(stage.fleet.land(stagger_s=4))
+        with pytest.raises(OperationRejected, match="got a newer order meanwhile; the show was not started"):
+            await flight
+        assert (await landing).is_complete
+        assert stage.modes_ordered("north/2") == ["LAND"]
+
+
+@pytest.mark.parametrize("by_fleet", [True, False])
+async def test_following_does_not_overrule_landing_of_same_moment(by_fleet: bool) -> None:
+    async with open_stage(2, on_error="continue_others") as stage:
+        await stage.take_off()
+        line = Formation.line(["north/2"], 8.0, frame="north")
+        async with stage.fleet.following(line, leader="north/1") as following:
+            await (stage.fleet if by_fleet else stage.fleet.vehicles["north/2"]).land()
+            with pytest.raises(SetpointStreamStopped, match="north/2 got a newer order before it started"):
+                following.raise_if_stopped()
+        assert stage.modes_ordered("north/2") == ["LAND"]

@@ -10,6 +10,7 @@ import pytest
 from fleet_stage import Stage, open_stage
 
 from aerokit.errors import AerokitError, OperationRejected
+from aerokit.fleets.events import MemberTakenOver
 from aerokit.fleets.members import Member, MemberState
 from aerokit.mavlink import FrameEncoder
 from aerokit.mavlink.enums import CopterMode, MavCmd
@@ -148,3 +149,26 @@ async def test_disarmed_member_gets_no_orders_from_policy() -> None:
         await anyio.sleep(3.0)
         assert stage.orders_to("north/3") == []
         assert stage.modes_ordered("north/2") == ["LAND"]
+
+
+async def test_members_armed_by_cancelled_arming_are_not_taken_over() -> None:
+    async with open_stage(2) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        with anyio.move_on_after(0):  # The commands are sent, but not acknowledged yet.
+            await stage.fleet.arm()
+        await anyio.sleep(5)
+        assert not stage.events(MemberTakenOver)
+        assert not any(copter.is_armed for copter in stage.copters.values())
+        assert (await stage.fleet.arm()).is_complete
+
+
+async def test_member_in_posted_mode_after_arming_is_not_taken_over() -> None:
+    async with open_stage(1) as stage:
+        (await stage.fleet.wait_ready()).raise_for_errors()
+        (await stage.fleet.arm()).raise_for_errors()
+        vehicle = stage.fleet.vehicles[OURS]
+        mode = vehicle.autopilot.find_mode("ALT_HOLD")
+        with vehicle.posted("mode", modes=(mode,)) as posted:
+            await posted.set_mode(mode)
+        await anyio.sleep(2)
+        assert not stage.events(MemberTakenOver)

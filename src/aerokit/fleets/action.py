@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
+from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from fnmatch import fnmatchcase
 from functools import partial
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from aerokit.fleets.policy import PolicyOrder, PolicyRules
     from aerokit.fleets.separation import Deconfliction
     from aerokit.missions.mission import Mission
+    from aerokit.vehicle.commanding.order import Order
     from aerokit.vehicle.vehicle import Vehicle
 
 
@@ -60,6 +63,7 @@ class FleetAction:
             have already finished the action are told to hold as well.
         moves_members: the action overrules older actions: these send its members no orders of their policy, and do not
             start members that still wait.
+        arms: the action only arms, so that newer actions that do not end the flight may follow its members' start.
         corridors: the delay of each member, and how late it may start.
     """
 
@@ -75,22 +79,27 @@ class FleetAction:
         is_safe: bool = False,
         holds_if_cancelled: bool = True,
         moves_members: bool = False,
+        arms: bool = False,
         corridors: Deconfliction | None = None,
     ) -> None:
         self.name: str = name
         self._context, self._execute, self._timeout = context, execute, timeout
         self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
-        self._moves_members, self._corridors = moves_members, corridors
+        self._moves_members, self._arms, self._corridors = moves_members, arms, corridors
+        self._moves: Counter[str] = Counter()  # `FleetContext.moves` when the action began
         self._newer_actions: list[FleetAction] = []  # actions that move members and began while this one was running
         requested = list(members)
         for member in requested:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
+        self._number = next(context.action_numbers)
+        self._newer_order_checks = {member.name: self._newer_order_check(member) for member in self._members}
+        self._starts = Counter(context.starts)
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
-        self._final_orders: dict[str, object] = {}  # the newest steering order when the member had finished
+        self._final_orders: dict[str, object] = {}  # see `FleetContext.newest_orders`; when the member had finished
         self._failed: dict[str, Exception] = {}
         self._stopped: dict[str, Exception] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -112,15 +121,22 @@ class FleetAction:
         if not self._members:
             return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
+        for action in self._context.actions:
+            older, newer = (self, action) if action._number > self._number else (action, self)
+            if newer._moves_members:
+                older._newer_actions.append(newer)
+        was_called_late = bool(self._newer_actions)
         if self._moves_members:
-            for action in self._context.actions:
-                action._newer_actions.append(self)
+            self._context.moves.update(member.name for member in self._members)
+        self._moves = Counter(self._context.moves)
         self._context.actions.append(self)
         try:
             delays_s = {} if self._corridors is None else self._corridors.delays_s
             for index, member in enumerate(self._members):
                 delay_s = index * self._stagger_s + delays_s.get(member.name, 0.0)
-                tasks.start(partial(self._run_member, member, delay_s), f"aerokit {self.name} {member.name}")
+                tasks.start(
+                    partial(self._run_member, member, delay_s, was_called_late), f"aerokit {self.name} {member.name}"
+                )
             await self._finished.wait()
         except BaseException:
             self._hold_finished_members()
@@ -173,28 +189,36 @@ class FleetAction:
 
     # --------------------------------------------------------------------------------- one member
 
-    async def _run_member(self, member: Member, delay_s: float) -> None:
-        """Execute the action with one member after a delay, and record its outcome."""
+    async def _run_member(self, member: Member, delay_s: float, was_called_late: bool) -> None:
+        """Execute the action with one member after a delay, and record its outcome.
+
+        The program may have given the member an order since the action was created. With ``was_called_late``, this may
+        be a newer action.
+        """
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
         try:
             if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
-            wait_s, arbiter = delay_s, member.vehicle._arbiter
-            arm_commands, order_before = arbiter.arm_commands_sent, arbiter.newest
-            while wait_s > START_TOLERANCE_S:
+            has_newer_order, wait_s = self._newer_order_checks[member.name], delay_s
+            if self._context.starts[member.name] != self._starts[member.name]:  # An older action may have ordered this.
+                has_newer_order = self._newer_order_check(member)
+            is_overruled = (self._moves_members or self._arms) and (
+                has_newer_order() or (was_called_late and self._has_newer_action(member))
+            )
+            while wait_s > START_TOLERANCE_S and not is_overruled:
                 await self._wait_to_start(member, wait_s)
-                has_armed = self.name == "arm" and arbiter.arm_commands_sent > arm_commands
-                has_landed = arbiter.newest is not order_before and _is_ending_flight(member)
-                if has_armed or has_landed or self._has_newer_action(member):
-                    raise OperationRejected(
-                        f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
-                    )
+                is_overruled = has_newer_order() or self._has_newer_action(member)
                 # After a blocked event loop, the delays of several members may end at once. Each of them then waits
                 # until `stagger_s` after the last start.
                 wait_s = self._last_start_at + self._stagger_s - self._context.now()
+            if is_overruled:
+                raise OperationRejected(
+                    f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
+                )
             self._last_start_at = self._context.now()
+            self._context.starts[member.name] += 1
             if not member.is_available:
                 raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
             value = await self._execute_in_time(member)
@@ -208,7 +232,7 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                self._final_orders[member.name] = newest_order(member)
+                self._final_orders[member.name] = _newest_order(member), self._moves[member.name]
                 member.record_success()
         finally:
             del self._tasks[member.name]
@@ -241,7 +265,7 @@ class FleetAction:
     def _has_failed_or_stopped(self, member: Member) -> bool:
         return member.name in self._failed or member.name in self._stopped
 
-    def _has_newer_order(self, member: Member, order: PolicyOrder) -> bool:
+    def _has_newer_order(self, member: Member) -> bool:
         """Return True if the program has given the member a newer order, which this order of the policy must not end.
 
         This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
@@ -249,15 +273,34 @@ class FleetAction:
         """
         # The landing may also be a part of the action, if it is a function of the program that still runs.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
-        if _is_ending_flight(member) and order != "land" and not is_ordered_by_action:
-            return True
-        return self._has_newer_action(member)
+        return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
 
     def _has_newer_action(self, member: Member) -> bool:
-        """Return True if a newer action of the fleet moves the member or has moved it."""
+        """Return True if a newer action of the fleet moves the member or has moved it.
+
+        A member may arm during a newer action, unless this action ends the flight.
+        """
         return any(
-            member in action._members and not action._has_failed_or_stopped(member) for action in self._newer_actions
+            member in action._members and not action._has_failed_or_stopped(member)
+            for action in self._newer_actions
+            if action._is_safe or not self._arms
         )
+
+    def _newer_order_check(self, member: Member) -> Callable[[], bool]:
+        """Return a function that returns True if the program has told the member to land, return or disarm since."""
+        arbiter, order_before = member.vehicle._arbiter, _newest_order(member)
+
+        def commands_sent() -> int:
+            return arbiter.arm_commands_sent if self._arms else arbiter.disarm_commands_sent
+
+        commands_before = commands_sent()
+
+        def has_newer_order() -> bool:
+            has_landed = _newest_order(member) is not order_before and _is_ending_flight(member)
+            # A vehicle in the air refuses to disarm, which must not keep it from landing.
+            return has_landed or (not self._is_safe and commands_sent() > commands_before)
+
+        return has_newer_order
 
     async def _execute_in_time(self, member: Member) -> Any:
         if self._timeout is None:
@@ -309,7 +352,7 @@ class FleetAction:
             order = orders.get(member.name)
             if order is None:
                 continue
-            if self._has_newer_order(member, order):
+            if self._has_newer_order(member):
                 skipped[member.name] = "it has a newer order"
             elif member.is_flown_by_program:
                 self._policy_orders[member.name] = order
@@ -398,7 +441,7 @@ class FleetAction:
         # cancelled. Failed and stopped members get no order.
         for member in self._members if self._holds_if_cancelled else ():
             has_finished = member.name in self._outcomes and not self._has_failed_or_stopped(member)
-            if has_finished and member.is_flown_by_program and not self._has_newer_order(member, "hold"):
+            if has_finished and member.is_flown_by_program and not self._has_newer_order(member):
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:
@@ -411,15 +454,16 @@ class FleetAction:
         self._finished.set()
 
 
-def newest_order(member: Member) -> object:
+def _newest_order(member: Member) -> Order | None:
     """Return the newest order of this program that flies the vehicle; None if there is none."""
     return member.vehicle._arbiter.latest(STEERING)
 
 
 def _is_ending_flight(member: Member) -> bool:
-    """Return True if the vehicle's newest order is one of this program to land, return or disarm, and still valid."""
-    newest = member.vehicle._arbiter.newest
-    return newest is not None and newest.ends_flight and not newest.end
+    """Return True if the vehicle's newest order is one of this program to land or return, and still valid."""
+    newest = _newest_order(member)
+    # A posted order that was closed still flies the vehicle.
+    return newest is not None and newest.ends_flight and newest.is_newest and not newest.takeover_reason
 
 
 class FleetContext:
@@ -442,6 +486,9 @@ class FleetContext:
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
         self.actions: list[FleetAction] = []
+        self.action_numbers: Iterator[int] = itertools.count()
+        self.moves: Counter[str] = Counter()  # how many actions that move each member were given
+        self.starts: Counter[str] = Counter()  # how many actions each member has started
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
         # The missions of the upload that began last; empty if an older upload may have replaced one of them.
         self.newest_upload: Mapping[str, Mission] = {}
@@ -461,6 +508,10 @@ class FleetContext:
 
     def publish(self, event: FleetEvent) -> None:
         self.bus.publish(event)
+
+    def newest_orders(self, member: Member) -> tuple[object, object]:
+        """Return the newest order that flies the member, and the number of actions, whose orders may still follow."""
+        return _newest_order(member), self.moves[member.name]
 
     def hold(self, member: Member, task_name: str) -> None:
         """Order a member to hold, in the background. If the order fails, the member's state becomes FAILED."""
@@ -543,9 +594,9 @@ class SelectionBase:
             raise OperationRejected(f"{action}: {member.name} is {member.status}; {consequence}")
 
     def _check_not_ordered_since(self, orders: Mapping[str, object], action: str, consequence: str) -> None:
-        """Raise OperationRejected if the newest order of a member is no longer the one in ``orders``."""
+        """Raise OperationRejected if the newest orders of a member are no longer those in ``orders``."""
         for name, order in orders.items():
-            if newest_order(self._context.members[name]) is not order:
+            if self._context.newest_orders(self._context.members[name]) != order:
                 raise OperationRejected(f"{action}: {name} got a newer order meanwhile; {consequence}")
 
     def __len__(self) -> int:
@@ -582,5 +633,6 @@ class SelectionBase:
             is_safe=is_safe,
             holds_if_cancelled=not is_safe and built_in_action not in ACTIONS_ON_GROUND,
             moves_members=is_safe or built_in_action in MOVING_ACTIONS,
+            arms=built_in_action == "arm",
             corridors=corridors,
         ).run()

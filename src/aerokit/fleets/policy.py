@@ -119,7 +119,7 @@ class FleetResult(Mapping[str, Any]):
         self.skipped: dict[str, str] = dict(skipped)
         """Unavailable members, which got no order, with the reason. They are no keys of the FleetResult."""
         self._outcomes = dict(outcomes)
-        self._final_orders: Mapping[str, object] = {}  # the vehicle's newest order when the member had finished
+        self._final_orders: Mapping[str, object] = {}  # those when the member had finished
 
     @property
     def is_complete(self) -> bool:

@@ -16,7 +16,6 @@ from aerokit._internal.arguments import check_range, checks_arguments
 from aerokit._internal.formatting import short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, OperationRejected, OperationTimeout, StaleValueError
-from aerokit.fleets.action import newest_order
 from aerokit.fleets.distances import LocalOrigin, altitude_amsl
 from aerokit.fleets.formation import follow_velocity
 from aerokit.fleets.members import Member
@@ -370,7 +369,7 @@ class Shows(Travel):
         local_origin, origin_amsl_m = self._local_origin(show, origin)
         self._check_show(show, local_origin, origin_amsl_m)
         names = tuple(show.tracks)
-        orders_before = {name: newest_order(self.members[name]) for name in names}
+        orders_before = {name: self._context.newest_orders(self.members[name]) for name in names}
         clocks: FleetResult = await self._run("clocks", lambda member: measure_clock(member.vehicle), names=names)
         clocks.raise_for_errors()
         self._check_not_ordered_since(orders_before, "fly_show", "the show was not started")

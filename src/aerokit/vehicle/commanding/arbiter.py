@@ -56,6 +56,7 @@ class CommandArbiter:
         """The last steering order given by an action or a raw command."""
         self.arm_commands_sent: int = 0
         """Number of arm and disarm commands sent."""
+        self.disarm_commands_sent: int = 0
         self.mode_settles_at: float = -math.inf
         """Time until which HEARTBEAT may report the mode of an abandoned order."""
         # Until this time, any reported mode may be the effect of a raw command.
@@ -214,8 +215,9 @@ class CommandArbiter:
         disarms = armed is False
         if is_steering:
             self._notify_steering()
-            if self.newest is not None:  # A change to a mode of the posted order is not a takeover.
-                self.newest.expect(modes)
+            for previous in (self.newest, self._arming_order):
+                if previous is not None:  # A change to a mode of the posted order is not a takeover.
+                    previous.expect(modes)
         self._supersede_arming(armed)
         now = self._now()
         recent_modes = {mode for ordered_at, mode in self._ordered_modes if ordered_at > now - OWN_MODES_MAX_AGE_S}
@@ -264,6 +266,7 @@ class CommandArbiter:
             self._supersede_arming(armed)
             order.arm_command = self.arm_commands_sent
         self._sent.append(sent)
+        sent_at = self._now()
         try:
             yield sent
             # The block has not raised, so the vehicle has accepted the command.
@@ -271,6 +274,9 @@ class CommandArbiter:
             self._record_accepted(armed)
         except CommandRejected:
             order.was_refused = True
+            raise
+        except BaseException:  # The command was abandoned, but its acknowledgement and its effect may follow.
+            self._record_accepted(armed, sent_at)
             raise
         finally:
             self._sent.remove(sent)
@@ -280,16 +286,19 @@ class CommandArbiter:
         self._supersede_arming(armed)
         self._record_accepted(armed)
 
-    def _record_accepted(self, armed: bool | None) -> None:
-        """Record the time at which an arming command was accepted, because HEARTBEAT reports the effect later."""
+    def _record_accepted(self, armed: bool | None, accepted_at: float | None = None) -> None:
+        """Record when (by default now) an arming command was accepted, because HEARTBEAT reports the effect later."""
         if armed:
-            self._arming_accepted_at = self._now()
+            accepted_at = self._now() if accepted_at is None else accepted_at
+            # A newer command may have been accepted before this one was abandoned.
+            self._arming_accepted_at = max(self._arming_accepted_at, accepted_at)
 
     def _supersede_arming(self, armed: bool | None) -> None:
         """If a newer command arms or disarms (``armed`` is not None), end earlier orders to arm or disarm."""
         if armed is None:
             return
         self.arm_commands_sent += 1
+        self.disarm_commands_sent += not armed
         self.supersede(("arm",))
         for sent in self._sent:
             sent.on_newer_command(armed)

@@ -188,6 +188,8 @@ class Order:
         """True once the first transmission of a command of the order began. The next command is a further step."""
         self.only_stops: bool = False
         """True once the remaining steps only stop the vehicle, so that they are also sent if the computer slept."""
+        self.is_closed: bool = False
+        """True once the `with` block of the posted order was left."""
         self.is_confirmed: bool = False
         """True once a change to one of the order's modes, or to its armed state, was reported."""
         # Sets of modes, by their numbers in HEARTBEAT.custom_mode. The docstring of the class describes the kinds.
@@ -219,6 +221,8 @@ class Order:
         """Text that explains why no command of the order may be sent; empty while commands may be sent."""
         if not self.is_newest:
             return SUPERSEDED
+        if self.is_closed and not self.takeover_reason:
+            return "its `with` block was left"
         return self.takeover_reason or ("" if self.ends_flight else self.failsafe)
 
     @property
@@ -244,7 +248,7 @@ class Order:
 
     def close(self) -> None:
         """End the posted order, because its `with` block was left."""
-        self.takeover_reason = self.takeover_reason or "its `with` block was left"
+        self.is_closed = True
 
     def clear_failsafe(self) -> None:
         """Ignore the reported failsafe, because the program has reclaimed the vehicle."""
