@@ -215,7 +215,10 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return a key that is equal for addresses that cannot both be open; None if the system chooses the port or pty."""
+    """Return the key of an address. Only one address with the same key can be open at a time.
+
+    The key is None if the system chooses the port or pty.
+    """
     if isinstance(target, Link):
         return id(target)
     gets_new_endpoint = (target.kind in ("udpin", "tcpin") and not target.port) or (

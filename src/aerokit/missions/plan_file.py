@@ -221,9 +221,10 @@ def _read_fence(value: JsonValue) -> Fence:
 
 
 def _check_version(value: JsonValue, *content_keys: str) -> int:
-    """Return the version; raise FileFormatError unless it is 2, or 1 without content.
+    """Return the version; raise FileFormatError if it is not supported.
 
-    Version 1 had other contents, but QGroundControl has also written it for empty fences and empty rally points.
+    Version 2 is supported. Version 1 is supported only without content (``content_keys``), because QGroundControl has
+    written it for empty fences and empty rally points.
     """
     is_empty = not any(value.members().get(key) for key in content_keys)
     allowed = (1, 2) if is_empty else (2,)

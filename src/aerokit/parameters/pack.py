@@ -88,9 +88,12 @@ def unpack_parameters(data: bytes, *, start: int = 0) -> ParameterTable:
             sends a wrong number once, after its list has changed; download the file again.
     """
     magic, count, total = read_header(data)  # `total` also counts the parameters before `start`.
-    if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS) or count > total:
+    if magic not in (MAGIC, _MAGIC_WITH_DEFAULTS):
+        expected = f"{MAGIC:#06x} or {_MAGIC_WITH_DEFAULTS:#06x}"
+        raise RemoteProtocolError(f"the file is not a param.pck: it begins with {magic:#06x} instead of {expected}")
+    if count > total:
         raise RemoteProtocolError(
-            f"the file is not a param.pck: its header has {magic:#06x}, and {count} of {total} parameters"
+            f"the param.pck is damaged: its header says that it has {count} of {total} parameters"
         )
     parameters = list(_parameters(data, magic == _MAGIC_WITH_DEFAULTS, start))
     if len(parameters) != count:

@@ -144,7 +144,7 @@ class SimParameters:
         return row
 
     def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
-        """Append a parameter, like a firmware on which a feature is enabled at run time."""
+        """Append a parameter, as real firmware does when a feature is enabled."""
         self._rows[name] = SimParameter(name, type, stored_value(value, type), stored_value(value, type))
         self._names = None
 

@@ -275,7 +275,7 @@ async def test_erase_continues_while_logs_disappear(ardupilot: Bench) -> None:
 
 async def test_erase_without_effect_times_out(ardupilot: Bench) -> None:
     ardupilot.simulated.on(m.LogErase, lambda *_: None)
-    with pytest.raises(FileTimeout, match=r"logs still exist, and none has gone for 3 s"):
+    with pytest.raises(FileTimeout, match=r"logs still exist; none was erased in the last 3 s"):
         await ardupilot.logs.erase(idle_timeout_s=3.0)
 
 

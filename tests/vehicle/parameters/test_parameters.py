@@ -260,7 +260,8 @@ async def test_list_from_before_a_reboot_is_downloaded_again() -> None:
     simulated = copter()
     first = next(iter(simulated.parameters))
     async with open_flight(simulated) as flight:
-        session, reboots = flight.vehicle._session, []
+        session = flight.vehicle._session
+        reboots: list[TransferProgress] = []
 
         def reboot_once(progress: TransferProgress) -> None:
             if progress.done == 60 and not reboots:

@@ -36,7 +36,7 @@ def misplaced_file(word: str) -> str | None:
     """Return an error text if the user gave a file name instead of an address; otherwise None.
 
     A recording (.tlog) is a valid address. A name with a known suffix, such as .plan, counts as a file even if no such
-    file exists. Its error text has the command that takes such files.
+    file exists. The error text then names the command for this type of file.
     """
     path = Path(word)
     suffix = path.suffix.lower()

@@ -261,7 +261,7 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
             *[_cell(record.fields.get(name)) for name in names],
         ]
     parts = [column.field.partition(".") for column in columns]
-    # NAME is a second name even if there is only one column. For a single name, attrgetter would not return a tuple.
+    # NAME is added because attrgetter returns a tuple only for two or more names.
     get_fields = attrgetter("NAME", *(name for name, _, _ in parts))
     array_elements = [(position, int(index)) for position, (_, _, index) in enumerate(parts) if index]
     text_positions = [position for position, column in enumerate(columns) if column.kind == "str"]

@@ -354,7 +354,7 @@ class MessageRequests:
         return None
 
     def poll_for(self, cell: StateCell[Any], message_type: type[Message], period_s: float) -> None:
-        """Poll the message of a state value every ``period_s`` seconds while the program uses the value."""
+        """Request the message that sets ``cell`` every ``period_s`` seconds while the program uses the cell."""
         self._polled.append(_PolledCell(self._link.now, cell, message_type, period_s))
 
     def forget_refusals(self) -> None:

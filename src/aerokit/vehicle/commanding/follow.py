@@ -92,7 +92,7 @@ class FollowedTarget:
         return self.latest
 
     def _read_vehicle(self, telemetry: Any) -> None:
-        """Take position and velocity from the cells of a target that is a vehicle."""
+        """Read position and velocity of a target that is a vehicle, from its telemetry."""
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return

@@ -134,7 +134,7 @@ class _StreamMonitor:
             cleanup.callback(bus.attach_event(event_type, self._on_event))
 
     def reset(self) -> None:
-        """Before a new request, forget that messages were received and that a request was due."""
+        """Clear both attributes before a new request."""
         self.has_received = False
         self.must_request = asyncio.Event()
 

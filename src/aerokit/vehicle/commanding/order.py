@@ -348,7 +348,7 @@ class SentCommand:
         self._armed_now = armed_now
         self.arms = armed
         """True if the command arms the vehicle, False if it disarms it, None if it does neither."""
-        # True once this command arms and a newer command of the program disarms, or the reverse.
+        # True if the program has sent a newer command that does the opposite: disarm instead of arm, or the reverse.
         self._is_overruled = False
         self._is_done = is_done
         self._slept_s = slept_s

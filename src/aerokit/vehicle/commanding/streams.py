@@ -290,9 +290,9 @@ class SteeringStream(ValueStream[ValueT]):
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
             self._hold()
         elif not self._context.arbiter.is_state_recent:
-            # The vehicle is silent, so there may have been a takeover whose report was not received. The hold is
-            # therefore sent after the next HEARTBEAT, unless that shows a takeover. This call does not wait for it.
-            # `_stop` replaces the error from above by one about the silence.
+            # The vehicle is silent, so the report of a takeover may be missing. `_stop` therefore sends the hold in the
+            # background, after the next HEARTBEAT and only if this HEARTBEAT shows no takeover. It also sets
+            # `_stop_error` to an error about the silence.
             self._stop(f"the vehicle has been silent for {self._session.heartbeat_age:.1f} s")
             raise self._stop_error
         elif not self._session.telemetry.is_confirmed_disarmed:

@@ -224,7 +224,8 @@ class Logs:
                     progress_at = now
                 elif now - progress_at >= idle_timeout_s:
                     raise FileTimeout(
-                        f"erase logs: {len(remaining)} logs still exist, and none has gone for {idle_timeout_s:g} s"
+                        f"erase logs: {len(remaining)} logs still exist;"
+                        f" none was erased in the last {idle_timeout_s:g} s"
                     )
 
     def stream(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S) -> LogStream:

@@ -103,7 +103,7 @@ class ReleaseCommand:
                     if not self._is_target_silent():
                         raise
                     # The target was silent, and may have missed the command. Send it again at the target's next
-                    # HEARTBEAT. This may be late, because a manager executes it only if this program has control.
+                    # HEARTBEAT. A late command does no harm: the manager ignores it if this program has lost control.
                     await self._wait_target_heartbeat()
                     if self._is_still_due():
                         self._send()

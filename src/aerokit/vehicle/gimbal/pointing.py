@@ -118,9 +118,10 @@ class RestTarget:
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Request the gimbal's attitude from the autopilot, and the vehicle's attitude to convert yaws, during a block.
+    """Request the attitudes of vehicle and gimbal during a `with` block.
 
-    Gimbals with their own component id send their attitude without a request.
+    The vehicle's attitude is needed to convert yaw angles. The gimbal's attitude is requested only from an autopilot,
+    because gimbals with their own component id send it without a request.
     """
     session = orders.session
     with ExitStack() as requests:

@@ -359,7 +359,10 @@ class ParameterAccess:
             self.store.unmark_replaced(name)
 
     def _recently_written(self) -> set[str]:
-        """Return the names for which a late answer to a write may arrive. Their next write is therefore read back."""
+        """Return the names whose last write may still be answered.
+
+        This answer could be taken for the answer to the next write, so the next write is verified by a read.
+        """
         earliest = self._transfers.connection.now() - ECHO_WINDOW_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
