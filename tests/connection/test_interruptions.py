@@ -8,6 +8,7 @@ import errno
 import re
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -193,6 +194,17 @@ async def test_order_without_link_says_that_it_was_not_sent(order: Callable[[Veh
             await order(vehicle)
         assert not raised.value.was_sent
         assert not re.search("may|nevertheless|disarms it", str(raised.value))
+
+
+async def test_recording_has_only_messages_that_link_accepted(tmp_path: Path) -> None:
+    """A report would otherwise attribute a change of mode to an order that was not sent."""
+    orders = [m.CommandLong(1, 1, MavCmd.DO_SET_MODE, 0, 1, number, 0, 0, 0, 0, 0) for number in (3, 4)]
+    async with cabled(record=tmp_path / "flight.tlog") as (cable, vehicle):
+        vehicle.send(orders[0])
+        cable.pull()
+        vehicle.send(orders[1])
+    recorded = (tmp_path / "flight.tlog").read_bytes()
+    assert [order.encode().rstrip(b"\0") in recorded for order in orders] == [True, False]
 
 
 async def test_order_is_sent_when_link_is_restored() -> None:

@@ -399,6 +399,7 @@ def test_rejections_describe_vehicle_state(vehicle: dronekit.Vehicle, caplog: py
         lambda vehicle: vehicle.wait_ready("unknown"),
         lambda vehicle: vehicle.wait_for(lambda: False),
         lambda vehicle: vehicle.arm(),
+        lambda vehicle: vehicle._master.motors_armed_wait(),
         lambda vehicle: (vehicle.commands.download(), vehicle.commands.clear()),
     ],
 )
@@ -412,6 +413,12 @@ def test_wait_on_loop_thread_raises(vehicle: dronekit.Vehicle, wait: Callable[[A
         vehicle.run(call)
     vehicle.wait_ready("commands")
     assert not vehicle.armed
+
+
+def test_wait_with_negative_interval_ends(vehicle: dronekit.Vehicle) -> None:
+    """-1 means "no limit" for a lock."""
+    with pytest.raises(dronekit.TimeoutError):
+        vehicle.wait_for(lambda: False, timeout=0.01, interval=-1)
 
 
 @pytest.mark.parametrize(

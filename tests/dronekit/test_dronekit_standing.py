@@ -117,6 +117,13 @@ def test_disarming_does_not_wait_for_arming(copter: FlightController, vehicle: d
     copter.report("COMMAND_ACK", command=ARM, result=2)  # so that closing does not wait
 
 
+def test_string_arms_as_in_dronekit(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
+    value: Any = "False"
+    vehicle.armed = value
+    copter.wait_for_command(ARM)
+    assert [command.param1 for command in copter.commands()] == [1]
+
+
 def test_disarm_during_arming_waits_for_answer(copter: FlightController, vehicle: dronekit.Vehicle) -> None:
     lose_answers(copter, ARM, does=False)
     vehicle.armed = True

@@ -132,6 +132,15 @@ def test_station_with_ids_of_vehicle_gets_no_orders(stage: Stage) -> None:
     assert stage.receive("c", order(1), 255, 190) == {"a", "b"}  # The ids are those of the station now.
 
 
+@pytest.mark.parametrize("other", [STATION, CAMERA])
+def test_autopilot_has_priority_over_earlier_sender_with_its_ids(other: Heartbeat, stage: Stage) -> None:
+    stage.receive("b", other)
+    for port in "aba":
+        stage.receive(port, COPTER if port == "a" else other)
+        stage.receive("d", Heartbeat(2, 3, 81, 5, 3))  # the second link of the vehicle
+    assert stage.receive("c", order(1), 255, 190) == {"a"}
+
+
 def test_copy_at_other_port_is_dropped_without_effect(stage: Stage) -> None:
     raw = FrameEncoder(1, 1).encode(COPTER)
     assert stage.pass_on("a", raw) == set("bcd")

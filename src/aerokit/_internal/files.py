@@ -102,7 +102,7 @@ class PartFile:
     `with` statement, which raises OSError while another download of this program writes the file.
     """
 
-    _claimed: ClassVar[set[str]] = set()  # absolute paths of the partial files that downloads write
+    _claimed: ClassVar[dict[str, PartFile]] = {}  # maps absolute paths to the downloads that write these files
 
     def __init__(self, destination: str | os.PathLike[str], mark: str = "") -> None:
         self._destination = os.fspath(destination)
@@ -111,13 +111,13 @@ class PartFile:
 
     def __enter__(self) -> Self:
         self._claim = os.path.abspath(self.path)
-        if self._claim in self._claimed:
+        # One dict operation, because downloads of several vehicles may run on several threads.
+        if self._claimed.setdefault(self._claim, self) is not self:
             raise OSError(errno.EBUSY, "another download is writing this file", self._claim)
-        self._claimed.add(self._claim)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._claimed.discard(self._claim)
+        del self._claimed[self._claim]
 
     @property
     def size(self) -> int:

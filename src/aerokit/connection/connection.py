@@ -577,10 +577,11 @@ class Connection:
         dropped_before = self.link.dropped_writes
         for peer in peers:
             self.link.write(data, peer)
-        if peers:
-            self._observers.record_sent(data, self._clock())
         # EVERY_PEER is any number of peers: one of them may have got the frame although a write to another was dropped.
-        return peers is EVERY_PEER or self.link.dropped_writes - dropped_before < len(peers)
+        is_written = peers is EVERY_PEER or self.link.dropped_writes - dropped_before < len(peers)
+        if is_written:
+            self._observers.record_sent(data, self._clock())
+        return is_written
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
         """Encode a message with the next sequence number, and write it to one peer, e.g. to probe one of the links."""

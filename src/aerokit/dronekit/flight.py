@@ -89,7 +89,8 @@ class FlightMethods(VehicleAttributes):
 
         Set it to arm or disarm: **propellers may start to turn**. Setting it does not wait. It sends nothing if the
         vehicle already reports the value, unless an opposite order is pending. An order to disarm is always sent to a
-        silent vehicle, because its last report may be outdated. :meth:`arm` waits, and raises the reason of a refusal.
+        silent vehicle, because its last report may be outdated. As in DroneKit, the truth of the value counts: the
+        string ``"False"`` arms. :meth:`arm` waits, and raises the reason of a refusal.
         """
         return self._armed
 

@@ -13,7 +13,7 @@ from pymavlink import mavutil
 from aerokit.autopilots.modes import is_armed
 from aerokit.connection.heartbeats import is_autopilot
 from aerokit.dronekit.classic_connection import weak_callback
-from aerokit.dronekit.exceptions import APIException
+from aerokit.dronekit.exceptions import APIException, classic_errors
 from aerokit.dronekit.observers import message_of
 from aerokit.errors import InvalidArgument
 from aerokit.mavlink.dialect import STANDARD
@@ -191,7 +191,8 @@ class Master:
 
         From the first call on, messages are stored: the last 1,000, each for at most five seconds. If none matches,
         returns None at once if ``blocking`` is false, otherwise after ``timeout`` seconds (None: no limit). Raises
-        APIException if the connection is closed and no stored message matches.
+        APIException if no stored message matches and the connection is closed, or if it would have to wait on the event
+        loop's own thread.
         """
         types = (type,) if isinstance(type, str) else type
         names = None if types is None else set(types)
@@ -199,9 +200,7 @@ class Master:
         def matches(message: Any) -> bool:
             return bool(mavutil.evaluate_condition(condition, {message.get_type(): message}))
 
-        # A wait on the loop's thread would stop reception.
-        may_wait = blocking and not self._connection.loop.is_current
-        return self.messages.next_match(names, matches, timeout if may_wait else 0.0)
+        return self.messages.next_match(names, matches, timeout if blocking else 0.0)
 
     def wait_heartbeat(self, blocking: bool = True, timeout: float | None = None) -> Any:
         """Return the next HEARTBEAT; see :meth:`recv_match` for ``blocking`` and ``timeout``."""
@@ -349,6 +348,8 @@ class Inbox(Mapping[str, Any]):
                 if wait_s <= 0:
                     return None
                 arrived = self._arrived
+            with classic_errors():
+                self._connection.loop.check_may_wait()
             arrived.wait(wait_s)
 
     def _raise_if_closed(self) -> None:

@@ -18,6 +18,7 @@ from aerokit.hub.senders import (
     REPEAT_WINDOW_S,
     RecentFrames,
     Sender,
+    is_autopilot,
 )
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ class Router(Generic[PortT]):
     - A vehicle that is received at several ports gets messages through the first port until that port is silent for 3.5
       s, so that no command arrives twice. A message for a system goes to the one port that is used for its autopilot,
       and also to each port at which only other components of the system were received. Ground stations that share ids
-      all get the messages for these ids.
+      all get the messages for these ids. An autopilot has priority over other senders with its ids.
     - A frame never goes back to the port at which it arrived, and is forwarded once. Copies that arrive at other ports
       within two seconds are dropped. Later copies are dropped if they prove a loop. Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
@@ -236,7 +237,8 @@ class Router(Generic[PortT]):
         if sender.port_number == number:
             sender.received_at = now
         else:
-            self._record_at_other_port(sender, node, now)
+            must_move = not (message_id or sender.is_autopilot) and is_autopilot(body)
+            self._record_at_other_port(sender, node, now, must_move)
         if not message_id:
             self._record_heartbeat(sender, node, body)
         try:
@@ -280,10 +282,13 @@ class Router(Generic[PortT]):
                 del self._senders[source]
         return len(self._senders) < MAX_ROUTES
 
-    def _record_at_other_port(self, sender: Sender, node: RouterPort[PortT], now: float) -> None:
-        """Record a frame that arrived at another port than the sender's. A silent sender moves to this port."""
+    def _record_at_other_port(self, sender: Sender, node: RouterPort[PortT], now: float, must_move: bool) -> None:
+        """Record a frame that arrived at another port than the sender's. A silent sender moves to this port.
+
+        With ``must_move``, it moves at once, because an autopilot has priority over other senders with its ids.
+        """
         former_number = sender.port_number
-        if sender.record_at_other_port(node.number, now):
+        if sender.record_at_other_port(node.number, now, must_move):
             self.forget_plans()
         if sender.is_autopilot and sender.port_number != former_number:
             self._report("route_changed", sender.source, node, former_number)

@@ -87,12 +87,12 @@ class Sender:
         """Return True if this is the sender's port, or if the sender was received here at nearly the same time."""
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
-    def record_at_other_port(self, number: int, now: float) -> bool:
+    def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:
         """Record a frame at another port than `port_number`. Return True if the routes to the sender change."""
         is_new = now - self.ports.get(number, -math.inf) > ROUTE_TIMEOUT_S
         self.ports[number] = now
-        if now - self.received_at > ROUTE_TIMEOUT_S:
-            # The sender is silent at its present port, so messages go to the new port.
+        if must_move or now - self.received_at > ROUTE_TIMEOUT_S:
+            # If the sender is silent at its present port, messages go to the new port.
             self.ports[self.port_number] = self.received_at
             self.port_number, self.received_at = number, now
             return True

@@ -46,7 +46,7 @@ class ThreadFuture(Generic[T]):
 
     def wait(self, timeout: float) -> bool:
         """Wait at most ``timeout`` seconds and return True if done."""
-        if not self.is_done and self._gate.acquire(timeout=timeout):
+        if not self.is_done and self._gate.acquire(timeout=max(timeout, 0.0)):  # A lock takes -1 as "no limit".
             self._gate.release()  # Let the next waiting thread continue.
         return self.is_done
 

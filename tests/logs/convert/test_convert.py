@@ -300,6 +300,23 @@ def test_gpx_has_no_guided_target_and_no_cleared_mission(result: int, names: lis
     assert [waypoint.name for waypoint in gpxpy.parse((tmp_path / "out.gpx").read_text()).waypoints] == names
 
 
+def test_gpx_has_mission_after_lost_request_to_clear(tmp_path: Path) -> None:
+    gpxpy = pytest.importorskip("gpxpy")
+    vehicle, station = FrameEncoder(1, 1), FrameEncoder(255, 190)
+    with TlogWriter(tmp_path / "in.tlog") as writer:
+        for encoder, message in (
+            (vehicle, m.Heartbeat(2, 3, 81, 4, 4, 3)),
+            (vehicle, m.GlobalPositionInt(0, 474000000, 85000000, 500000, 0, 0, 0, 0, 0)),
+            (station, m.MissionClearAll(1, 1)),
+            (station, m.MissionCount(1, 1, 1)),
+            (station, m.MissionItemInt(1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, 474010000, 85010000, 30.0)),
+            (vehicle, m.MissionAck(255, 190, 0)),
+        ):
+            writer.write(encoder.encode(message), BEGIN)
+    convert(tmp_path / "in.tlog", tmp_path / "out.gpx")
+    assert len(gpxpy.parse((tmp_path / "out.gpx").read_text()).waypoints) == 1
+
+
 def test_kml_has_altitude_modes(log: Path, tmp_path: Path) -> None:
     pytest.importorskip("simplekml")
     convert(log, tmp_path / "out.kml")
