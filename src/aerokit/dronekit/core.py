@@ -399,5 +399,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    """Return the core of a vehicle, for classes whose constructor gets the vehicle because that of DroneKit does."""
+    """Return the core of a vehicle. Used by classes whose constructors, as in DroneKit, take the vehicle."""
     return vehicle._dk
