@@ -167,7 +167,7 @@ def _error(rule: Rule, argument: str, value: object, vehicle_parameter: object) 
 
 
 def _hint(check: Check, value: object) -> str:
-    """Return a hint if the program passed a state cell whose value would be allowed; otherwise an empty string."""
+    """Return the hint to pass ``.value`` if ``value`` is a state cell whose latest value is allowed; else ""."""
     latest = getattr(value, "latest", None)
     return "; pass its .value" if latest is not None and check(latest) else ""
 

@@ -141,11 +141,11 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
 
 
 def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return data about the current mode if the vehicle cannot arm in it, or can only if a parameter permits it.
+    """Return data about a current mode in which the vehicle cannot arm, or only if a parameter permits it; else None.
 
-    Return None for other modes, and for an unknown mode. ``mode`` is the name of the current mode, ``arms_in`` that of
-    the mode to which ``arm`` would change, or None. ``unless`` is the autopilot's parameter that can permit arming in
-    the current mode, or None. The value of this parameter is not checked.
+    None is also returned while the mode is unknown. The keys are ``mode``: the name of the current mode;
+    ``arms_in``: the mode to which ``arm`` would change, or None; ``unless``: the autopilot's parameter that can permit
+    arming in the current mode, or None. The value of this parameter is not checked.
     """
     autopilot = vehicle.autopilot
     mode = vehicle.mode.latest

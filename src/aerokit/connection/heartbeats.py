@@ -83,9 +83,9 @@ class OwnHeartbeat(Snapshot):
     A vehicle's ground station failsafe acts when heartbeats stop. Heartbeats therefore pause when the program hangs,
     i.e. when it has called neither aerokit nor ``feed()`` for ``fed_within_s`` seconds (infinity: never). None means 60
     seconds in :mod:`aerokit.sync` and :mod:`aerokit.dronekit`, whose event loop runs on a separate thread. In asyncio,
-    None means infinity, because a blocked loop sends nothing anyway; with a number, only ``feed()`` counts, and an
-    awaited call does not. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18 for a companion computer
-    (ONBOARD_CONTROLLER).
+    None means infinity, because a blocked loop sends nothing anyway. If you set a number in asyncio, call ``feed()``
+    regularly, because other calls do not count there. ``type`` is a MAV_TYPE: 6 for a ground station (GCS), 18 for a
+    companion computer (ONBOARD_CONTROLLER).
     """
 
     type: int = MavType.GCS.value

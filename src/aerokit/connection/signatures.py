@@ -64,9 +64,10 @@ class SignatureGate:
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
         """Switch to ``signing`` when frames received during the block show that the component uses the new key.
 
-        The yielded event is set at the switch. Before the switch, the old key signs and verifies. One frame signed with
-        the new key is enough. If the key is removed, at least `MIN_UNSIGNED_FRAMES` unsigned frames over
-        `MIN_UNSIGNED_S` without a signed frame are needed, because any sender could forge a few unsigned frames.
+        The old key signs and verifies until the switch, which sets the yielded event. One frame signed with the new key
+        causes the switch. If ``signing`` is None, the component stops signing. The switch then needs at least
+        `MIN_UNSIGNED_FRAMES` unsigned frames over `MIN_UNSIGNED_S` without a signed one, because any sender could forge
+        a few.
 
         Raises:
             BusyError: another handover is in progress.
@@ -117,9 +118,9 @@ class SignatureGate:
         return refusal is None
 
     def has_verified(self, frame: Frame) -> bool:
-        """Return True if an admitted frame was admitted because of its signature with our key.
+        """Return True if an admitted frame has a signature that was verified with our key.
 
-        Frames that need no signature are admitted with any signature, also a forged or replayed one.
+        False for frames that need no signature: they are admitted with any, also a forged or replayed one.
         """
         signing = self._encoder.signing
         return signing is not None and bool(frame.incompat_flags & SIGNED) and not signing.may_be_unsigned(frame)

@@ -81,9 +81,9 @@ class Readiness:
         return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
-        """Wait until an attribute gets a value or fails, at most ``max_wait_s`` and at most 0.2 s.
+        """Wait until any attribute gets a value or fails, for 0.2 s or ``max_wait_s``, whichever is shorter.
 
-        Returns at once if none of these attributes is missing, or if one of the missing ones has failed.
+        Returns at once if all attributes in ``names`` have values, or if one without a value has failed.
         """
         with self._lock:
             missing, changed = names - self.names, self._changed
@@ -399,5 +399,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    """Return the core of a vehicle, for classes whose constructor gets the vehicle because that of DroneKit does."""
+    """Return the core of a vehicle. Used by classes whose constructors, as in DroneKit, take the vehicle."""
     return vehicle._dk

@@ -237,7 +237,7 @@ def _open(
 async def _with_override_release(
     opened: contextlib.AbstractAsyncContextManager[Connection], overrides: OverrideRelease
 ) -> AsyncIterator[Connection]:
-    """Wrap a connection, so that its last message releases overridden RC channels, however it ends."""
+    """Yield a connection. However the block ends, overridden RC channels are released before it closes."""
     async with opened as connection:
         try:
             yield connection

@@ -174,7 +174,7 @@ class FleetAction:
         return result
 
     def close(self) -> None:
-        """Make the members that execute the action fail and cancel their tasks, because the fleet's block has ended."""
+        """End the action with the fleet's block: members that still execute it fail, and their tasks are cancelled."""
         for member in self._members:
             if member.name not in self._outcomes:
                 self._record_failure(member, ConnectionClosed(f"{self.name}: {FLEET_CLOSED}"))
@@ -278,7 +278,7 @@ class FleetAction:
     def _has_newer_action(self, member: Member) -> bool:
         """Return True if a newer action of the fleet moves the member or has moved it.
 
-        A member may arm during a newer action, unless this action ends the flight.
+        If this action arms its members, only newer actions that end the flight count, such as a landing.
         """
         return any(
             member in action._members and not action._has_failed_or_stopped(member)
@@ -310,10 +310,10 @@ class FleetAction:
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _record_failure(self, member: Member, error: Exception) -> None:
-        """Record that a member failed, and ask the policy what the other members do.
+        """Record that a member failed, and ask the policy for orders to the other members.
 
-        The policy is not asked if the action is a safe one (such as a landing), or if an earlier failure in this action
-        has already led to orders of the policy.
+        The policy is not asked again once it has given orders in this action. It is never asked if the action is a safe
+        one (such as a landing), if the member is released, or after the fleet's block has ended.
         """
         if member.name in self._failed:
             return

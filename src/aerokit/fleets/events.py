@@ -36,9 +36,9 @@ class FleetEvent(Event):
 
 
 class MemberEvent(FleetEvent):
-    """An event of one vehicle, such as ``ModeChanged`` or ``LinkReport``, or of a network, such as ``LinkInterrupted``.
+    """Contains an event of one vehicle (``ModeChanged``, ``LinkReport`` …) or of one network (``LinkInterrupted`` …).
 
-    ``member`` is the name of the vehicle or of the network.
+    ``member`` is the name of this vehicle or network.
     """
 
     event: Event

@@ -228,9 +228,10 @@ def _delays(
     slack_s: float,
     max_delay_s: float,
 ) -> tuple[dict[str, float], Route | None, str]:
-    """Return the delay of each route in seconds, so that no route conflicts with those before it in the sequence.
+    """Find delays (s) by which no route conflicts with a resting path, or with a route before it in the sequence.
 
-    If a delay would exceed the maximum, also return its route, and the name of the vehicle that blocks this route.
+    Return (delays by name, None, ""). If a route needs more than the maximum delay, return (delays of the routes before
+    it, this route, name of the vehicle that blocks it).
     """
     delayed_paths: list[Path] = []
     delays: dict[str, float] = {}

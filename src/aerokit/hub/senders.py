@@ -185,7 +185,7 @@ class IdentityGuard:
         self._routes.exclude_pause(now, paused_s)
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Drop the claims of the first peer without a heartbeat in the last 30 s, and return the peer."""
+        """Return the first peer without a heartbeat in the last 30 s, or None. Its claims to routes are dropped."""
         silent = (peer for peer in peers if now - self._heartbeat_at.get(peer, -math.inf) > PEER_TTL_S)
         return self._routes.evict_idle_peer(silent, now)
 

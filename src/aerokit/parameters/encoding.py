@@ -134,7 +134,7 @@ class _ExactParamValue(ParamValue):
 
 
 def _with_exact_bits(message: _M, exact_type: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
-    """Return the message, or a copy with the exact ``bits`` if encoding the message would give other bits."""
+    """Return the message if ``param_value`` is encoded as ``bits``; otherwise a copy that is encoded so."""
     if _FLOAT.pack(message.param_value) == bits:
         return message
     exact = exact_type(**message.to_dict())

@@ -153,9 +153,9 @@ def replacement_of(name: str) -> str:
 
 
 def resolve_rename(name: str, known: Container[str]) -> Renamed | None:
-    """Find the name of parameter ``name`` on a vehicle whose parameters have the ``known`` names.
+    """Find the other name under which a vehicle has parameter ``name``. ``known`` are the names of its parameters.
 
-    Returns None if ``name`` itself is known, or if no other name of the parameter is known.
+    Returns None if the vehicle has the parameter under ``name`` itself, or under no name.
     """
     if name in known:
         return None

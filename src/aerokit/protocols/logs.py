@@ -167,7 +167,7 @@ class LogDownload(Transfer[int]):
         self._set_deadline()
 
     def _request_gaps(self, now: float) -> None:
-        """After the end of a range, request its long gaps one after the other, then all other missing blocks."""
+        """Request what a streamed range left out: each long gap as a range, one at a time, then single blocks."""
         if self._may_have_long_gaps:
             gap = self._first_long_gap()
             if gap is not None:

@@ -189,7 +189,8 @@ class Page:
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
         """Add imports of the names in an expression, for type checkers only unless ``at_run_time`` is True.
 
-        If one of ``modules`` imports a name itself, its import is copied. Others come from the first module.
+        If one of ``modules`` imports a name, the name is imported from the same place as there. Any other name is
+        imported from the first of the modules.
         """
         if node is None:
             return

@@ -60,7 +60,7 @@ class ThreadFuture(Generic[T]):
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:
-        """Return the error and forget it, because its traceback refers to this object: a reference cycle."""
+        """Return the error and clear it, because its traceback refers to this object (a reference cycle)."""
         error, self._error = self._error, None
         return error
 

@@ -441,9 +441,9 @@ class Connection(ConnectionTwin):
     ) -> Subscription[ItemT]:
         """Return a subscription to these messages or events of one system (0: of all), to use in a ``with`` block.
 
-        At most ``capacity`` unread items are kept, of all types together; by default only the newest. ``overflow`` says
-        what happens to a further item: ``"drop_oldest"`` or ``"drop_newest"`` drops an item, ``"error"`` ends the
-        subscription with an error, see :class:`Subscription`.
+        At most ``capacity`` unread items are kept, of all types together; by default only the newest. When a further
+        item arrives, ``overflow="drop_oldest"`` drops the oldest unread item, ``"drop_newest"`` the new one, and
+        ``"error"`` ends the subscription with an error, see :class:`Subscription`.
 
         Raises:
             InvalidArgument: no type is given, or the dialect does not have a given type.

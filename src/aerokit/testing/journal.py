@@ -41,7 +41,7 @@ class ReceivedMessage:
 class Journal:
     """Status texts that a vehicle sent, and messages that it received, from the oldest to the newest.
 
-    The journal grows while the vehicle runs. Assertions raise AssertionError.
+    The journal grows while the vehicle runs. The ``assert_…`` methods raise AssertionError.
     """
 
     def __init__(self) -> None:

@@ -294,8 +294,8 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         """Return True if datagrams of a sender other than the present peer may be delivered.
 
-        The host must be allowed. Besides, the present peer must be silent, or the sender must be another port of its
-        host. The latter is for receivers that keep peers only: they check the frames before they call `keep_peer`.
+        The sender's host must be allowed. The present peer must be silent, unless the sender is another port of its
+        host, and the receiver keeps peers: such a receiver checks the frames before it calls `keep_peer`.
         """
         host, *_ = source
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host

@@ -55,8 +55,8 @@ class FlightWatch:
 
     ``crash`` is strict: a flying vehicle must not count as crashed, because the page offers to stop the motors of a
     crashed vehicle. A vehicle has crashed if ``ImpactDetector`` reports an impact, after which the vehicle does not
-    move. In addition, one of these must be true: the vehicle is disarmed, it reports that it is on the ground, or it
-    stopped near the altitude of home faster than motors can stop it.
+    move. In addition, one of these must be true: the vehicle is disarmed; it reports that it is on the ground; it is
+    near the altitude of home, and the impact stopped it more abruptly than its motors could.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -227,7 +227,7 @@ class FlightWatch:
 
     @property
     def _has_climbed(self) -> bool:
-        """True if the vehicle has climbed since it reported, after a crash, that it took off."""
+        """True if the crashed vehicle has reported a take-off, and has climbed by CLIMBED_M since that report."""
         height_m = height_above_home(self._vehicle.telemetry)
         if height_m is None or self._take_off_height_m is None:
             return False

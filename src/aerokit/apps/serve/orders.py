@@ -449,7 +449,7 @@ class OrderRunner:
             raise
         except Exception as error:
             problem = record.fail(error)
-            record.replaced_by = self._replacing(record, error)
+            record.replaced_by = self._replaced_by(record, error)
             if problem["status"] == 500:
                 logger.exception("order %s to vehicle %d failed", record.order, record.system_id)
         finally:
@@ -467,8 +467,8 @@ class OrderRunner:
         record.ended.set()
         self._publish(record)
 
-    def _replacing(self, record: OrderRecord, error: Exception) -> str | None:
-        """If later motion orders have superseded this order, return the key of the newest of them; else None."""
+    def _replaced_by(self, record: OrderRecord, error: Exception) -> str | None:
+        """If ``error`` says that newer motion orders replaced this one, return the key of the newest; else None."""
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
         newest_key = None

@@ -97,7 +97,7 @@ class Copies:
 
     @property
     def was_admitted(self) -> bool:
-        """True if the signature of an earlier copy of the last checked frame was valid, or needed no check."""
+        """True if the last checked frame, or another copy of it, has passed the signature check (see `admit`)."""
         return self._current is not None and self._current.is_admitted
 
     def arrived_over(self, link: int) -> bool:
@@ -181,8 +181,9 @@ class MergedStreams:
     def was_accepted(self, frame: Frame, link: int, *, may_prove: bool) -> bool:
         """Return True if this frame is a copy of a frame that was accepted over another link.
 
-        A copy also shows that its link works, and counts as evidence that both links lead to one vehicle. It is no such
-        evidence if ``may_prove`` is False: a second sender with the same ids has sent the frame.
+        If so, the call records that the frame's link works. A copy that has passed the signature check, and contains
+        the time since boot, also counts as evidence that its links lead to one vehicle. It does not count if
+        ``may_prove`` is False, because a second sender with the same ids has then sent it.
         """
         if not self.copies.is_copy(frame, link, may_prove=may_prove):
             return False
@@ -198,9 +199,10 @@ class MergedStreams:
         return True
 
     def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
-        """Count a frame as evidence that its links lead to one vehicle, if the link in use is among them.
+        """Count the copies of a frame as evidence that the links that delivered them lead to one vehicle.
 
-        ``link`` brought the last copy. A frame without a copy over the link in use may come from another vehicle.
+        ``link`` delivered the last copy. If the link in use delivered none, nothing is counted, because the frame may
+        come from another vehicle.
         """
         used = choice.used
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
@@ -227,7 +229,7 @@ class MergedStreams:
         # A late frame that equals an accepted one is probably a delayed copy.
         if self.copies.is_late and not _may_be_different_frame(frame, link, choice):
             return False
-        if link != choice.used.link and not _is_accepted_from_unused(frame, candidate, choice, stream):
+        if link != choice.used.link and not _accepts_over_unused_link(frame, candidate, choice, stream):
             return False
         is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
         if is_after_change and frame.message_id in ACKNOWLEDGEMENTS:
@@ -253,8 +255,8 @@ class MergedStreams:
         return stream
 
 
-def _is_accepted_from_unused(frame: Frame, candidate: Candidate | None, choice: LinkChoice, stream: _Stream) -> bool:
-    """Return True if a frame is accepted although it arrived over another link than the link in use."""
+def _accepts_over_unused_link(frame: Frame, candidate: Candidate | None, choice: LinkChoice, stream: _Stream) -> bool:
+    """Return True if a frame that arrived over ``candidate``, a link that is not in use, is to be accepted."""
     if candidate is None or choice.used is None:
         return False
     is_answer = frame.message_id in ANSWERS

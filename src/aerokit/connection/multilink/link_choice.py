@@ -314,7 +314,7 @@ class LinkChoice:
             self._better = None
         elif best is not self._better:
             self._better, self._better_since = best, now
-        elif now - self._better_since >= MIN_BETTER_S and not self._must_wait(used, now):
+        elif now - self._better_since >= MIN_BETTER_S and not self._must_delay_switch(used, now):
             return self._change(best, "cheaper" if best.is_costly < used.is_costly else "better", now)
         return None
 
@@ -352,8 +352,11 @@ class LinkChoice:
         if self.hardware is None or is_from_same_link or not self.hardware.contradicts(hardware):
             self.hardware, self._hardware_link = hardware, used.link
 
-    def _must_wait(self, used: Candidate, now: float) -> bool:
-        """Return True while a command over a faster link could overtake an earlier one (at most MAX_SWITCH_DELAY_S)."""
+    def _must_delay_switch(self, used: Candidate, now: float) -> bool:
+        """Return True while the last command, sent over ``used``, could be overtaken by one over the better link.
+
+        The switch is delayed by at most MAX_SWITCH_DELAY_S.
+        """
         transit_s = (used.round_trip_s or 0.0) + JITTER_S
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S

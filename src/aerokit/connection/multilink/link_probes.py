@@ -105,7 +105,7 @@ class LinkProbes:
     def is_answer(self, frame: Frame, link: int) -> bool:
         """Return True if this TIMESYNC answers one of our probes, whichever link the probe was sent over.
 
-        If the autopilot has answered over that same link, record the answer.
+        An answer of the autopilot is recorded if it arrived over the link of its probe.
         """
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.

@@ -205,12 +205,15 @@ class MultiLinkRoutes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers that get a message for this component.
 
-        The message is sent over the link in use for its system or, if that has no route to the component, over a usable
-        link that has one. Without a link in use, every peer gets it. No peer gets it if the link in use leads to
-        another vehicle with the same id, and no other link works: the effect is that of a lost link. A broadcast
-        reaches each known system, mostly only once, and is also sent over links without a known system; broadcasts of
-        heartbeats and time go to all peers of all links. ``message`` is None for raw frames, which count as commands.
-        The call may change the link in use, and records the time of commands.
+        ``message`` is None for a raw frame, which counts as a command. The call records the time of a command. It may
+        also change the link in use.
+
+        - A message for one system is sent over the link in use or, if that has no route to the component, over a usable
+          link that has one. If no link is in use yet, every peer gets the message.
+        - No peer gets it if the link in use leads to another vehicle with the same id, and no other link works. The
+          effect is that of a lost link.
+        - A broadcast reaches each known system, mostly only once, and is also sent over links without a known system.
+        - A broadcast of a heartbeat or of the time is sent to all peers of all links.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
@@ -233,7 +236,8 @@ class MultiLinkRoutes:
         """Return True if this frame was already accepted over another link, or has our own ids.
 
         PX4 forwards our heartbeats from one of its ports to its other ports. Another program with our ids is ignored,
-        too. What a copy proves about its link is recorded. ``is_other_peer`` is the result of `arrived_on_other_peer`.
+        too. ``is_other_peer`` is the result of `arrived_on_other_peer`. If it is False, a copy of a heartbeat or of a
+        hardware id is recorded for the link over which it arrived.
         """
         if (frame.system_id, frame.component_id) == self._own_source:
             return True

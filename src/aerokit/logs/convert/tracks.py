@@ -75,7 +75,7 @@ class _TrackWriter:
         self._path.write_text(self._text(), encoding="utf-8")
 
     def _record_mission(self, record: LogRecord) -> None:
-        """Record a mission for the sender and the receiver, because only the end of the log shows all vehicles."""
+        """Store a mission for its sender and its receiver; which of them is a vehicle may be known only later."""
         message: Any = record.message
         for system_id in {record.system_id, message.target_system}:
             if system_id not in self._missions:

@@ -170,7 +170,7 @@ class _Tables:
         return time_us
 
     def _rows_at(self, index: int) -> Iterator[tuple[int, int]]:
-        """Yield the offset and the time in microseconds of the row with this index of each table that has it."""
+        """For each table that has a row ``index``, yield the offset of this row and its time in microseconds."""
         reader = self._reader
         for number in reader.name_to_id.values():
             offsets, row_format = reader.offsets[number], reader.formats[number]

@@ -195,7 +195,7 @@ class _Reader:
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return all instances of the first of these topics that the log has, each with its number."""
+        """Return the instances of one topic, the first of ``names`` that the log has, as (number, topic)."""
         for name in names:
             instances = [data for data in self._data if data.name == name]
             if instances:

@@ -131,7 +131,7 @@ class LinkCounter:
 
 
 def is_real_time(speed: float) -> bool:
-    """Return True if this speed of the vehicle's clock is that of a real vehicle, or of a simulation in real time."""
+    """Return True if ``speed`` is about 1. It is the speed of the vehicle's clock relative to the recording's."""
     return abs(math.log(speed)) <= _MAX_CLOCK_DRIFT
 
 

@@ -141,7 +141,7 @@ def time_in_modes(flight: FlightLog) -> dict[str, float]:
 
 
 class _ArmedSpans:
-    """Selects the rows of time series in which the vehicle was armed, or all rows if it was never armed."""
+    """Selects the rows of time series logged while the vehicle was armed, or all rows if it was never armed."""
 
     def __init__(self, flight: FlightLog) -> None:
         self._spans = flight.armed or [(-math.inf, math.inf)]
@@ -268,7 +268,7 @@ class _DescentValues(Snapshot):
 
     @property
     def is_low(self) -> bool:
-        """True if the median in the descent is less than half of the median before it."""
+        """True if the median during the descent is less than half of the median just before the descent."""
         return self.median < _LOW_POWER_SHARE * self.before
 
     def text(self, unit: str) -> str:

@@ -190,10 +190,10 @@ class RunningCommands:
 
     Sends IN_PROGRESS while they run, and handles COMMAND_CANCEL.
 
-    A repeated transmission (COMMAND_LONG with a confirmation) does not execute a command twice, except one that stops:
-    it is answered by IN_PROGRESS, or by the result if the command ended at most five seconds ago. Another command with
-    the same MAV_CMD is TEMPORARILY_REJECTED while the first command runs, unless it stops the first one. So is any new
-    command while ``MAX_RUNNING_COMMANDS`` run.
+    A repeated transmission (COMMAND_LONG with a confirmation) does not execute its command again. The answer is
+    IN_PROGRESS while the command runs, and its result for five seconds after the end. Only a stop command is executed
+    again after its end. While a command runs, another one with the same MAV_CMD is TEMPORARILY_REJECTED, unless it
+    stops the first one. New commands are also rejected in this way while ``MAX_RUNNING_COMMANDS`` run.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:

@@ -75,7 +75,7 @@ class _Mode(ArduPilotMode):
         return 0.0 if abs(share) < _DEADZONE else share
 
     def horizontal_velocity_from_sticks(self) -> tuple[float, float]:
-        """Turn as the yaw stick commands, and return the velocity north and east (m/s) that the sticks command."""
+        """Turn by the yaw stick; return the velocity north and east (m/s) by the forward and lateral sticks."""
         motion = self.vehicle.motion
         motion.turn(self.stick(RC_YAW) * _FULL_STICK_TURN_RAD_S)
         forward = self.stick(SUB_FORWARD) * _FULL_STICK_M_S

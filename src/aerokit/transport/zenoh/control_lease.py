@@ -407,10 +407,10 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if a datagram is to be delivered. False if it is late, or not from the tracked vehicle side.
+        """Return True if a datagram is to be delivered: it is not late, and the tracked vehicle side sent it.
 
-        ``epoch`` identifies the vehicle side that sent it, ``sent_s`` is the time of sending on the clock of that side.
-        A vehicle side is a program that serves the vehicle to clients.
+        A vehicle side is a program that serves the vehicle to clients. A client tracks one of them. ``epoch``
+        identifies the one that sent the datagram; ``sent_s`` is the time of sending on its clock.
         """
         if epoch != self.epoch:
             self.foreign += 1

@@ -295,7 +295,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         cleanup.enter_context(run.session.streaming("rc_channels"))
 
         async def wait_channels() -> None:
-            """Wait for a new message, because the positions of the sticks in the last one may be old."""
+            """Wait for an RC_CHANNELS that arrives after this call. Stick positions received before may be outdated."""
             previous_update = channels.updated_at
             await run.wait(
                 lambda: channels.updated_at > previous_update,

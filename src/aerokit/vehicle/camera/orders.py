@@ -183,10 +183,10 @@ class CameraOrders:
         self._session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
 
     async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
-        """At the end of a block, send its stop command at once, and retry it in the background as :meth:`command` does.
+        """End the operation of a block: send its stop command at once, and repeat it as :meth:`command` does.
 
-        Does nothing if a newer order was given. With ``is_awaited``, raises as :meth:`command`; otherwise a failure is
-        logged as a warning.
+        Does nothing if a newer order was given. The repetitions are sent by a background task. With ``is_awaited``,
+        waits for this task and raises as :meth:`command`; otherwise the task logs a failure as a warning.
         """
         if not order.is_newest or self._session.is_closed:
             return

@@ -309,8 +309,8 @@ class CommandArbiter:
     def is_flown_by_program(self) -> bool:
         """True while the vehicle is armed and executes orders of this program.
 
-        This is so if the program armed the vehicle, or has given a steering order since another party armed it; and if
-        neither a takeover nor a failsafe has followed.
+        For this, the program must have armed the vehicle, or have given a steering order since another party armed it.
+        After that, there must have been no takeover and no failsafe.
         """
         order = self.current
         if order is None or order.takeover_reason or order.failsafe:
@@ -335,8 +335,8 @@ class CommandArbiter:
     def may_be_executing(self) -> bool:
         """True while the vehicle may still execute an order of the program.
 
-        Becomes False when the vehicle disarms. A takeover also makes it False, unless the program has ordered to arm
-        since the vehicle was last disarmed, which a takeover does not undo.
+        Becomes False when the vehicle disarms. A takeover makes it False only if the program has given no order to arm
+        since the vehicle was last disarmed, because a takeover does not undo such an order.
         """
         order, topics = self.newest, self._ordered_since_disarmed
         # After an order without modes, such as a raw command, a mode change does not prove a takeover. If a posted
@@ -357,7 +357,7 @@ class CommandArbiter:
         return is_in_doubt or bool(self._late_modes())
 
     def settle_mode(self) -> None:
-        """Record that the mode that was ordered last is reported, so that the modes of earlier orders cannot follow."""
+        """Record that the vehicle reports the mode ordered last. Modes of earlier orders are no longer expected."""
         self.mode_settles_at = -math.inf
         self._unreported_modes.clear()
 
@@ -448,7 +448,7 @@ class CommandArbiter:
             self._unreported_modes.extend((now, mode) for mode in order.modes if mode != present_mode)
 
     def _late_modes(self) -> tuple[Mode, ...]:
-        """Return the modes of orders that were replaced or left so shortly ago that HEARTBEAT may report them now."""
+        """Return modes that HEARTBEAT may still report, because recently replaced or left orders requested them."""
         since = self._now() - MODE_GRACE_S
         return tuple(mode for at, mode in self._unreported_modes if at > since)
 

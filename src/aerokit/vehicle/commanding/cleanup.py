@@ -321,7 +321,7 @@ class ArmCleanup:
 
     @contextmanager
     def arming(self, order: Order, was_armed: bool) -> Iterator[None]:
-        """Register the order that a call awaits, so that `finish` watches it if the vehicle's block ends meanwhile."""
+        """Register an awaited arm order. If the vehicle's block ends meanwhile, `finish` treats it as cancelled."""
         self._awaited = order, was_armed
         try:
             yield

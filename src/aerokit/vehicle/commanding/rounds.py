@@ -264,7 +264,7 @@ class RoundFlight:
     async def _stream(self, flight: PathFlight, order: Order) -> None:
         """Stream the set-points of the flight until the vehicle, which lags behind them, has flown the rounds.
 
-        A count that is too low by at most ``LAG_ROUNDS`` suffices.
+        The last ``LAG_ROUNDS``, a small part of a round, need not be flown.
         """
         stream = Guided(self._context).trajectory(
             flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S

@@ -348,10 +348,10 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
 
 
 def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
-    """Return those of ``logs`` that a newer list still has.
+    """Return the entries of ``listed``, a newer list, whose logs are also in ``logs``.
 
-    Logs are identified by time and size, because a new log may get the id of an erased one. The newest may still be
-    written, so it is also the same log if it has its id and has grown.
+    Logs are compared by time and size, because a new log may get the id of an erased one. Only the newest of ``logs``
+    may have grown since: it is found by its id, unless the entry with this id shows a different log.
     """
     newest = logs[-1]
     kinds = {(entry.time_utc, entry.size) for entry in logs}

@@ -192,9 +192,9 @@ class MissionEndDetector:
 
     @property
     def _is_landing(self) -> bool:
-        """True if the last item is a landing or a return, and the vehicle executes it in the mode for it.
+        """True if the mission ends by a landing or a return, and the vehicle is in a mode for it at the last item.
 
-        If the items are unknown, `_ends_by_landing_or_return` decides from the completion and the mode.
+        If the items are unknown, the number of the current item does not matter.
         """
         current, last = self._tracker.current.latest, self._tracker.last_item
         is_at_end = (current is not None and current == last) or not self._are_items_known

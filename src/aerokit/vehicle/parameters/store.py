@@ -78,7 +78,7 @@ class ParameterStore:
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
     def unmark_replaced(self, name: str) -> None:
-        """Accept messages with the old value given to `mark_replaced` again, because a new write may set this value."""
+        """End the effect of `mark_replaced` on a parameter, because a new write may set its previous value again."""
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:

@@ -330,7 +330,7 @@ class ParameterWriter:
         return plans, errors
 
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
-        """Return the result of one write, with the name and the unit in which the program requested it."""
+        """Return the result of one write, with the name and the unit of the request. The vehicle may use others."""
         name, requested = plan.resolved.requested, plan.requested
         answer = answers[plan.to_send.name]
         outcome = outcome_of(plan.to_send, plan.old, answer)

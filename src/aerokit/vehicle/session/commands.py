@@ -271,8 +271,8 @@ class CommandSender:
     def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
         """Record acks that may still arrive, so that the next command with this key ignores them.
 
-        ``count`` is the number of acks that the last command may still get; they are recorded with the current time.
-        ``earlier_records`` are the times recorded for earlier commands; :meth:`_pop_pending_acks` has returned them.
+        The last command may still get ``count`` acks, which are recorded with the current time. ``earlier_records``,
+        the result of :meth:`_pop_pending_acks`, are the times of acks of earlier commands; they are recorded again.
         """
         new_records = [self._connection.now()] * count
         if earlier_records or new_records:

@@ -91,7 +91,7 @@ class _Stream:
 
     @property
     def is_due(self) -> bool:
-        """True if the needed rate must be requested, because it is not the one last requested."""
+        """True if a request is due: the needed rate differs from the rate that was requested last."""
         return self.requested_hz != self.needed_hz
 
     def achieved_hz(self) -> float:

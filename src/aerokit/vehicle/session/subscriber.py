@@ -150,7 +150,7 @@ class ComponentSubscriber:
         return cell
 
     def _of_component(self, sink: Callable[..., object]) -> Sink:
-        """Return a sink that passes only messages of this component, and events about it or the whole system."""
+        """Return a sink that drops messages of other components and events about them, and passes all else on."""
 
         def filtered(item: Any) -> None:
             frame = getattr(item, "received_frame", None)
