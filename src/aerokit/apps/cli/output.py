@@ -274,7 +274,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def _requirement(extra: str) -> str:
-    """Return the argument with which pip adds an extra, from PyPI or from the folder or URL of this installation."""
+    """Return pip's argument to install an extra from where aerokit itself was installed: PyPI, a folder or a URL."""
     from importlib.metadata import PackageNotFoundError, distribution
     from urllib.parse import unquote
 
