@@ -59,7 +59,7 @@ class _SnapshotType(type):
 
 
 def _lazy_init(cls: Any) -> Callable[..., None]:
-    """Return an ``__init__`` that generates and calls the real one, and is replaced by it.
+    """Return a temporary ``__init__``. When it is first called, it generates the class's final ``__init__``.
 
     A program creates values of only a few of these classes, and generating takes time.
     """

@@ -22,9 +22,9 @@ _FAILSAFE_REPORT_DURATION_S = 10.0
 
 
 def active_failsafe(vehicle: Vehicle) -> list[str] | None:
-    """Return the vehicle's newest texts about its active failsafe, the oldest of them first; None if none is active.
+    """Return the vehicle's texts about its active failsafe, oldest first; None if no failsafe is active.
 
-    If no such text was received, the result is one line that says so.
+    Texts from more than ten seconds before the last one are left out. If there is no text, one line says so.
 
     ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which means nothing while the vehicle is disarmed
     (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).

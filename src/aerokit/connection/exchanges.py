@@ -62,7 +62,7 @@ class ExchangeRun(Generic[ResultT]):
             self._after_step()
 
     def on_link_selected(self, system_id: int, event: LinkSelected) -> None:
-        """Inform the exchange that messages to this system now use another link than before."""
+        """Inform the exchange if the link to its system has changed. The first choice of a link is no change."""
         is_first_choice = event.before is None
         if event.system_id == system_id and not is_first_choice:
             self._exchange.link_changed(self._connection.now())

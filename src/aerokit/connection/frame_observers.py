@@ -207,7 +207,7 @@ class FrameObservers:
 
     @property
     def want_all(self) -> bool:
-        """True if the framer must build all received frames, also those without subscribers."""
+        """True if a `Frame` must be created for every received message, even if no subscriber wants the message."""
         return self.recording is not None or bool(self.receive_callbacks)
 
     def add(self, callback: FrameObserver) -> Detach:

@@ -139,8 +139,8 @@ class LoopWatch:
     def _detect_sleep(self) -> bool:
         """Record and report a suspension of the computer since the last call. Return True if there was one.
 
-        Two clocks are compared, one of which stands still in a suspension. Differences of up to `LATE_THRESHOLD_S` are
-        dropped and never added up: on macOS, NTP may adjust only one of the clocks, so they also drift apart slowly.
+        Two clocks are compared, one of which stands still in a suspension. On macOS, NTP may adjust only one of them,
+        so they also drift apart slowly. A difference of up to `LATE_THRESHOLD_S` since the last call is thus ignored.
         """
         # `_suspended` subtracts two clock readings. Its result is too small if the process was preempted between the
         # readings. The true value never decreases, so the largest result so far is used.

@@ -86,10 +86,11 @@ class RouteClaim:
         return self._sequence_matches is not False and self._clock_matches is True
 
     def has_replaced(self, now: float, rate: float) -> bool:
-        """Return True if the claim has continued the owner's stream for long enough, with at least three frames.
+        """Return True if the claim proves that the new peer has replaced the owner.
 
-        The time is long enough if the owner would have sent three frames in it at its ``rate`` (frames per second). A
-        frame of the owner ends the claim.
+        The peer must have sent at least three frames, which must continue the owner's stream. The claim must also have
+        lasted as long as the owner needs for three frames at its ``rate`` (frames per second). A frame of the owner
+        ends the claim.
         """
         return (
             self.continues_owner

@@ -102,7 +102,7 @@ class FlightMethods(VehicleAttributes):
             self._dk.check_link()
 
     def _dk_reports_armed(self, value: bool) -> bool:
-        """Return True if HEARTBEAT reports that the vehicle is armed or, with False, that it is disarmed.
+        """Return True if HEARTBEAT reports this value of ``armed``.
 
         An old report of a disarmed vehicle does not count, because a pilot may have armed it since.
         """

@@ -184,8 +184,8 @@ class HasObservers:
 class MessageListeners(Listeners):
     """Message listeners of a vehicle, called on the listener thread. Imports pymavlink for the first listener.
 
-    Listeners get the messages of all components of the vehicle and of all other systems, such as radios and ground
-    stations, except those of other vehicles.
+    Listeners get the messages of all components of the vehicle, and of other systems that are not vehicles, such as
+    radios and ground stations.
     """
 
     kind = "message"

@@ -254,9 +254,9 @@ def _closest_on_edge(
     difference: Sequence[float],
     other_difference: Sequence[float],
 ) -> tuple[float, float]:
-    """Return the point (s, t) on an edge of the polygon at which the distance between the two legs is smallest.
+    """Return the s and t (see `_closest`) on an edge of the polygon for which the two places are closest to each other.
 
-    ``difference`` and ``other_difference`` are the vectors between the legs at the two corners of the edge.
+    ``difference`` and ``other_difference`` are the vectors between the two places at the two ends of the edge.
     """
     step = _difference(other_difference, difference)
     squared_length = _dot(step, step)

@@ -149,9 +149,9 @@ class Hub:
         """Add an open connection of this program as an endpoint.
 
         The connection continues as before. The other endpoints get every frame that the connection receives or sends.
-        Frames of these endpoints for the connection's vehicles are sent over the connection, signed if the connection
-        signs. Other stations must not use this program's ids (``source_system``, ``source_component``), because frames
-        for these ids go to the program.
+        Frames that they send to a vehicle of the connection go over the connection, signed if the connection signs.
+        Other stations must not use the connection's own ids (``source_system``, ``source_component``), because frames
+        that are addressed to these ids go to this program.
 
         Raises:
             InvalidArgument: an endpoint has this name, or this hub shares the connection already.

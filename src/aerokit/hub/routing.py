@@ -296,9 +296,10 @@ class Router(Generic[PortT]):
     def _is_copy(self, earlier: tuple[int, int, float], number: int, now: float, is_late: bool) -> bool:
         """Return True if a frame with the same bytes as an earlier frame is a copy.
 
-        It may instead be the first command of a restarted program, which numbers its frames from the start again. It is
-        therefore not a copy if it arrives too late, in sequence at the same port, at a port that is newer than the
-        earlier frame, or after the earlier frame's port was removed.
+        It may instead be the first command of a restarted program, which numbers its frames from the start again. At
+        the port of the earlier frame, only a late frame (out of sequence) is a copy. At another port, the frame is a
+        copy if that port existed when the earlier frame arrived, and the earlier frame's port still exists. In both
+        cases, the earlier frame must be recent.
         """
         first_port, port_count, received_at = earlier
         if first_port == number:

@@ -50,7 +50,7 @@ def timestamp_at(unix_time_s: float) -> int:
 
 
 def is_signed_with_a_key(frame: Frame) -> bool:
-    """Return True unless a frame is unsigned, or signed with a key of zeros, as by a PX4 without a key."""
+    """Return True if a frame is signed with a real key. While PX4 has no key, it signs with zeros."""
     raw = frame.raw
     return bool(frame.incompat_flags & SIGNED) and (
         sha256(_NO_KEY + raw[:-_HASH_LENGTH]).digest()[:_HASH_LENGTH] != raw[-_HASH_LENGTH:]

@@ -81,8 +81,8 @@ def format_waypoints(mission: Mission, *, version: int = 110) -> str:
     """Format a mission as a ``QGC WPL`` file. Numbers have as many decimal places as in Mission Planner, or more.
 
     Values that are not given (NaN) become 0, because Mission Planner rejects a file that contains NaN
-    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 then turns to the north, because it takes 0 for a given
-    heading; use a .plan file for PX4, because it keeps NaN (as null).
+    (https://github.com/ArduPilot/pymavlink/issues/1096). PX4 then turns to the north, because a heading of 0 means
+    north; use a .plan file for PX4, because it keeps NaN (as null).
 
     Raises:
         InvalidArgument: ``mission`` is no mission, a number is infinite, the altitude of a place is NaN, or the version

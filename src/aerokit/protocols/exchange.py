@@ -245,7 +245,7 @@ _MAX_RANGES = 10
 
 
 def is_addressed_to(message: Any, system_id: int, component_id: int) -> bool:
-    """Return True if a message's target is this component, or 0 (all), which old firmware sends."""
+    """Return True if a message is for this component, or for all (target 0), as messages of old firmware are."""
     return message.target_system in (0, system_id) and message.target_component in (0, component_id)
 
 

@@ -225,7 +225,7 @@ class SetCurrentItem(Transfer[None]):
         self._send(now)
 
     def receive(self, message: Message, now: float) -> None:
-        """Finish if MISSION_CURRENT reports our item, or if its change shows that the vehicle has passed our item."""
+        """Finish if MISSION_CURRENT reports our item, or changes to a later item because ours was passed."""
         if not isinstance(message, MissionCurrent) or not self._is_from_target(message):
             return
         if message.seq == self._seq or self._has_passed(message.seq):

@@ -479,11 +479,12 @@ class Selection(SelectionTwin["AsyncSelection"]):
         Args:
             condition: function of a member; it is called four times a second and when the member's state changes, until
                 it is true for this member.
-            timeout: seconds until the condition has been true for all members.
+            timeout: the longest time in seconds to wait for all members together.
             description: name of the barrier in errors.
 
         Raises:
-            FleetError: the condition was not true for a member in time, and the fleet's policy was applied.
+            FleetError: the time has expired before the condition was true for every member. The fleet's policy for
+                failed members was applied.
         """
         return self._loop.run(self.aio.barrier, condition, timeout=timeout, description=description)
 

@@ -1639,9 +1639,9 @@ class Logs(TwinOf["AsyncLogs"]):
     total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
     it. You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
-    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
-    a log is larger than its entry says, logger "aerokit" reports that (INFO).
+    ArduPilot answers LOG_* messages only while disarmed. When it is asked for a log by them, it ends the log that it is
+    writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current
+    end. If such a log is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def list(self, *, idle_timeout_s: float = IDLE_TIMEOUT_S, timeout: float | None = None) -> tuple[LogEntry, ...]:
@@ -4204,7 +4204,7 @@ class Vehicle(VehicleTwin):
         self._loop.call(self.aio.send, message)
 
     def note_sent(self, message: Message) -> None:
-        """Register a message that the program sent by ``connection.send``, as if it had called :meth:`send`."""
+        """Treat a message that the program sent by ``connection.send`` as if :meth:`send` had sent it."""
         self._loop.call(self.aio.note_sent, message)
 
     def posted(
@@ -4218,11 +4218,11 @@ class Vehicle(VehicleTwin):
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
         or their effect is reported. The retries also end in these cases:
 
-        - A newer order is about the first subject of this order, perhaps among other subjects.
-        - The vehicle changes to a mode to which neither this order nor another order of the last ten seconds leads,
-          unless this order disarms.
-        - A failsafe becomes active, unless this order lands, returns or disarms.
-        - The vehicle reboots; or it disarms, and the first subject is motion.
+        - A newer order is given whose subjects include the first subject of this order.
+        - The mode changes to one that this program has not ordered, by this order or in the ten seconds before it. An
+          order to disarm is still retried.
+        - A failsafe becomes active. An order to land, to return or to disarm is still retried.
+        - The vehicle reboots or, if the first subject is ``"motion"``, disarms.
 
         If you leave the block early, aerokit neither makes the vehicle hold nor disarms it if it arms later. Use the
         actions for that.
@@ -4230,7 +4230,7 @@ class Vehicle(VehicleTwin):
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first one is mode or motion, the order also ends the
                 action in progress.
-            modes: the modes that the order leads to.
+            modes: the modes that the vehicle may change to because of the order.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
         Raises:
@@ -4506,13 +4506,15 @@ class Vehicle(VehicleTwin):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
-        command is sent again. In all other cases the command is sent only once, because a repetition might arm a
-        vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
-        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open, and
-        disarms it if this command arms it after all. Arming is attributed to this command if the vehicle accepts the
-        command, or if the next HEARTBEAT reports armed and no pilot has taken over. If another party has armed the
-        vehicle, it stays armed. Logger "aerokit" warns about the outcome.
+        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If it refuses there, the mode is changed
+        and the command is sent a second time. Otherwise the command is sent only once, because a repetition might arm a
+        vehicle that a pilot has just disarmed.
+
+        After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
+        therefore monitors the vehicle for 15 seconds, as long as the connection is open, and disarms it if this command
+        arms it after all. A vehicle that another party has armed stays armed. aerokit assumes that this command has
+        armed the vehicle if the vehicle accepts the command, or if HEARTBEAT reports armed right after the command and
+        no pilot has taken over. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which

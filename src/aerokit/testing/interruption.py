@@ -33,7 +33,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def allowed(self) -> Iterator[None]:
-        """Allow interruptions in this block, if the block runs on the main thread and SIGINT has no other handler."""
+        """Allow interruptions in this block, but only on the main thread, and only if `_is_sigint_available`."""
         if threading.current_thread() is not threading.main_thread() or not _is_sigint_available():
             yield
             return

@@ -191,7 +191,7 @@ class _Parser:
         return "", text
 
     def parse_with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
-        """Parse the part after a known scheme, which may be an alias of a link's kind, e.g. ``file`` of replay."""
+        """Parse the part after a known scheme. `_SCHEMES` maps the scheme to the kind of link."""
         kind = _SCHEMES[scheme]
         target, _, query = after_scheme.partition("?")
         options = self.parse_options(kind, query)

@@ -207,7 +207,7 @@ class _SerialProtocol(asyncio.Protocol):
 
 
 def _replace_port_methods(port: Any, on_failure: _OnFailure) -> None:
-    """Replace methods of a port, so that they never block, and report a lost device to ``on_failure``."""
+    """Replace methods of a port by ones that never block, and that call ``on_failure`` if the device is lost."""
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), on_failure)

@@ -165,8 +165,8 @@ _CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))
 def plain_text(error: BaseException) -> str:
     """Return the text of an error, in which the name of the call that raised it is replaced by words for users.
 
-    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Reasons
-    that only announce a mission item, such as ``Mission: 3 WP``, are left out.
+    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. If the
+    error lists reasons, those that only announce a mission item, such as ``Mission: 3 WP``, are left out.
     """
     text = _MISSION_REASON.sub("", str(error))
     call = _CALL.match(text)
@@ -274,7 +274,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def _requirement(extra: str) -> str:
-    """Return the argument with which pip adds an extra, from PyPI or from the folder or URL of this installation."""
+    """Return pip's argument to install an extra from where aerokit itself was installed: PyPI, a folder or a URL."""
     from importlib.metadata import PackageNotFoundError, distribution
     from urllib.parse import unquote
 

@@ -318,7 +318,7 @@ class FlightReport:
                 await asyncio.wait(tasks)  # asyncio itself logs the error of a task that has failed
 
     def record_impact(self) -> None:
-        """Record for the summary how long the vehicle was armed until it hit the ground."""
+        """Record an impact on the ground for the summary: the seconds for which the vehicle had been armed by then."""
         if self._impact_s is None and self._armed_at is not None:
             # The impact is detected only later, because the vehicle must first lie still for some time.
             impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at

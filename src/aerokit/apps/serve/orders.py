@@ -82,7 +82,7 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Check that no argument is unknown or missing, and that bools are given exactly for the boolean arguments.
+        """Check that no argument is unknown or missing. A boolean argument must be a bool, and no other may be one.
 
         Ranges and all other types are checked later, by the method that the order calls.
 

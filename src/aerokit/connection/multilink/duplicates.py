@@ -274,7 +274,8 @@ def _accepts_over_unused_link(frame: Frame, candidate: Candidate | None, choice:
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:
     """Return True if a frame may be new, although it equals a frame that was accepted earlier.
 
-    Heartbeats of separate streams can be equal: True for one over the link in use if no other link has the same stream.
+    Only a heartbeat over the link in use may be new. If another link carries the same frames as this link, the
+    heartbeat is a copy. If not, each link has its own stream of heartbeats, and two of them can be equal by chance.
     """
     used = choice.used
     if used is None or used.link != link or frame.message_id != m.Heartbeat.ID:

@@ -38,10 +38,10 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 
 
 class LinkProbes:
-    """Probes each link to a system twice a second, an idle costly link every five seconds.
+    """Probes each link to a system twice a second, or every five seconds if the link is costly and not in use.
 
-    Answers are recorded in ``choices``. A second vehicle under the same system id is reported once, and again only
-    after the link has led back to the known vehicle. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. If a link leads to a second vehicle with the same system id, this is reported
+    once, and again only if the link has led to the known vehicle in between. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(

@@ -63,7 +63,7 @@ class VehicleClock:
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample is as expected from the last one and the clock's rate; None if this is unknown."""
+        """Return True if a sample agrees with the last sample and the clock's rate; None while the rate is unknown."""
         rate = self._rate
         if rate is None:
             return None

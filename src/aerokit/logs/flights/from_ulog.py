@@ -403,7 +403,7 @@ class _Reader:
 
 
 def _drop_damaged_rows(topics: list[Any]) -> int:
-    """Drop the rows of topics whose time is impossible, as those of a ``.bin``. Return their number.
+    """Drop the rows whose time is impossible, and the topics that are then empty. Return the number of these rows.
 
     Rows have no checksum. The time of a row is impossible if it is far from those of both neighbours, or later than the
     whole log.

@@ -138,7 +138,7 @@ def is_real_time(speed: float) -> bool:
 def use_simulated_time(flight: FlightLog, speed: float) -> None:
     """Convert all times of a recording to the vehicle's seconds, if the vehicle is a simulation at another speed.
 
-    Recorded speeds and turn rates refer to the vehicle's seconds, so they fit the converted times only.
+    Speeds and turn rates stay as recorded, because the vehicle itself reports them per second of its own time.
     """
     if is_real_time(speed):
         return

@@ -73,7 +73,7 @@ class AccelerometerCalibration:
         self._request(self._run_number, result)
 
     def _request(self, run_number: int, position: int) -> None:
-        """Send this AccelcalVehiclePos every second until it is confirmed, or the calibration is reset or restarted."""
+        """Send this position or result every second, until it is confirmed or the calibration is reset or restarted."""
         self._requested = position
 
         def request_until_confirmed() -> None:

@@ -284,10 +284,10 @@ class MissionRun:
             self._running_do = None
 
     def _start_next_navigation(self, start: int = 0) -> bool:
-        """Start the next navigation command, and the first "do" command that is found before it.
+        """Start the next navigation command. If "do" commands precede it, also start the first of them.
 
-        The search begins at the index ``start``; 0: after the current navigation command. Return False if it finds no
-        navigation command.
+        The search begins at the index ``start`` or, if that is 0, after the current navigation command. Return False if
+        it finds no navigation command.
         """
         index_after_current = self.nav_index + 1 if self.nav_index else _FIRST
         index = start or index_after_current

@@ -196,7 +196,7 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         return self.vehicle.mode.number == PlaneMode.TAKEOFF and self.vehicle.mode.is_taking_off
 
     def _resume_pending(self) -> None:
-        """Start a postponed long failsafe after the take-off, or discard it if TAKEOFF was left."""
+        """After a take-off, start the long failsafe that was postponed until then; if TAKEOFF was left, drop it."""
         if self._is_long_pending and not self._is_in_take_off:
             self._is_long_pending = False
             if self.vehicle.mode.number == PlaneMode.TAKEOFF:

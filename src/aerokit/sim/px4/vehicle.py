@@ -319,7 +319,7 @@ class Px4PlaneMission(Px4Mission):
         return is_near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
-        """Change to HOLD after the mission, but keep the position that the vehicle flies to."""
+        """Change to HOLD after the mission, but fly on to the present target instead of holding here."""
         target = self._plane.flight.target
         super()._hold()
         if self._plane.mode == modes.HOLD:

@@ -202,8 +202,8 @@ class ClientFilter:
     def refuse_late(self, data: bytes, now: float) -> list[RefusalNotice]:
         """Refuse the frames of a datagram that arrived too late. Return the notices for the client.
 
-        The notices contain no rejection such as a COMMAND_ACK. If the client has sent its command again, it would take
-        this for the rejection of the new command.
+        The notices contain no answer to the late command, such as a COMMAND_ACK. A client that has meanwhile sent the
+        command again would process it as the answer to the new command.
         """
         notices: list[RefusalNotice] = []
         for frame in _framer().receive(data, now):

@@ -71,7 +71,10 @@ class Shutter:
         return None
 
     async def take_photo(self, timeout: float) -> Capture:
-        """Take one photo and return its capture, which is requested if lost; errors as for `Camera.take_photo`."""
+        """Take one photo and return its capture. If the camera's report of it is lost, request the report.
+
+        Raises the errors of `Camera.take_photo`.
+        """
         async with self._lock:
             series = self.link.latest_order("series")
             before = await self.request_status_reliably()

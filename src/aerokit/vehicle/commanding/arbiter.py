@@ -98,7 +98,7 @@ class CommandArbiter:
         return order
 
     def _is_newest(self, order: Order) -> bool:
-        """Return True if the order is not withdrawn, and no newer order was given about a topic that ends it."""
+        """Return True if the order is not withdrawn, and no newer order about one of its `ending_topics` was given."""
         latest_orders = (self.latest(topic) for topic in order.ending_topics)
         is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
         return not order.is_withdrawn and not is_superseded

@@ -127,13 +127,15 @@ class ArmingActions(VehicleBase):
         """Arm the motors and wait until HEARTBEAT reports armed: **propellers may start to turn**.
 
         If the present mode does not allow arming (RTL or LAND after a flight, OFFBOARD), the mode is changed first.
-        ArduCopter decides by AUTO_OPTIONS whether it arms in AUTO; if it refuses there, the mode is changed and the
-        command is sent again. In all other cases the command is sent only once, because a repetition might arm a
-        vehicle that a pilot has just disarmed. After a cancellation, or an error other than a refusal, the command may
-        still be executed. aerokit therefore monitors the vehicle for 15 seconds, as long as the connection is open, and
-        disarms it if this command arms it after all. Arming is attributed to this command if the vehicle accepts the
-        command, or if the next HEARTBEAT reports armed and no pilot has taken over. If another party has armed the
-        vehicle, it stays armed. Logger "aerokit" warns about the outcome.
+        ArduCopter arms in AUTO only if its parameter AUTO_OPTIONS allows it. If it refuses there, the mode is changed
+        and the command is sent a second time. Otherwise the command is sent only once, because a repetition might arm a
+        vehicle that a pilot has just disarmed.
+
+        After a cancellation, or an error other than a refusal, the vehicle may still execute the command. aerokit
+        therefore monitors the vehicle for 15 seconds, as long as the connection is open, and disarms it if this command
+        arms it after all. A vehicle that another party has armed stays armed. aerokit assumes that this command has
+        armed the vehicle if the vehicle accepts the command, or if HEARTBEAT reports armed right after the command and
+        no pilot has taken over. Logger "aerokit" warns about the outcome.
 
         Args:
             mode: the mode to arm in. None: the present mode; if it does not allow arming, the mode in which

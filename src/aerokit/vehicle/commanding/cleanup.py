@@ -238,7 +238,7 @@ class FlightCleanup:
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Register the order whose effect a call awaits, so that `end_flights` can replace it by a hold.
+        """Register the order while a call waits for its effect, so that `end_flights` can order a hold instead.
 
         The vehicle is also ordered to hold if it hits the ground in the block, because it could climb again to the
         target of the order.

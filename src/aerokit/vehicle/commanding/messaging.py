@@ -262,7 +262,7 @@ class MessagingActions(VehicleBase):
         self.note_sent(message)
 
     def note_sent(self, message: Message) -> None:
-        """Register a message that the program sent by ``connection.send``, as if it had called :meth:`send`."""
+        """Treat a message that the program sent by ``connection.send`` as if :meth:`send` had sent it."""
         target = getattr(message, "target_system", self.system_id)  # All messages with subjects have this field.
         subjects = subjects_of(message) if target in (ALL_SYSTEMS, self.system_id) else ()
         if subjects == ARM_ALONE and isinstance(message, (CommandInt, CommandLong)):
@@ -288,11 +288,11 @@ class MessagingActions(VehicleBase):
         In the ``with`` block, the order's commands are sent again right after a HEARTBEAT, until they are acknowledged
         or their effect is reported. The retries also end in these cases:
 
-        - A newer order is about the first subject of this order, perhaps among other subjects.
-        - The vehicle changes to a mode to which neither this order nor another order of the last ten seconds leads,
-          unless this order disarms.
-        - A failsafe becomes active, unless this order lands, returns or disarms.
-        - The vehicle reboots; or it disarms, and the first subject is motion.
+        - A newer order is given whose subjects include the first subject of this order.
+        - The mode changes to one that this program has not ordered, by this order or in the ten seconds before it. An
+          order to disarm is still retried.
+        - A failsafe becomes active. An order to land, to return or to disarm is still retried.
+        - The vehicle reboots or, if the first subject is ``"motion"``, disarms.
 
         If you leave the block early, aerokit neither makes the vehicle hold nor disarms it if it arms later. Use the
         actions for that.
@@ -300,7 +300,7 @@ class MessagingActions(VehicleBase):
         Args:
             subjects: ``"mode"``, ``"motion"`` or ``"arm"``. If the first one is mode or motion, the order also ends the
                 action in progress.
-            modes: the modes that the order leads to.
+            modes: the modes that the vehicle may change to because of the order.
             armed: True if the order arms the vehicle, False if it disarms it; required for ``"arm"``.
 
         Raises:

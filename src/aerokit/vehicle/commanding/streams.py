@@ -105,7 +105,7 @@ class ValueStream(Generic[ValueT]):
         self._replace_value(value)
 
     async def _supply_for(self, value: ValueT, duration_s: float) -> None:
-        """Supply one value for ``duration_s`` seconds, often enough that it does not expire meanwhile."""
+        """Supply the same value repeatedly for ``duration_s`` seconds, so that it does not expire in this time."""
         until = self._now() + duration_s
         while (remaining_s := until - self._now()) > 0:
             self._set(value)

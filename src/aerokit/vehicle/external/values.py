@@ -180,10 +180,10 @@ class TargetMeasurement(Snapshot):
 class FlowMeasurement(Snapshot):
     """Optical flow of a camera that looks down (OPTICAL_FLOW, OPTICAL_FLOW_RAD).
 
-    ``x_rad`` and ``y_rad`` are the angles about the body's forward and right axes by which the camera seems to have
-    turned within ``interval_s``, judged by the ground in its picture. They include its real turn, whose angles about
-    all three axes are ``gyro_rad``. ``quality`` is from 0 to 255. Send every measurement without gaps, because
-    ArduPilot takes the time between two messages as ``interval_s``.
+    ``x_rad`` and ``y_rad`` are the movement of the picture within ``interval_s``, as angles about the body's forward
+    and right axes. For a camera that only turns, they are the angles of its turn. ``gyro_rad`` has the angles by which
+    the body really turned, about all three axes; do not subtract them from ``x_rad`` and ``y_rad``. ``quality`` is from
+    0 to 255. Send every measurement without gaps: ArduPilot uses the time between two messages as ``interval_s``.
     """
 
     x_rad: float

@@ -93,9 +93,9 @@ class Logs:
     total; None for no limit). For ``download`` and ``read``, ``timeout`` limits each step: finding the log, and reading
     it. You can cancel any call; the vehicle then stops sending.
 
-    ArduPilot answers LOG_* messages only while disarmed, and ends its current log when a log is read by these messages.
-    By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current end. If such
-    a log is larger than its entry says, logger "aerokit" reports that (INFO).
+    ArduPilot answers LOG_* messages only while disarmed. When it is asked for a log by them, it ends the log that it is
+    writing. By MAVFTP, logs can also be read in flight. A log that is still being written is read up to its current
+    end. If such a log is larger than its entry says, logger "aerokit" reports that (INFO).
     """
 
     def __init__(self, transfers: Transfers, files: Files, context: VehicleContext) -> None:

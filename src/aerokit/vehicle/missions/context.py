@@ -276,7 +276,7 @@ class MissionTracker:
         """Detect that the item that was reached last is current once more, so the vehicle flies to it again.
 
         PX4 may report an item as reached just before it reports the item as current, and this is no second approach.
-        The change to this item therefore counts only some time after it was reached, or if a later item was current.
+        It is one if the item becomes current some time after it was reached, or directly after a later item.
         """
         if current is None or current != self.reached:
             return

@@ -65,7 +65,7 @@ def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParamete
 
 
 class NameResolver:
-    """Finds the vehicle's parameters by the names in the program, which may be older or newer than the vehicle's."""
+    """Finds parameters of the vehicle, also by the names that older or newer firmware uses for them."""
 
     def __init__(self, access: ParameterAccess) -> None:
         self._access = access

@@ -250,7 +250,7 @@ class CommandSender:
                 self._expect_acks(key, exchange.pending_answers, still_pending)
 
     def _abort_run_of_ended_order(self, key: _Key) -> None:
-        """Abort the running command with this key if its order has ended, so that a newer command need not wait."""
+        """If the order of the running command with this key has ended, abort it, so that a newer one need not wait."""
         order_status = self._order_statuses.get(key)
         if order_status is not None and order_status.end:
             _, command = key

@@ -311,7 +311,7 @@ class Telemetry(States):
         return True
 
     def _learn_autopilot(self, heartbeat: messages.Heartbeat) -> None:
-        """Use the autopilot of the first HEARTBEAT, and store in each cell which messages it waits for."""
+        """Set the autopilot from the first HEARTBEAT, and in each cell the names of the messages that can fill it."""
         self.autopilot = autopilot_for(heartbeat)
         self._context.autopilot = self.autopilot
         self._knows_autopilot = True
@@ -319,7 +319,7 @@ class Telemetry(States):
             cell.waits_for = STATES[name].waits_for(self.autopilot)
 
     def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
-        """Store the name of a mode, unless the autopilot's own table has the mode or too many names are stored."""
+        """Store the name of an external mode or of a mode that aerokit does not know, unless too many are stored."""
         self.has_available_modes = True
         name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
         if name is not None and (message.custom_mode in self._mode_names or len(self._mode_names) < MAX_MODE_NAMES):
