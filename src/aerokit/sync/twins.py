@@ -3023,7 +3023,7 @@ class CameraBlock(BlockTwin["AsyncCameraBlock"]):
     """An operation of a camera for the duration of an ``async with`` block.
 
     The command to stop is sent at once when the block exits, also under cancellation, and retried. If the vehicle's
-    block exits first, the command is sent at that time, once. After a newer order about the same subject, it is not sent.
+    block exits first, the command is sent once at that time. It is not sent after a newer order about the same subject.
     """
 
 
