@@ -63,8 +63,8 @@ class ExternalRules(Snapshot):
 def _external_navigation(quantity: str) -> ExternalRule:
     """Return the rule for measurements that ArduPilot reads if VISO_TYPE is set (AP_VisualOdom).
 
-    They are the only source of ``quantity`` (POSXY or VELXY) if EK3_SRC1_<quantity> is 6 (ExternalNav), and the same
-    parameters of EK3_SRC2 and EK3_SRC3 are 6 or 0 (none).
+    The estimator has no other source of ``quantity`` (POSXY or VELXY) if EK3_SRC1_<quantity> is 6 (ExternalNav), and
+    both EK3_SRC2_<quantity> and EK3_SRC3_<quantity> are 6 or 0 (none).
     """
     sole_source = (
         (f"EK3_SRC1_{quantity}", (6.0,)),

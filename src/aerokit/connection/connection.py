@@ -394,9 +394,9 @@ class Connection:
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
         """Return how signatures may block communication with a component, for error texts; "" if nothing suggests it.
 
-        If this program has a signing key, the text counts the frames that it has refused, from all senders. Otherwise,
-        the text says so if the last heartbeat of the component was signed, which requires ``system_id``.
-        ``component_id`` 0 means all components of the system.
+        If this program has a signing key, the text counts the frames from all senders that it has refused. Without a
+        key, the text says that the component signs its frames if its last heartbeat was signed. For this,
+        ``system_id`` is required; ``component_id`` 0 means any component of the system.
         """
         return self._gate.describe(
             heartbeat

@@ -134,7 +134,7 @@ class ClassicConnection:
         )
 
     def match_mavlink_version(self, heartbeat: Message) -> None:
-        """Use MAVLink 2 if the vehicle is known to support it, else its HEARTBEAT's version (1 for old firmware)."""
+        """Send in MAVLink 2 if the vehicle is known to support it, otherwise in the version of its HEARTBEAT."""
         frame = heartbeat.received_frame
         if frame is not None:
             version = 2 if self.supports_mavlink_2 else frame.version

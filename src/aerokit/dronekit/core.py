@@ -207,7 +207,7 @@ class Core:
         return aio
 
     def check_may_wait(self) -> None:
-        """Raise APIException if the link is down, or on the loop's thread, which must receive what is waited for."""
+        """Raise APIException if the link is down, or on the loop's thread, where a wait would be a deadlock."""
         self.check_link()
         with classic_errors():
             self.handler.loop.check_may_wait()

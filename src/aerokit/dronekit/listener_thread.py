@@ -83,7 +83,7 @@ class ListenerThread:
             pass
 
     def keep_alive(self, owner: object, *, has_listeners: bool) -> None:
-        """Keep an object alive if it has listeners, even if the program drops the vehicle; otherwise let it go."""
+        """Keep an object alive while it has listeners, even if the program drops the vehicle; else release it."""
         if has_listeners and not self.is_stopped:
             self._kept_alive[id(owner)] = owner
         else:

@@ -262,8 +262,8 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
         """Start receiving, in the same loop iteration in which the vehicle was found.
 
-        What is given to the loop refers to this vehicle weakly, so that it can be garbage collected when the program
-        drops it. The handler may refer to it strongly, because the handler belongs to the vehicle.
+        Callbacks that the event loop keeps have only weak references to this vehicle, so that it can be garbage
+        collected when the program drops it. `_handler` may have strong ones, because it belongs to this vehicle.
         """
         core = self._dk
         core.start_receiving(aio, tasks)

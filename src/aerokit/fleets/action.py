@@ -460,7 +460,7 @@ def _newest_order(member: Member) -> Order | None:
 
 
 def _is_ending_flight(member: Member) -> bool:
-    """Return True if the vehicle's newest order is one of this program to land or return, and still valid."""
+    """Return True if this program ordered the vehicle to land or return, and the order is still valid."""
     newest = _newest_order(member)
     # A posted order that was closed still flies the vehicle.
     return newest is not None and newest.ends_flight and newest.is_newest and not newest.takeover_reason
@@ -510,7 +510,11 @@ class FleetContext:
         self.bus.publish(event)
 
     def newest_orders(self, member: Member) -> tuple[object, object]:
-        """Return the newest order that flies the member, and the number of actions, whose orders may still follow."""
+        """Return a value that changes with each move that the program orders, to be compared with an earlier one.
+
+        It is the newest order that flies the member, and how many actions it was given. An action counts before it
+        gives an order.
+        """
         return _newest_order(member), self.moves[member.name]
 
     def hold(self, member: Member, task_name: str) -> None:

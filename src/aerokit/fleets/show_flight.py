@@ -429,7 +429,7 @@ class Shows(Travel):
         }
 
     def _check_show(self, show: Show, origin: LocalOrigin, origin_amsl_m: float) -> None:
-        """Raise OperationRejected if a member is unavailable, or if tracks or other members come too close."""
+        """Raise OperationRejected if a member is unavailable or its track is too close to another track or member."""
         for name in show.tracks:
             self._check_available(self.members[name], "fly_show", "nothing was sent")
         min_m = self._context.min_distance_m

@@ -429,7 +429,7 @@ class Router(Generic[PortT]):
         return numbers
 
     def _is_redundant(self, number: int) -> bool:
-        """Return True if autopilots are received at this port, and other ports are used to reach all of them."""
+        """Return True if autopilots are received at this port, but messages for each of them go to another port."""
         here = [sender for sender in self._senders.values() if sender.is_autopilot and sender.is_at(number)]
         return bool(here) and all(sender.port_number != number for sender in here)
 

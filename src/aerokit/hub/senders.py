@@ -84,7 +84,10 @@ class Sender:
         return (self.port_number,) if self.is_vehicle else self.ports
 
     def is_at(self, number: int) -> bool:
-        """Return True if this is the sender's port, or if the sender was received here at nearly the same time."""
+        """Return True if this is the sender's port, or if the sender's frames arrive at both ports.
+
+        The last frame here must be at most ROUTE_TIMEOUT_S older than the last frame at the sender's port.
+        """
         return number == self.port_number or self.ports.get(number, -math.inf) >= self.received_at - ROUTE_TIMEOUT_S
 
     def record_at_other_port(self, number: int, now: float, must_move: bool) -> bool:

@@ -142,7 +142,7 @@ def pack_for_download(
 
     ``block_size`` is the number of data bytes per read (a block). ``count`` 0 means all parameters from ``start`` on.
     An entry may be split between two blocks, but PX4 keeps its value and its default in the same block. ArduPilot
-    (``whole_defaults=False``) may split between value and default, and even the value if a default follows it
+    (``whole_defaults=False``) only keeps the last of them unsplit: a value may be split if a default follows it
     (AP_Filesystem_Param.cpp). InvalidArgument is raised if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))

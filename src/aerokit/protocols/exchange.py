@@ -343,9 +343,9 @@ class StaleAnswerFilter:
     def is_stale(self, name: str, sent_at: float, now: float, *, attempts: int) -> bool:
         """Return True if ``now`` is too early for an answer to the request for ``name`` sent at ``sent_at``.
 
-        ``attempts`` is the number of transmissions of the request. After several early answers, the vehicle counts as
-        faster, and early answers are accepted. An accepted answer may be one to another station, so the caller must
-        check it in other ways too.
+        ``attempts`` is the number of transmissions of the request. After MAX_EARLY_ANSWERS early answers for a name,
+        False is returned for further ones, because the vehicle has become faster. False does not prove that an answer
+        is new: it may be meant for another station. The caller must check it in other ways too.
         """
         elapsed_s = now - sent_at
         if elapsed_s >= MIN_ROUND_TRIP_FRACTION * (self._round_trip.fastest_s or 0.0):

@@ -304,7 +304,7 @@ class FtpDownload(FtpExchange[int]):
         return not was_sent_completely and len(self._reassembly.gaps) < MAX_GAPS
 
     def _request_ahead(self) -> None:
-        """Request the next blocks one by one, because the server does not support bursts; none if the end is known."""
+        """For a server without bursts: request the next blocks, each by its own request, until the end is known."""
         if self._reassembly.end is None:
             for number in range(self._requests.window.size):
                 self._requests.request(self._reassembly.tail + number * DATA_SIZE)

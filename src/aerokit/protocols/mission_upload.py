@@ -227,7 +227,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _is_refusal_of_partial_upload(self) -> bool:
-        """True while an ERROR would refuse a partial upload as such, because the vehicle has not requested an item."""
+        """True if an ERROR would refuse a partial upload: the vehicle has not requested an item of it yet."""
         return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:

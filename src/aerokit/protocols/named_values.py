@@ -251,7 +251,7 @@ class NamedReads(NamedRequests[ValueT]):
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 
     def _reject_if_requested_often(self, names: Iterable[str], now: float) -> None:
-        """Reject those of the unanswered names that were requested so often that a loss of all answers is unlikely."""
+        """Reject these unanswered names, except those whose answers may all have been lost."""
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
                 text = f"{self.unknown_text} {name}: it answers requests for other names, but not for this one"

@@ -168,7 +168,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._must_request_missing = True
 
     def _on_streamed_value(self, index: int, now: float) -> None:
-        """Request missing indices before this one, and measure the pauses of the stream."""
+        """Request the indices that the stream skipped before this one, and update the length of its pauses."""
         for missing in range(self._next_index, min(index, self._count or 0)):
             self._window.request(missing)
         if self._streamed_count:

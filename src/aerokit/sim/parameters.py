@@ -198,7 +198,7 @@ def _lines_and_switches(
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
     """Return the lines of the parameters named in ``used``, and other lines to reach ``count`` lines.
 
-    The other lines are the first of the table, but none of a parameter that another parameter enables.
+    The other lines are the first lines of the table whose parameter has no switch (see `SimParameter`).
     """
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))

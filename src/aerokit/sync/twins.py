@@ -735,9 +735,9 @@ class StickStream(BlockTwin["AsyncStickStream"]):
 
     Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block, also
     by an exception, orders the vehicle to hold and ends the stream; ArduPilot is also told to release the sticks. If
-    the stream stops by itself (no new positions, a blocked event loop, a silent vehicle), ``set`` and leaving the block
-    raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changes the mode, the stream ends in the same way,
-    but no hold is ordered.
+    the stream stops by itself (no new positions, a blocked event loop, a silent vehicle, another mode), ``set`` and
+    leaving the block raise :class:`SetpointStreamStopped`. No hold is ordered if it stopped because a pilot or a
+    failsafe changed the mode.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a
@@ -3022,8 +3022,8 @@ class Rtk(TwinOf["AsyncRtk"]):
 class CameraBlock(BlockTwin["AsyncCameraBlock"]):
     """An operation of a camera for the duration of an ``async with`` block.
 
-    The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. If the vehicle's block exits first, the command is sent then. It is not sent after a newer order.
+    The command to stop is sent at once when the block exits, also under cancellation, and retried. If the vehicle's
+    block exits first, the command is sent once at that time. It is not sent after a newer order about the same subject.
     """
 
 

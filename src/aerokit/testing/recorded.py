@@ -208,7 +208,7 @@ class RecordedVehicle(SimulatedVehicle):
     - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
       other params, with the recorded delays. If it was recorded several times, each repetition gets the next recorded
       answer, and further ones get the last. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the
-      message as played last, or else as first recorded.
+      latest played message of this type or, if none was played yet, the first in the recording.
     - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
       recording can be set. A request for another parameter gets PARAM_ERROR if the recorded vehicle ever sent
       PARAM_ERROR, otherwise no answer.

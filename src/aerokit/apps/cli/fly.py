@@ -167,9 +167,9 @@ class PlanFlight(SupervisedFlight):
             group.cancel_scope.cancel()
 
     async def _explain_wait(self, mode: str) -> None:
-        """Print that a change to ``mode`` ends the flight soon, unless the vehicle reports the end of the mission.
+        """Print how long the flight will wait, after a change to ``mode``, for a report that the mission has ended.
 
-        Nothing is printed if it reports the end within the first quarter of this time.
+        Nothing is printed if this report arrives within the first quarter of the wait.
         """
         delay_s = END_GRACE_S / 4
         await anyio.sleep(delay_s)

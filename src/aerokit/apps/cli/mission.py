@@ -279,7 +279,7 @@ def _emit_warnings(plan: Plan, options: argparse.Namespace) -> list[str]:
 
 
 def _notes(plan: Plan) -> list[str]:
-    """Return a note on the items that only ArduPilot accepts, unless the plan is for ArduPilot."""
+    """Return a note if the plan has items that only ArduPilot accepts, but is not marked as one for ArduPilot."""
     if plan.firmware_type == MavAutopilot.ARDUPILOTMEGA:
         return []
     try:

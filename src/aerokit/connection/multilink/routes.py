@@ -266,7 +266,7 @@ class MultiLinkRoutes:
     # ------------------------------------------------------------------ state of the links
 
     def link_changed(self, link: int, is_available: bool) -> None:
-        """Record that a link was lost or is available again, and choose the link for each of its systems."""
+        """Record that a link was lost or is available again, and choose anew for each system that it reaches."""
         now = self._now()
         if not is_available:  # A lost link has no unsent data.
             self._stalled.discard(link)

@@ -148,7 +148,7 @@ class _Tables:
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        """Return False if a row is later than the whole log, or does not fit two adjacent rows that fit each other.
+        """Return False if a row's time is after the end of the log, or out of order between two rows in order.
 
         Rows have no checksum. One wrong time would move all later rows of a `TimeSeries`.
         """

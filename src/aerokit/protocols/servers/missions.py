@@ -382,7 +382,7 @@ class MissionServer:
             self._clear(non_empty if kind == MavMissionType.ALL else [kind], request, channel)
 
     def _clear(self, kinds: list[int], request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear these lists one after the other, as long as ``validate`` accepts. Then acknowledge."""
+        """Clear these lists in turn. Acknowledge when all are cleared, or when ``validate`` refuses to clear one."""
         if not kinds:
             self._end_clearing(_Result.ACCEPTED, request, channel)
             return

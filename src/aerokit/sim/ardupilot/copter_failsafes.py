@@ -309,9 +309,10 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 
 
 class CopterFence(ArduPilotFence[CopterHost]):
-    """Executes FENCE_ACTION: only report (0), RTL (1), LAND (2), SMART_RTL, else RTL (3), BRAKE (4), SMART_RTL (5).
+    """Executes FENCE_ACTION. With 0, the breach is only reported; other values change the mode.
 
-    Except with 0, the copter lands if these modes are refused or if it is more than 100 m outside the fence.
+    The modes are 1: RTL, 2: LAND, 3: SMART_RTL and, if this is refused, RTL, 4: BRAKE, 5: SMART_RTL. The copter changes
+    to LAND if they are all refused, or if it is more than 100 m outside the fence.
     """
 
     PERIOD_S: ClassVar[float] = 0.1

@@ -114,7 +114,7 @@ class Px4MissionServer(MissionServer):
         return self.lists[MavMissionType.MISSION]
 
     def _store_if_changed(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
-        """Store a list, unless it is the stored one (same opaque id, not empty) or has an unknown type."""
+        """Store a list of a known type. Do nothing if it has items and the stored list has the same opaque id."""
         if mission_type not in self.lists or (items and opaque_id == self.id(mission_type)):
             return
         self.store(mission_type, items)

@@ -349,8 +349,8 @@ class ActiveOperation:
 class CameraBlock:
     """An operation of a camera for the duration of an ``async with`` block.
 
-    The command to stop is sent at once when the block exits, also under cancellation, and retried until it is
-    acknowledged. If the vehicle's block exits first, the command is sent then. It is not sent after a newer order.
+    The command to stop is sent at once when the block exits, also under cancellation, and retried. If the vehicle's
+    block exits first, the command is sent once at that time. It is not sent after a newer order about the same subject.
     """
 
     def __init__(

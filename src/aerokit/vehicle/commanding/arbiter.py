@@ -207,8 +207,8 @@ class CommandArbiter:
     ) -> Iterator[Order]:
         """Create a posted order, which is valid during the `with` block.
 
-        It ends earlier posted orders whose first subject is one of its subjects. If its own first subject is mode or
-        motion, it also ends the action in progress. A newer order about its first subject ends it.
+        The new order ends earlier posted orders whose first subject is in ``subjects``. If ``subjects`` begins with
+        "mode" or "motion", it also ends the action in progress. A newer order about its first subject ends it.
         """
         first_subject = subjects[0]
         is_steering = first_subject != "arm"

@@ -282,7 +282,7 @@ class SetpointStream(SteeringStream[SetpointT]):
             self._sent_at = self._now()
 
     def _stop_reason(self, lag: float) -> str | None:
-        """Also stop the stream if the vehicle stays in place although its set-point requires motion."""
+        """Return why the stream must stop; one more reason is that the vehicle stays in place but should move."""
         if self._mode is None or not wants_motion(self._value, self._context):
             # A vehicle that does not have to move cannot stall, so the detection starts again.
             self._stall = StallDetector(self._session)

@@ -179,7 +179,7 @@ class Health:
             await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= HEALTH_MAX_AGE_S)
 
     async def request_reasons(self, since: float) -> None:
-        """Make the vehicle report why its pre-arm checks fail, unless it has done so since this time."""
+        """If the vehicle's pre-arm checks fail, make it report why, unless it has done so since this time."""
         sensors = self._telemetry.sensors.latest
         if sensors is not None and sensors.prearm_checks_pass is False and not self._telemetry.is_armed:
             await self._request_texts(since)

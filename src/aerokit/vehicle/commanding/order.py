@@ -235,7 +235,7 @@ class Order:
         return mode.custom_mode in self._own_modes
 
     def expect(self, modes: Collection[Mode]) -> None:
-        """Count these modes as the order's own, because the program itself will order one of them."""
+        """Also accept these modes as effects of the order, because the program will order one of them."""
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:

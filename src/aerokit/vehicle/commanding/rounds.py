@@ -189,7 +189,7 @@ class RoundFlight:
 
     @property
     def _is_in_place(self) -> bool:
-        """True while the vehicle is on its path or, without a counter, at the place."""
+        """True while the vehicle is on its path or, if rounds are not counted, at the center."""
         position = self._context.vehicle_position
         if self._counter is not None:
             return self._counter.is_on_path
@@ -233,7 +233,7 @@ class RoundFlight:
         """Return the flight along the path, with the center in the local frame.
 
         The vehicle's position is known in both frames, so the center can be converted from the global to the local one.
-        Both positions must be new, because a moving vehicle has left the place of an older one.
+        Both positions must be new: while the vehicle moves, older ones may belong to different places.
         """
         position, local_position = self._telemetry.position, self._telemetry.local_position
         since = self._session.connection.now()

@@ -58,9 +58,9 @@ class StickStream(SteeringStream[StickInput]):
 
     Entering the block sends the initial positions for a second and then changes to the mode. Leaving the block, also
     by an exception, orders the vehicle to hold and ends the stream; ArduPilot is also told to release the sticks. If
-    the stream stops by itself (no new positions, a blocked event loop, a silent vehicle), ``set`` and leaving the block
-    raise :class:`SetpointStreamStopped`. If a pilot or a failsafe changes the mode, the stream ends in the same way,
-    but no hold is ordered.
+    the stream stops by itself (no new positions, a blocked event loop, a silent vehicle, another mode), ``set`` and
+    leaving the block raise :class:`SetpointStreamStopped`. No hold is ordered if it stopped because a pilot or a
+    failsafe changed the mode.
 
     If the program is killed, ArduPilot returns to the transmitter after RC_OVERRIDE_TIME (3 s), and PX4 treats the
     sticks as lost after COM_RC_LOSS_T (0.5 s). PX4 has no message that releases the sticks, so it treats every end of a

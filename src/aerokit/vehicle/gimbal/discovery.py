@@ -183,7 +183,7 @@ class GimbalRegistry:
     ) -> GimbalDevice | None:
         """Return the gimbal that a manager's message is about; record the sender as this gimbal's manager.
 
-        Returns None if a better manager of this gimbal is known, or if the gimbal or the sender is unknown.
+        Returns None if another manager of this gimbal has a higher rank, or if the gimbal or the sender is unknown.
         """
         frame = message.received_frame
         if frame is None:

@@ -235,7 +235,10 @@ class MissionTracker:
         self.discard_completion()
 
     def discard_completion(self) -> None:
-        """Ignore reports of completion, which are about the previous flight, unless the vehicle flies its mission."""
+        """Forget that the mission is complete, unless it is being flown.
+
+        For STALE_STATE_S, reports of completion are ignored, because they are about the previous flight.
+        """
         if not self._was_active:
             self.is_complete = False
             self._stale_until = self._session.connection.now() + STALE_STATE_S

@@ -398,7 +398,7 @@ class VehicleSession:
         ]
 
     def _attach_watched_streams(self) -> None:
-        """Let each state whose message has no default rate request it while the program watches the state."""
+        """Make states with a ``watched_hz`` request their message at this rate while the program watches them."""
         for name, state in STATES.items():
             cell = self.telemetry.cells[name]
             for source in state.sources:

@@ -41,8 +41,8 @@ MessageT = TypeVar("MessageT", bound=Message)
 class ComponentSubscriber:
     """Subscriptions to the messages of one component, and cells with its latest messages.
 
-    ``register_cell``, ``at_close`` and ``end`` are those of the session: ``register_cell`` adds a cell to the session,
-    ``at_close`` registers a callback for the end of the session, and ``end`` ends the subscriptions.
+    ``register_cell`` adds a cell to the session. ``at_close`` registers a callback that is called when the session
+    ends. ``end`` is the session's signal that ends all subscriptions.
     """
 
     def __init__(
