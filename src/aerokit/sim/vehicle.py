@@ -296,7 +296,7 @@ class SimulatedVehicle:
         self._next_tick_at = round(next_tick * NS_PER_S) / NS_PER_S if next_tick < math.inf else math.inf
 
     def _tick_until(self, now: float) -> None:
-        """Execute all ticks that are due at ``now`` in one call of `tick`, and schedule the next tick."""
+        """Call `tick` once with the total duration of the ticks that are due at ``now``, and schedule the next tick."""
         if now < self._first_tick_at:
             return
         ticks = _whole_ticks(now - self._first_tick_at) - self._ticks_done
