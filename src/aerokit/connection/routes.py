@@ -259,7 +259,7 @@ class Routes:
             route.silent_since = min(now, route.silent_since + paused_s)
 
     def record_duplicate_sender(self, frame: Frame) -> None:
-        """Record that a second sender behind the same peer uses the ids of this frame."""
+        """Record that two senders behind one peer, the owner of the route, both use the ids of this frame."""
         claim = self._claim((frame.system_id, frame.component_id), _SAME_PEER)
         if not claim.is_duplicate_reported:
             claim.is_duplicate_reported = True

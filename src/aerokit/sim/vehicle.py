@@ -352,7 +352,7 @@ class SimulatedVehicle:
                 port.write(data)
 
     def send_built(self, message_id: int, channel: Channel | None = None) -> None:
-        """Send the current message of this id, if there is one."""
+        """Build the message with this id from the current state, and send it; send nothing if `build` returns None."""
         message = self.build(message_id)
         if message is not None:
             self.send(message, channel)
