@@ -70,10 +70,9 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
 
 
 def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
-    """Return what is missing for a flight, in its two groups.
+    """Like `readiness`, but without the reason that the mode itself does not allow arming.
 
-    If the vehicle's checks pass although estimates are missing, its mode decides whether they prevent arming.
-    The reason that the mode itself does not allow arming is added by `readiness`.
+    If the vehicle's checks pass although estimates are missing, the mode decides whether these prevent arming.
     """
     missing = vehicle.missing_for_flight()
     against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)

@@ -26,12 +26,13 @@ ExternalKind: TypeAlias = Literal[
 
 
 class ExternalRule(Snapshot):
-    """Parameters that decide whether the autopilot uses one kind of measurement.
+    """Parameter values with which the autopilot uses one kind of measurement.
 
-    - ``required``: for each parameter, its alternative names, and the values with which the autopilot uses messages
-      with this measurement
-    - ``sole_source``: for each parameter, its name, and the values with which the measurement is the estimator's only
-      source of position or velocity; parameters that the vehicle does not have are ignored
+    - ``required``: the names of each parameter in several firmware versions, and its suitable values. The autopilot
+      ignores the measurements unless all these parameters have one of these values.
+    - ``sole_source``: the name of each parameter, and its suitable values. If all have one of these values, the
+      measurement is the estimator's only source of position or velocity. The vehicle must have the first parameter; of
+      the others, those that it does not have are ignored.
     """
 
     required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()

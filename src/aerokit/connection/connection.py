@@ -321,7 +321,7 @@ class Connection:
 
         Frames with message ids outside the dialect are included, and their checksums are not checked. Frames that are
         refused because a second peer sends them under the ids of a known component are excluded. The callback must
-        return quickly; its exceptions are logged. Without observers, frames without subscribers are not even built.
+        return quickly; its exceptions are logged. Observers cost time, because every frame must then become an object.
         """
         return self._observers.add(callback)
 

@@ -204,7 +204,8 @@ class FrameReceiver:
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
         """Deliver the frames that pass all checks, and pass them to the observers.
 
-        With one link, the recording gets every frame that passes the signature check, even if a later check refuses it.
+        If the connection has a single link, frames are recorded once they have passed the signature check, even if a
+        later check refuses them. Frames of several links are recorded only if they pass all checks.
         """
         framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
         # True if frames arrived out of order (late), or may be those of a second sender with the same ids (foreign).

@@ -151,13 +151,14 @@ class Routes:
 
     The first peer that sends a HEARTBEAT under these ids owns the route; frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer continues the owner's stream if its sequence numbers and, where known,
-    its time since boot are those expected of the owner. It takes over the route (``RouteChanged``)
+    its time since boot are those expected of the owner. The owner is gone once its TCP client has disconnected, or
+    after 3.5 s without a heartbeat, not counting pauses of the event loop. Another peer takes over the route
+    (``RouteChanged``)
 
     1. at once, if it is another port of the same host and has continued the stream with three frames, while the owner
        sent nothing for the time of three frames;
-    2. once the owner is gone (3.5 s without a heartbeat, not counting pauses of the event loop, or a TCP client that
-       has disconnected), if one of these is true: it is on the same host, as after a reboot; it continues the stream;
-       it signs with our key; the system has no vehicle object; the program allows every host (``may_move``).
+    2. when the owner is gone, if the peer is on the same host (as after a reboot), continues the stream, or signs with
+       our key; or if the system has no vehicle object; or if the program allows every host (``may_move``).
 
     Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.
@@ -259,7 +260,7 @@ class Routes:
             route.silent_since = min(now, route.silent_since + paused_s)
 
     def record_duplicate_sender(self, frame: Frame) -> None:
-        """Record that a second sender behind the same peer uses the ids of this frame."""
+        """Record that two senders behind one peer, the owner of the route, both use the ids of this frame."""
         claim = self._claim((frame.system_id, frame.component_id), _SAME_PEER)
         if not claim.is_duplicate_reported:
             claim.is_duplicate_reported = True

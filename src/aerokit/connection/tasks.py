@@ -132,9 +132,9 @@ Alarm = Callable[[], None]
 
 
 class Deadlines:
-    """Calls each alarm at its time, unless it is cancelled before.
+    """Calls each alarm (a function) at its deadline, unless the deadline is cancelled before.
 
-    Most deadlines of requests are cancelled soon, when the answer arrives. One timer serves all of them, because a
+    Most deadlines of requests are cancelled soon, when the answer arrives. One timer serves all deadlines, because a
     loop timer for each would cost more than sending the request. Cancelling a deadline does not reschedule the timer.
     """
 

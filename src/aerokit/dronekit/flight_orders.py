@@ -164,9 +164,9 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which PX4 may get a reposition command, which changes its mode to the first of them.
+    """Return the modes in which a reposition command is sent to PX4, which then changes to the first of them.
 
-    Empty for other autopilots: the command does not change their mode, and they refuse it in wrong modes.
+    Empty for other autopilots: they do not change the mode, and refuse the command in unsuitable modes.
     """
     if not aio.autopilot.repositions_amsl:  # not PX4
         return ()

@@ -58,9 +58,9 @@ class ListenerThread:
     def call(self, function: Callable[..., object], *args: Any) -> None:
         """Queue a call and wait until it has run, but at most two seconds.
 
-        The wait is limited because the caller may hold a lock for which a callback waits. On this thread, or after it
-        has ended, the function is called directly. The thread of an event loop, and any other listener thread, does not
-        wait, because that could cause a deadlock.
+        The wait is limited because the caller may hold a lock for which a callback waits. The function is called
+        directly if the caller is this listener thread, or after :meth:`stop`. The call is queued without waiting if the
+        caller is the thread of an event loop or another listener thread, because the wait could cause a deadlock.
         """
         if self.is_current or self.is_stopped:
             function(*args)

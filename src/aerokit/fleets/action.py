@@ -192,8 +192,8 @@ class FleetAction:
     async def _run_member(self, member: Member, delay_s: float, was_called_late: bool) -> None:
         """Execute the action with one member after a delay, and record its outcome.
 
-        The program may have given the member an order since the action was created. With ``was_called_late``, this may
-        be a newer action.
+        A member that got a newer order after the action was created does not start. ``was_called_late`` is True if
+        the action runs only after the begin of a newer one, which then counts as such an order.
         """
         task = asyncio.current_task()
         assert task is not None
@@ -243,8 +243,8 @@ class FleetAction:
 
         Raises:
             OperationRejected: the computer slept during the wait, the member is unavailable, or it would start too late
-                in its corridor. Unless the action is safe (such as a landing), also if the member was unavailable
-                during the wait, because it has then failed.
+                in its corridor. A member that was unavailable during the wait has failed, so it is rejected, too,
+                unless the action is safe (such as a landing).
             HeartbeatTimeout: the member is silent.
         """
         connection, name = member.vehicle.connection, member.name
@@ -287,7 +287,10 @@ class FleetAction:
         )
 
     def _newer_order_check(self, member: Member) -> Callable[[], bool]:
-        """Return a function that returns True if the program has told the member to land, return or disarm since."""
+        """Return a function that tells whether the program has given the member certain orders after this call.
+
+        They are orders to land, to return or to disarm and, if this action arms the members, to arm.
+        """
         arbiter, order_before = member.vehicle._arbiter, _newest_order(member)
 
         def commands_sent() -> int:

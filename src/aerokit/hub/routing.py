@@ -405,8 +405,8 @@ class Router(Generic[PortT]):
     def _ports_to(self, system_id: int, component_id: int, source: int, here: int) -> dict[int, None]:
         """Return the numbers of the ports for a frame to a component or, if it is unknown or 0, to its whole system.
 
-        ``source`` is the sender, ``here`` the number of the port that received the frame. If the sender is itself a
-        target, its only port is ``here``. The caller then removes ``here``, so that no sender gets its own frame.
+        ``source`` is the sender, ``here`` the number of the port that received the frame. If the sender itself is a
+        target, ``here`` is used as its port. The caller removes ``here``, so that no sender gets its own frame.
         """
         origin = self._senders.get(source)
         target = self._senders.get(system_id | component_id << 8) if component_id else None

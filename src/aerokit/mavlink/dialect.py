@@ -41,7 +41,7 @@ class Dialect:
         self._set_rows({cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()})
 
     def _set_rows(self, rows: dict[int, Row]) -> None:
-        """Store the table of messages, and prepare decoders that load a message class at its first use."""
+        """Store the table of messages, and prepare a decoder for each. It loads the message class at its first use."""
         self.rows = rows
         """Maps message ids to (CRC_EXTRA, payload length without extensions, payload length with extensions)."""
         self.extras: dict[int, bytes] = {

@@ -54,7 +54,7 @@ class AdaptiveWindow:
         return int(self._size)
 
     def widen(self, size: float) -> None:
-        """Raise the size to ``size``, the number of answers in one round trip, but at most to half of the maximum."""
+        """Raise the number of requests in flight to ``size``, but at most to half of ``max_size``."""
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:

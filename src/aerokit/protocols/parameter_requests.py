@@ -186,17 +186,19 @@ WRITE_WINDOW = 10
 
 
 class ParameterWrites(ParameterRequests):
-    """Set some parameters. The result has the value that each parameter has afterwards, as the vehicle reports it.
+    """Set some parameters. The result has the value that the vehicle reports for each parameter afterwards.
 
-    - An answer with the requested value and type completes a write.
-    - If no answer arrives, the value is read.
-    - If the vehicle reports the value in ``before``, or ``before`` lacks the name, the write may have been lost, so
-      PARAM_SET is sent again. After eight such answers in a row, the reported value is the result.
-    - Another value was rounded, clamped, or set by another station. It is the result if it is reported twice in a row,
-      and PARAM_SET is not sent again, so that a change by another station is not undone.
+    ``before`` has the values from before the writes, as far as they are known. The answers are handled as follows:
 
-    ``recent`` has names that an earlier call has just written. Answers to the earlier write may still arrive, so the
-    first matching answer is verified by another read.
+    - The requested value with the requested type completes a write.
+    - If there is no answer, the value is read.
+    - The value from before, or any value if that is unknown: the write may have been lost, so PARAM_SET is sent again.
+      If the same value is reported eight times in a row, it is the result.
+    - Another value: the vehicle has rounded or clamped the request, or another station has set the value. PARAM_SET is
+      not sent again, because it would undo the other station's change. A value reported twice in a row is the result.
+
+    ``recent`` has the names that an earlier call has just written. Their first answer with the requested value may
+    belong to the earlier write, so the value is read once more.
     """
 
     def __init__(

@@ -34,9 +34,9 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. If the loop was blocked, the server simulates the missed time afterwards: all of it if ``speedup`` is 1, at
-    other speeds at most half a simulated second, so that vehicles do not detect a link loss while the client could not
-    send.
+    second. If the loop was blocked, the server simulates the missed time afterwards. If ``speedup`` is not 1, it
+    simulates at most half a second of that time and skips the rest. Otherwise, vehicles would detect a link loss,
+    because the client could not send either.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.

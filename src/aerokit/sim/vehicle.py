@@ -296,7 +296,7 @@ class SimulatedVehicle:
         self._next_tick_at = round(next_tick * NS_PER_S) / NS_PER_S if next_tick < math.inf else math.inf
 
     def _tick_until(self, now: float) -> None:
-        """Execute all ticks that are due at ``now`` in one call of `tick`, and schedule the next tick."""
+        """Call `tick` once with the total duration of the ticks that are due at ``now``, and schedule the next tick."""
         if now < self._first_tick_at:
             return
         ticks = _whole_ticks(now - self._first_tick_at) - self._ticks_done
@@ -352,7 +352,7 @@ class SimulatedVehicle:
                 port.write(data)
 
     def send_built(self, message_id: int, channel: Channel | None = None) -> None:
-        """Send the current message of this id, if there is one."""
+        """Build the message with this id from the current state, and send it; send nothing if `build` returns None."""
         message = self.build(message_id)
         if message is not None:
             self.send(message, channel)

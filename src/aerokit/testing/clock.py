@@ -135,7 +135,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     @property
     def _can_skip_polls(self) -> bool:
-        """True unless sockets, executor calls, a stop of the loop or its debug mode need asyncio's own iteration."""
+        """True unless a socket, an executor call, a stop of the loop or debug mode requires asyncio's own iteration."""
         is_watched = self._executor_calls or self._stopping or self._debug  # type: ignore[attr-defined]
         return not is_watched and len(self._registered) == self._own_registered_count
 

@@ -82,7 +82,7 @@ class StalledQueue:
             outbox.discard()
 
     def drain(self) -> None:
-        """Send the bytes that the operating system has accepted, and the queued bytes that have not expired."""
+        """End the stall: send the bytes in the simulated operating system, then the unexpired bytes in the queues."""
         self._is_stalled = False
         accepted, self._accepted = self._accepted, []
         for data, peer in accepted:

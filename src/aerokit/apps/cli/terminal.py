@@ -100,10 +100,10 @@ def on_interrupt(
 ) -> Iterator[None]:
     """Within the block, SIGINT, SIGTERM and SIGHUP only call ``callback`` on the running loop.
 
-    Before that, ``at_once(number)`` is called in the signal handler, so it is called even if the loop is blocked.
+    The signal handler itself first calls ``at_once(number)``, so this call is made even while the loop is blocked.
 
-    Only the first SIGHUP is handled. When a terminal or an SSH session ends, both the shell and the kernel send one, a
-    moment apart. Handled like a second Ctrl-C, the second one would cancel the action that makes the vehicle safe.
+    When a terminal or an SSH session ends, both the shell and the kernel send a SIGHUP, a moment apart. The second one
+    is ignored. As a second signal, like a second Ctrl-C, it would cancel the action that makes the vehicle safe.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()

@@ -259,8 +259,8 @@ Handler = Callable[["Request"], Awaitable[Response]]
 class Operation:
     """One HTTP method of one path.
 
-    ``name`` is the operationId. ``order`` is the type of the order that the operation gives. ``body_type`` is the
-    type of an order that the operation does not give, but whose arguments it checks.
+    ``name`` is the operationId. An operation that gives an order has its type in ``order``. An operation that only
+    checks the arguments of an order has the order's type in ``body_type``.
     """
 
     method: str

@@ -140,7 +140,7 @@ class FlightWatch:
             self._disarm_ordered_at = self._now()
 
     def _on_armed(self, before: bool | None, is_armed: bool) -> None:
-        """Record when the vehicle is armed, and a disarming on the ground that no order of this server caused."""
+        """Record the time of arming or disarming, and a disarming before take-off that this server did not order."""
         now = self._now()
         if is_armed:
             # If the vehicle was armed before this program started, the time of arming is unknown.

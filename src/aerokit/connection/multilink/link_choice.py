@@ -271,8 +271,8 @@ class LinkChoice:
     def record_hardware(self, link: int, hardware: HardwareId) -> None:
         """Record a hardware id received over a link.
 
-        An id received over the link in use becomes the vehicle's id. But if it contradicts an id that was adopted from
-        another link, that id stays, and the link in use counts as leading to another vehicle.
+        An id received over the link in use becomes the vehicle's id, unless the vehicle already has a contradicting id
+        that was received over another link. The link in use then counts as a link to another vehicle.
         """
         candidate = self.candidates[link]
         if hardware.has_value or candidate.hardware is None:  # An empty id does not replace a known one.

@@ -279,7 +279,7 @@ class GimbalRequests:
             self._apply_attitude(message)
 
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
-        """Apply the set-point of another manager, such as an autopilot, unless a different component is in control."""
+        """Apply the set-point of another manager, such as an autopilot, if it or no component is in control."""
         if self._gimbal.primary in ((0, 0), sender_of(message)):
             self._apply_attitude(message)
 

@@ -102,7 +102,7 @@ class MessageStreams:
     def _set_interval(self, command: ReceivedCommand) -> int:
         """Set or stop a stream on one channel. Both 0 (default rate) and -1 stop it, because there is no default rate.
 
-        A stream of the message on all channels is stopped on all of them, because it cannot leave out this channel.
+        If one stream sends the message on all channels, it is stopped, because it would also send on this channel.
         """
         message_id = to_int(command.param1)
         if message_id not in self.builders:

@@ -286,7 +286,7 @@ class MissionServer:
 
     def _check(self, upload: ListUpload) -> None:
         """End an upload that has timed out, or request the missing item again."""
-        if not self._is_watched(upload):
+        if not self._may_time_out(upload):
             return
         if self._host.now >= upload.received_at + self.timeout_s:
             self._time_out(upload)
@@ -298,7 +298,7 @@ class MissionServer:
     def _is_running(self, upload: ListUpload) -> bool:
         return self._uploads.get(self._key(upload.mission_type)) is upload
 
-    def _is_watched(self, upload: ListUpload) -> bool:
+    def _may_time_out(self, upload: ListUpload) -> bool:
         return self._is_running(upload) and not upload.is_being_validated
 
     def _repeat(self, upload: ListUpload) -> None:

@@ -171,7 +171,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return is_complete
 
     def _has_passed(self, index: int) -> bool:
-        """Return True, and report it, if the plane is within WP_RADIUS of the waypoint or has passed the waypoint."""
+        """Return True and send a text if the plane is within WP_RADIUS of the waypoint, or has passed it."""
         assert self._place is not None
         wing = self.vehicle.wing
         north, east, _ = self._place

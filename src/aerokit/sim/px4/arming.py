@@ -197,7 +197,7 @@ class Px4Arming:
 
     @property
     def _mode_allows(self) -> bool:
-        """False in RETURN, LAND and ORBIT, and in a mode whose sticks, set-points or mission are missing."""
+        """False in a mode in which PX4 never arms, such as RETURN or LAND, and in a mode that `can_run` refuses."""
         mode = self._px4.mode
         return modes.MODES[mode].can_arm and self._px4.can_run(mode)
 

@@ -180,8 +180,8 @@ class Px4MissionServer(MissionServer):
             due = min(due, self._px4.now + self.retry_interval_s)
         self._px4.call_at(due, lambda: self._check(upload))
 
-    def _is_watched(self, upload: ListUpload) -> bool:
-        """Return True until the transfer has ended or another transfer of its link has replaced it."""
+    def _may_time_out(self, upload: ListUpload) -> bool:
+        """Return True unless the transfer has ended, or another transfer of its link has replaced it."""
         link = self._link(upload.channel)
         return link is upload and link.state is not TransferState.IDLE
 

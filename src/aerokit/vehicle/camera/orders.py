@@ -372,7 +372,7 @@ class MessageRequests:
                     await self._refresh(cell)
 
     async def _refresh(self, cell: _PolledCell) -> None:
-        """Request the message of one state value, and record whether the camera certainly or possibly lacks it."""
+        """Request the message of one state value. If the camera refuses, record that it lacks, or may lack, it."""
         cell.requested_at = self._link.now()
         try:
             await self.request(cell.message_type, timeout=POLL_INTERVAL_S)

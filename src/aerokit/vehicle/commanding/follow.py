@@ -65,7 +65,7 @@ class FollowPlace(Snapshot):
 class TargetState(Snapshot):
     """Position of the target with its velocity (north, east, down in m/s).
 
-    ``reported_at`` is the time of the last report of this position, ``first_reported_at`` the time of its first report.
+    The same position may be reported several times: first at ``first_reported_at``, and last at ``reported_at``.
     """
 
     position: Position

@@ -122,10 +122,10 @@ class Order:
     Modes are classified as follows:
 
     - ``mode_before`` was active when the order was given.
-    - ``modes`` are the order's own modes.
-    - ``expected`` modes may appear in any sequence until ``settles_at``, because the program ordered them shortly
-      before. They are no longer accepted once one of the order's own modes is reported. With ``requires_mode_change``,
-      reports of an own mode that was already active do not count: the mode must change to it.
+    - ``modes`` are the order's own modes: a report of one of them shows that the order has taken effect. With
+      ``requires_mode_change``, only a change to one of them shows this.
+    - ``expected`` modes were ordered by the program shortly before. They may appear in any sequence until
+      ``settles_at``. After that time, they are accepted only until the order has taken effect.
     - Until ``any_until`` every mode is accepted, because the program sent a raw command with an unknown effect.
     - Any other mode is attributed to the pilot or a failsafe.
     """
@@ -296,9 +296,9 @@ class Order:
         self._mode_now = number
 
     def on_system_status(self, state: int) -> None:
-        """Record a failsafe if MAV_STATE is worse than in the last report, which may be from before the order.
+        """Record a failsafe if MAV_STATE is worse than when it was last reported, even if that was before the order.
 
-        An order to land, to return or to disarm is not ended by any failsafe.
+        A failsafe does not end an order to land, to return or to disarm.
         """
         if is_worse_failsafe(state, self._last_state):  # `end` ignores a failsafe if the order ends the flight.
             self.failsafe = self.failsafe or failsafe_text(state)

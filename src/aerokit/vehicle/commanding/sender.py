@@ -301,7 +301,7 @@ class OrderSender:
         return failure_reason
 
     def impact_failure(self, order: Order) -> Callable[[], str]:
-        """Return a function that returns a text if the vehicle has hit the ground and ``order`` is still newest."""
+        """Return a function that describes an impact on the ground; "" if there is none, or a newer order was given."""
         detector = ImpactDetector(self._session.telemetry)
 
         def failure_reason() -> str:

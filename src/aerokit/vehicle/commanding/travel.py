@@ -210,10 +210,10 @@ class TravelActions(VehicleBase):
         sent_at = started  # when `unacknowledged_target` was last sent
 
         def resend_if_due() -> None:
-            """Resend the target if it is due.
+            """Send the target again if RESEND_INTERVAL_S has passed since the last transmission.
 
-            It is not sent if the state is not recent or the order has ended. If the computer has slept since the last
-            transmission, the target is never sent again, because it would be too late.
+            It is not sent while the state is not recent, or after the order has ended. Once the computer has slept, it
+            is never sent again, because it would be too late.
             """
             nonlocal sent_at
             now = self.connection.now()

@@ -53,11 +53,13 @@ RETURN_TIMEOUT_S = 300.0
 class MissionEndDetector:
     """Detects the end of a mission.
 
-    Usually, a mission has ended when the vehicle reports completion. A mission whose last item is a landing, or a
-    return with a landing, ends only on the ground, because PX4 reports completion when the return starts. Such a
-    mission also ends, without a report, when the vehicle disarms in the mode of the last item. A return without a
-    landing ends at home. If the vehicle reports no mission state, the mission has ended when the last item is reached.
-    If the items are unknown, the mode after the completion shows whether the vehicle lands.
+    Usually, a mission has ended when the vehicle reports completion or, if it reports no mission state, when the last
+    item is reached. These missions end later:
+
+    - If the last item is a landing, or a return with a landing, the vehicle must also be on the ground, because PX4
+      reports completion when the return starts. Disarming in the mode of the last item suffices without a report.
+    - If the last item is a return without a landing, the vehicle must be at home.
+    - If the items are unknown, the mode after the completion shows whether the vehicle still lands.
 
     If a failsafe during the last item changes the mode, e.g. to land elsewhere, the mission has failed.
     """

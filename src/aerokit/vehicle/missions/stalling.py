@@ -59,9 +59,9 @@ class MissionStallDetector:
         self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:
-        """Return the part of an error text that describes the fall or the stall; None if there is neither.
+        """Return a clause for an error text if the vehicle has fallen, or does not move although it should; else None.
 
-        A vehicle has not stalled if it may stand still at its current item, or is paused or disarmed.
+        Always None while the vehicle is paused or disarmed.
         """
         progress, current = self._tracker.progress.latest, self._tracker.current.latest
         is_paused = self._is_paused() or (progress is not None and progress.state == MissionState.PAUSED)

@@ -359,9 +359,9 @@ class ParameterAccess:
             self.store.unmark_replaced(name)
 
     def _recently_written(self) -> set[str]:
-        """Return the names whose last write may still be answered.
+        """Return the names of parameters whose last write may still be answered.
 
-        This answer could be taken for the answer to the next write, so the next write is verified by a read.
+        A late answer could be taken for the answer to the next write, so the next write is verified by a read.
         """
         earliest = self._transfers.connection.now() - ECHO_WINDOW_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}

@@ -249,11 +249,11 @@ class Parameters(ReadOnly):
     ) -> TemporaryParameters:
         """Set values for the duration of an ``async with`` block, and restore the previous values at its end.
 
-        They are also restored if the block raises or is cancelled, which takes at most three times ``idle_timeout_s``.
+        They are also restored if the block raises or is cancelled; this takes at most three times ``idle_timeout_s``.
         If one value cannot be set, all other values are restored and the error is raised. Blocks may be nested and may
         overlap, also with the same parameter: when the last of these blocks ends, the parameter gets its value from
-        before the first block. A value that another station has changed meanwhile stays, and a warning of logger
-        "aerokit" names the parameter.
+        before the first block. If another station has changed a value meanwhile, that value stays, and a warning of
+        logger "aerokit" names the parameter.
 
         Raises:
             RollbackFailed: some values could not be restored; ``not_restored`` has them.

@@ -69,11 +69,11 @@ class ParameterStore:
         return name in self._known
 
     def mark_replaced(self, name: str, value: float) -> None:
-        """Ignore messages with this previous value for ``IN_FLIGHT_S`` seconds, because a write has just replaced it.
+        """Ignore messages with the old value of a parameter for ``IN_FLIGHT_S`` seconds after a write has replaced it.
 
         ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
-        value. An answer with the previous value may therefore arrive after the confirmation of the write. Another
-        station may also have restored the previous value, so ``on_discarded`` is called after each ignored message.
+        value. An answer with the old value may therefore arrive after the confirmation of the write. Such a message may
+        also mean that another station has restored the old value, so ``on_discarded`` is called after each of them.
         """
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 

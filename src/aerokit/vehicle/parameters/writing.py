@@ -170,7 +170,7 @@ MAX_RELATIVE_ROUNDING = 1e-3
 
 
 class ParameterWrite(Snapshot):
-    """Result of writing one parameter, in the name and unit that the program used.
+    """Result of writing one parameter. The name and the unit are the program's, even if the vehicle uses others.
 
     ``outcome`` is one of:
 

@@ -138,8 +138,8 @@ class Rtk:
     def _send(self, message: bytes) -> None:
         """Send one RTCM message and update the statistics.
 
-        A message reaches all vehicles of the connection. If it was just sent for another of them, it is counted here
-        too, but not sent again.
+        One transmission reaches all vehicles of the connection. If the object of another vehicle has just sent the same
+        message, this method only counts it.
         """
         if self._session.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")

@@ -171,7 +171,10 @@ class CommandSender:
         return self.last_result(command, component_id) in UNSUPPORTED_RESULTS
 
     def may_get_late_ack(self, command: int, component_id: int) -> bool:
-        """Return True if the ack of an earlier command may arrive and be taken for that of one sent now, only once."""
+        """Return True if an earlier transmission of this command may still be answered.
+
+        Its late ack could then be taken for the ack of the same command that is sent now, without retries.
+        """
         earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return any(recorded_at >= earliest for recorded_at in self._pending_acks.get((component_id, command), ()))
 
