@@ -376,8 +376,8 @@ class ParameterAccess:
     ) -> dict[str, ParameterAnswer]:
         """Write parameters in one file if possible. Then set, one by one, those that the vehicle did not apply.
 
-        Writes by other tasks wait until all is done. Otherwise, a value that another task writes during the read-back
-        would be overwritten, because it is not the one in the file.
+        Writes by other tasks wait until all is done. A value that another task wrote during the read-back would differ
+        from the file, count as not applied, and be overwritten.
         """
         parameters = tuple(parameters)
         if not parameters:
