@@ -336,7 +336,7 @@ class FleetAction:
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
-        """Ask the policy about a failure, send its orders, and cancel the running actions of members with an order."""
+        """Ask the policy about a failure. Send its orders, and cancel the running actions of members with orders."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
