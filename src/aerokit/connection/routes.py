@@ -39,8 +39,8 @@ class RouteClaim:
     """Evidence on whether a component now sends from another peer of the link.
 
     The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
-    the component claims the route. When the owner sends again, the claim starts anew. Only the claim's first frame must
-    have a sequence number that continues the owner's. Later numbers are no evidence, because a peer could try many.
+    the component claims the route. When the owner sends again, the claim starts anew. Only the sequence number of the
+    claim's first frame is evidence, because a peer could try many numbers until one continues the owner's.
     """
 
     __slots__ = (

@@ -266,7 +266,7 @@ class FleetAction:
         return member.name in self._failed or member.name in self._stopped
 
     def _has_newer_order(self, member: Member) -> bool:
-        """Return True if the program has given the member a newer order. This action then must not order anything else.
+        """Return True if the program has given the member a newer order. This action must then send no other order.
 
         This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
         vehicle to land or to return.

@@ -2703,9 +2703,9 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         the mission, the mode after the completion shows whether the vehicle lands.
 
         When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
-        items and the mission id (PX4 1.15 and later); on a shared link, it has also seen the vehicle's answer to the
-        other station. It does not notice a mission with the same number of items that ArduPilot has received over
-        another link or as a file: call :meth:`download` first if another station may replace missions.
+        items and the mission id (PX4 1.15 and later). If both stations share a link, it has also seen the vehicle's
+        answer to the other station. It does not notice a mission with the same number of items that ArduPilot has
+        received over another link or as a file: call :meth:`download` first if another station may replace missions.
 
         Args:
             timeout: seconds to wait; None for no limit.

@@ -225,7 +225,7 @@ class ClientFilter:
     ) -> list[RefusalNotice]:
         """Count a refused frame, and return a notice of it, or nothing if the last notice of this message is recent.
 
-        If the client waits for an answer, which the notice contains, the notice is always returned.
+        A notice that contains an answer is always returned, because the client waits for the answer to its command.
         """
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME

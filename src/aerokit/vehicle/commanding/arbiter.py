@@ -183,8 +183,8 @@ class CommandArbiter:
     def auxiliary_order(self, device_order: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
         """Create an order that does not say where to fly (speed, home, arming …).
 
-        ``device_order`` is an order about a device that needs several commands. The new order is then for one of these
-        commands, and ends when a newer order about the device is given.
+        ``device_order`` is the order about a device for which the new order sends a command. A newer order about the
+        device ends both.
 
         Raises:
             OperationRejected: a newer order about the device was given.
