@@ -315,8 +315,9 @@ class FrameReceiver:
     def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:
         """Return True for the frames of a second sender with the same ids, and for outdated heartbeats.
 
-        A frame may be that of a second sender if its sequence number does not continue the earlier ones. A heartbeat
-        is then dropped at once; another frame only if the counters prove that there are two senders, which is reported.
+        If a frame's sequence number does not continue the earlier ones, a second sender may have sent the frame. A
+        heartbeat is dropped on this suspicion. Other frames are dropped only after the sequence numbers of several
+        frames have proved that there are two senders. The proof is reported.
         """
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:

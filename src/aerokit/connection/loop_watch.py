@@ -52,11 +52,13 @@ def loop_clock() -> Callable[[], float]:
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    Data may arrive during a pause and wait. Until all of this data has been read, its receive time is the time at which
-    the loop last ran before the pause. Pauses shorter than ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` are not detected, so
-    ages may be too small by up to this time. ``on_blocked`` gets the maximum length of each pause that delays the timer
-    by more than ``BLOCKED_THRESHOLD_S``. ``on_slept`` gets the time that the computer was suspended. ``on_caught_up``
-    is called when all waiting data has been read, and gets the seconds from the start of the pause until then.
+    Data that arrives during a pause waits until it is read. After a pause, all data gets as its receive time the time
+    at which the loop last ran before the pause, until no waiting data is left. A pause shorter than
+    ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` may not be detected. The age of data may then be too small by its length.
+
+    ``on_blocked`` gets the maximum length of each pause that delays the timer by more than ``BLOCKED_THRESHOLD_S``.
+    ``on_slept`` gets the time that the computer was suspended. ``on_caught_up`` is called when all waiting data has
+    been read, and gets the seconds from the start of the pause until then.
     """
 
     def __init__(

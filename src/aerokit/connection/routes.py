@@ -39,8 +39,8 @@ class RouteClaim:
     """Evidence on whether a component now sends from another peer of the link.
 
     The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
-    the component claims the route. Only the first frame after the owner's last frame is judged by its sequence number,
-    because a peer could otherwise try many numbers. When the owner sends again, the claim starts anew.
+    the component claims the route. When the owner sends again, the claim starts anew. Only the sequence number of the
+    claim's first frame is evidence, because a peer could try many numbers until one continues the owner's.
     """
 
     __slots__ = (
@@ -100,7 +100,7 @@ class RouteClaim:
 
     @property
     def may_continue_owner(self) -> bool:
-        """True unless the evidence shows that the new peer is another sender than the owner."""
+        """True unless the evidence proves that the new peer is not the owner itself."""
         return self._sequence_matches is not False and self._clock_matches is not False
 
 
@@ -337,7 +337,7 @@ class Routes:
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
-        """Publish that a second sender uses the ids, and that it does not get the route of the silent owner.
+        """Publish DuplicateSender for a second sender, and RouteChangeRefused if it claims the route of a silent owner.
 
         For each peer, DuplicateSender is published once, RouteChangeRefused once during each silence of the owner.
         """

@@ -225,9 +225,9 @@ class Core:
 
         The handler is called on the loop thread, as long as this object exists. Add it before the vehicle is connected.
 
-        If the handler only announces attributes, pass the attributes' ``names``. It is then called only while one of
-        them has no value yet, or has listeners on the vehicle or in ``listeners``. Other messages are skipped for all
-        handlers of the type, so pass names for all of them or for none.
+        If the handler only notifies the listeners of attributes, pass the ``names`` of the attributes. The handlers of
+        this message type are then called only while one of the attributes has no value yet, or has listeners on the
+        vehicle or in ``listeners``. This concerns all handlers of the type, so pass names for all of them or for none.
         """
         if message_type not in self._latest:
             self._latest[message_type] = LatestMessage(message_type, self.ready.names, self.listeners)

@@ -266,7 +266,7 @@ class FleetAction:
         return member.name in self._failed or member.name in self._stopped
 
     def _has_newer_order(self, member: Member) -> bool:
-        """Return True if the program has given the member a newer order, which this order of the policy must not end.
+        """Return True if the program has given the member a newer order. This action must then send no other order.
 
         This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
         vehicle to land or to return.
@@ -339,7 +339,7 @@ class FleetAction:
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
-        """Ask the policy about a failure, send its orders, and cancel the running actions of members with an order."""
+        """Ask the policy about a failure. Send its orders, and cancel the running actions of members with orders."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]

@@ -161,7 +161,8 @@ class Member:
     def _takeover_reason(self) -> str:
         """Return why the member counts as taken over; an empty string if it does not.
 
-        A failsafe that was active at `reclaim` is ignored until it gets worse, or until a call finds that it has ended.
+        A failsafe that was active at `reclaim` is ignored unless it gets worse. Once this method was called without a
+        failsafe, the next failsafe counts again.
         """
         vehicle = self.vehicle
         state = vehicle.system_status.latest

@@ -219,7 +219,8 @@ def _closest_inside(
 ) -> tuple[float, float] | None:
     """Return the s and t (see `_closest`) at which the straight lines through two legs are closest to each other.
 
-    There, both derivatives of the squared distance are 0. None if s or t is not from 0 to 1, or the lines are parallel.
+    At these values, both derivatives of the squared distance are 0. Return None if a value is not within 0 to 1, which
+    is beyond the leg, or if the lines are parallel.
     """
     # Dot products of a (`vector`), b (`other_vector`) and d (`start_difference`).
     aa, bb = _dot(vector, vector), _dot(other_vector, other_vector)

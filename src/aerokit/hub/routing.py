@@ -110,7 +110,8 @@ class Router(Generic[PortT]):
       and also to each port at which only other components of the system were received. Ground stations that share ids
       all get the messages for these ids. An autopilot has priority over other senders with its ids.
     - A frame never goes back to the port at which it arrived, and is forwarded once. Copies that arrive at other ports
-      within two seconds are dropped. Later copies are dropped if they prove a loop. Copies do not change routes.
+      within two seconds are dropped. Later ones are dropped once several of them show that the ports form a loop.
+      Copies do not change routes.
     - SETUP_SIGNING, which contains a key, is not forwarded. Status messages of telemetry radios do not go to vehicles.
 
     At most `MAX_ROUTES` senders are remembered. A new sender replaces a sender without heartbeats, or a sender that was
@@ -308,9 +309,9 @@ class Router(Generic[PortT]):
         return first_port in self._nodes and existed_then and now - received_at <= DUPLICATE_WINDOW_S
 
     def _is_echo(self, earlier: tuple[int, int, float], number: int, now: float) -> bool:
-        """Return True if a recent frame at another port was equal, and port ``number`` already existed at that time.
+        """Return True if an equal frame arrived recently at another port, while port ``number`` already existed.
 
-        Then either the frame has returned through a loop, or two frames are equal by chance.
+        The frame has then returned through a loop, unless it is a new frame that equals the earlier one by chance.
         """
         first_port, port_count, received_at = earlier
         return first_port != number and number <= port_count and now - received_at <= LOOP_WINDOW_S

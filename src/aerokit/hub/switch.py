@@ -200,7 +200,7 @@ class Switch:
         return remaining
 
     def _forward_together(self, plans: list[ForwardingPlan[Port]], data: bytes) -> bool:
-        """Forward ``data`` as it is if its frames go to the same ports, and fit into one write. Else return False."""
+        """Forward ``data`` in one write if its frames allow this and go to the same ports; otherwise return False."""
         outs = plans[0].outs
         for plan in plans:
             if plan.outs is not outs or not plan.is_plain:

@@ -192,7 +192,7 @@ class SourceStatistics(SourceFields):
         self._missing = self._skipped_over = 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        """Process a frame that continues the other stream. Return what :meth:`out_of_order` is to return for it.
+        """Process a frame that continues the other of two streams. Return `IN_ORDER`, `LATE` or `OTHERS`.
 
         The other stream replaces the current stream at once if the current stream has timed out, or after
         `_MIN_RETURNS` frames if the other stream has more frames than the current stream.

@@ -161,8 +161,8 @@ def _px4_letters(item: MissionItem) -> str:
 def _convert(letter: str, value: float) -> Iterator[float]:
     """Yield the value that the vehicle reports after it has stored ``value`` in the form that ``letter`` stands for.
 
-    Yield nothing if the value is beyond the range of the form, where the result of C's conversion is undefined. For
-    NaN and infinities, forms that store a number yield NaN.
+    Yield nothing if the value is out of the form's range, because C does not define the result of this conversion.
+    NaN and infinities become NaN in forms that store a number.
     """
     if letter == "-":  # not stored
         yield 0.0

@@ -173,9 +173,10 @@ def translate_values(
 ) -> tuple[dict[str, int | float], tuple[Renamed, ...]]:
     """Convert the values of a file or table to the names and units that a vehicle uses; ``known`` are its names.
 
-    A parameter that the vehicle has under no name is not changed. If ``values`` has a parameter under several names,
-    the value under the vehicle's name is used, or the last value if that name is missing. ``types`` are the vehicle's
-    types, for rounding. The second result lists the converted parameters.
+    A parameter that the vehicle does not have, whether under this name or another, keeps its name and value. If
+    ``values`` has a parameter under several names, the value under the vehicle's name is used, or the last value if
+    that name is missing. ``types`` are the vehicle's types, for rounding. The second result lists the converted
+    parameters.
     """
     translated: dict[str, int | float] = {}
     renamed: list[Renamed] = []

@@ -140,10 +140,10 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
 class SettingReads(NamedReads[Setting]):
     """Read some settings by name. The result has one answer for each name, in the order given.
 
-    Components do not answer requests for unknown names. While a name is overdue, the setting of index 0 is therefore
-    requested, too. If the component answers for index 0 but repeatedly not for the name, the result for the name is a
-    ParameterRejected. After ``idle_timeout_s`` seconds without progress, the missing answers become ParameterTimeout
-    errors.
+    Components do not answer requests for unknown names. A name that is not answered in time is therefore requested
+    again, together with the setting of index 0, which always exists. If index 0 is answered several times, but the name
+    never, the name's result is a ParameterRejected. After ``idle_timeout_s`` seconds without progress, the missing
+    answers become ParameterTimeout errors.
     """
 
     expects: tuple[type[Message], ...] = (ParamExtValue,)

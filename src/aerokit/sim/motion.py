@@ -324,7 +324,7 @@ class Motion:
         return north, east, down
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
-        """Return the acceleration (north, east) of a copter that leans by these angles in radians."""
+        """Return the acceleration (north, east), reduced by drag, of a copter that leans by these angles in radians."""
         max_lean = self.limits.lean_rad
         # A positive pitch raises the nose, which pushes the copter backwards. A positive roll pushes it to the right.
         forward = -GRAVITY_M_S2 * math.tan(_clamp(pitch, max_lean))

@@ -58,9 +58,9 @@ class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
     With ``sends_errors``, as in the released version of 4.7, a request with an unknown name or a value of NaN or
-    infinity is answered by PARAM_ERROR, and PARAM_SET is confirmed on the sender's port in addition to the broadcast.
-    Without ``sends_errors``, as in the development version of 4.7, such a request has no answer, and PARAM_SET only the
-    broadcast.
+    infinity is answered by PARAM_ERROR, and PARAM_SET is confirmed on the sender's port before the broadcast. Without
+    ``sends_errors``, as in the development version of 4.7, such a request is not answered, and PARAM_SET is confirmed
+    only by the broadcast.
 
     One read request is served each millisecond. Up to 20 requests wait in a queue, and further requests are lost.
     The banner texts are sent before a list.

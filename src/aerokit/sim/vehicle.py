@@ -244,7 +244,7 @@ class SimulatedVehicle:
 
     @property
     def is_steady(self) -> bool:
-        """True if a long tick gives the same result as several short ticks.
+        """True while the motion changes so little that one long tick is as good as several short ticks.
 
         A long tick lasts at most 0.12 s. It ends before anything is received, streamed or due, so that samples are as
         recent as with short ticks.

@@ -1067,8 +1067,9 @@ class Gimbal(TwinOf["AsyncGimbal"]):
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
     reports the ordered direction, and raises an error when another order is given. While the vehicle moves, the gimbal
-    keeps the direction in the frame of the order, e.g. its yaw from north or from the nose. If the manager requires
-    control, an order outside a block of :meth:`control` claims control until :meth:`release`.
+    keeps the direction in the frame of the order, e.g. its yaw from north or from the nose. If the manager accepts
+    orders only from the station in control, an order outside a block of :meth:`control` claims control, and keeps it
+    until :meth:`release`.
     """
 
     @cached_property
@@ -2701,10 +2702,10 @@ class MissionControl(TwinOf["AsyncMissionControl"]):
         a download shows whether the mission ends with a landing. Without them, or after another station has replaced
         the mission, the mode after the completion shows whether the vehicle lands.
 
-        When the call begins, aerokit notices a replaced mission by its number of items, by its mission id (PX4 1.15 and
-        later), or by the vehicle's answer to the other station, if both stations share a link. It does not notice a
-        mission with the same number of items that ArduPilot has received over another link or as a file: call
-        :meth:`download` first if another station may replace missions.
+        When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
+        items and the mission id (PX4 1.15 and later). If both stations share a link, it has also seen the vehicle's
+        answer to the other station. It does not notice a mission with the same number of items that ArduPilot has
+        received over another link or as a file: call :meth:`download` first if another station may replace missions.
 
         Args:
             timeout: seconds to wait; None for no limit.
@@ -4194,8 +4195,8 @@ class Vehicle(VehicleTwin):
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
         If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
-        as :meth:`command` does. A set-point does not end the action, only orders about motion that :meth:`posted` has
-        opened. A message to another system ends nothing.
+        as :meth:`command` does. A set-point does not end the action in progress, but it ends orders about motion that
+        :meth:`posted` has opened. A message to another system ends nothing.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.

@@ -169,7 +169,7 @@ class LinkExamination:
         return not set(self._frames) - {self._own_ids}
 
     def _silence(self) -> Iterator[Finding]:
-        """Yield the problem that no autopilot was received, with advice that depends on what was received instead."""
+        """If no autopilot was received, yield this problem, with advice that depends on what was received instead."""
         connection = self._connection
         if any(is_autopilot(heartbeat) for heartbeat in connection.heartbeats.values()):
             return

@@ -205,7 +205,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _rewrite_for_commands(record: logging.LogRecord) -> bool:
-    """Logging filter that rewords advice to change code, because users of a command have no code to change."""
+    """Logging filter that rewords messages about the program's code, because users of a command have no such code."""
     if str(record.msg).startswith("the async with block of vehicle %d was left: "):
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):

@@ -118,7 +118,7 @@ def _complete(flight: FlightLog) -> None:
 
 
 def _armed_at_end_note(flight: FlightLog) -> str:
-    """Return a note that the log ends while the vehicle is armed, and what is therefore unknown."""
+    """Return a note that the log ends while the vehicle is armed, with its last state unless it is near the ground."""
     note = "the log ends while the vehicle is armed"
     is_silent = bool(flight.silences) and flight.silences[-1].ends_s >= flight.duration_s
     heard_s = flight.silences[-1].begins_s if is_silent else flight.duration_s

@@ -251,7 +251,7 @@ def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tuple[list[dict[str, Any]], float]:
-    """Return a line for each mode, and the largest distance of a point of the track from these lines."""
+    """Return the track as one Plotly line per mode, and the largest distance of a position from the drawn track."""
     times, heights = flight.track.times, flight.track["altitude_relative_m"]
     changes = flight.modes or [ModeChange(0.0, "")]
     # The rows at which the modes begin, and the end of the last mode.

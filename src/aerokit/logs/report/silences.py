@@ -26,7 +26,7 @@ _OTHER_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def silence_sentences(flight: FlightLog) -> list[str]:
-    """Return sentences about silences that began while the vehicle was armed, and about the ground station failsafe."""
+    """Return sentences about silences that began while armed, and about the failsafe if the vehicle was silent."""
     silences = [
         silence for silence in flight.silences if any(begin <= silence.begins_s <= end for begin, end in flight.armed)
     ]

@@ -236,9 +236,9 @@ class ArduPilotVehicle(ArduPilotHost):
         return self.storage.ftp
 
     def is_addressed(self, message: Message) -> bool:
-        """Return True for a message to this system or to all systems, unless it is for one of `components`.
+        """Return True if a message is for the autopilot: to this system or all systems, and to none of `components`.
 
-        As in the firmware (MAVLink_routing.cpp), a message for a component that does not exist is included.
+        As in the firmware (MAVLink_routing.cpp), the autopilot also processes messages to a component that is unknown.
         """
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.system_id) and all(component != present.component_id for present in self.components)

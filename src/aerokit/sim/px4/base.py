@@ -385,7 +385,7 @@ class Px4Vehicle(Px4Host):
             self.mission.on_landed()
 
     def _auto_disarm(self) -> None:
-        """Disarm some time after a landing, or after arming without a take-off. A time of 0 turns this off."""
+        """Disarm COM_DISARM_LAND s after a landing, or COM_DISARM_PRFLT s after arming without take-off (0: never)."""
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown:

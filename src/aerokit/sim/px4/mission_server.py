@@ -200,9 +200,9 @@ class Px4MissionServer(MissionServer):
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         """Start or restart a download.
 
-        If an open transfer has transferred as many items as are stored, it is ended first, as in PX4
-        (mavlink_mission.cpp, handle_mission_request_list). PX4 does this even to an unfinished upload, and then refuses
-        other uploads until a download times out.
+        A transfer that is open on this link is ended first if the number of items it has transferred equals the number
+        of stored items, as in PX4 (mavlink_mission.cpp, handle_mission_request_list). This may end an unfinished
+        upload. PX4 then refuses other uploads until a download times out.
         """
         link = self._link(channel)
         if link.next == self.count(link.mission_type):

@@ -223,9 +223,9 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
-        """Count a refused frame, and return a notice, unless a notice about this message was returned recently.
+        """Count a refused frame, and return a notice of it, or nothing if the last notice of this message is recent.
 
-        A notice with an answer for the client is always returned.
+        A notice that contains an answer is always returned, because the client waits for the answer to its command.
         """
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME

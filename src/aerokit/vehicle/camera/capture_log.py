@@ -267,9 +267,9 @@ class CaptureLog:
                 self._outlier = entry
 
     def _add_failed(self, message: Message, entry: _Entry) -> None:
-        """Publish a failed picture, and store it unless a successful picture has the same index.
+        """Publish a failed picture once, and store it unless a successful picture has the same index.
 
-        The camera may use the index of a failed picture again.
+        Two pictures can have one index, because a camera may use the index of a failed picture again.
         """
         index, last_failed = entry.capture.index, self._failed
         if last_failed is not None and last_failed.capture.index == index and last_failed.reports_same_picture(entry):

@@ -197,8 +197,9 @@ class Shutter:
 def _is_new(capture: Capture, before: CameraStatus | None, known_indices: set[int]) -> bool:
     """Return True if a capture may be of a picture that was ordered after the status ``before``.
 
-    A lower index than the image count of ``before`` usually belongs to an older picture. It may belong to a new one if
-    no capture with this index was known before the order, because a camera may use the index of a failed picture again.
+    An index below the image count of ``before`` usually means an older picture. ``known_indices`` are those of the
+    captures known before the order. If the low index is not among them, the picture may be new, because a camera may
+    use the index of a failed picture again.
     """
     is_low = before is not None and capture.index < before.image_count
     return not is_low or capture.index not in known_indices

@@ -36,7 +36,7 @@ STEERING, ACTION = "steering", "action"
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
     """Return True if the vehicle, which is now armed, was armed by the order that it accepted at ``accepted_at``.
 
-    ``disarmed_at`` is the time of the last report of disarmed. If HEARTBEAT still reports disarmed more than
+    ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed. If this is more than
     ``ARM_HEARTBEAT_DELAY_S`` after the acceptance, the order had no effect, and another party has armed the vehicle.
     """
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
@@ -183,8 +183,8 @@ class CommandArbiter:
     def auxiliary_order(self, device_order: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
         """Create an order that does not say where to fly (speed, home, arming …).
 
-        With ``device_order``, which is an order about a device, the new order is for one of its commands. It ends when
-        a newer order about the device is given.
+        ``device_order`` is the order about a device for which the new order sends a command. A newer order about the
+        device ends both.
 
         Raises:
             OperationRejected: a newer order about the device was given.
@@ -440,7 +440,7 @@ class CommandArbiter:
         return tuple(mode for order in unconfirmed_orders for mode in order.modes)
 
     def _record_unreported(self, order: Order) -> None:
-        """Record the modes of an order that is replaced, or whose block is left, if they may be reported later."""
+        """Record the modes of an order that has just ended, if HEARTBEAT may still report them as its effect."""
         now, present_mode = self._now(), self._telemetry.mode.latest
         is_reported = present_mode is not None and order.is_own(present_mode)
         is_recent = now - order.given_at < MODE_GRACE_S  # An order with several modes may change the mode once more.

@@ -309,7 +309,7 @@ ARM_CLOSE_TIMEOUT_S = 1.5
 
 
 class ArmCleanup:
-    """Monitors the vehicle after an arm order was abandoned, and disarms the vehicle if the order still arms it."""
+    """Monitors the vehicle after an arm order was abandoned, and disarms it if this order arms it after all."""
 
     def __init__(self, session: VehicleSession, arbiter: CommandArbiter, sender: OrderSender) -> None:
         self._session, self._arbiter, self._sender = session, arbiter, sender

@@ -251,8 +251,8 @@ class MessagingActions(VehicleBase):
         """Send one message unchanged, once; never blocks. The caller sets its ``target_system``.
 
         If the message is a command (or SET_MODE) that changes the mode or the motion, it ends the action in progress,
-        as :meth:`command` does. A set-point does not end the action, only orders about motion that :meth:`posted` has
-        opened. A message to another system ends nothing.
+        as :meth:`command` does. A set-point does not end the action in progress, but it ends orders about motion that
+        :meth:`posted` has opened. A message to another system ends nothing.
 
         Raises:
             InvalidArgument: a field is out of range; nothing was sent.

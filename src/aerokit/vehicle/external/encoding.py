@@ -119,7 +119,7 @@ class MeasurementEncoder:
         return self._time_us(value.measured_at), position, covariance
 
     def vision_speed(self, value: v.SpeedMeasurement) -> tuple[Message, ...]:
-        """Return VISION_SPEED_ESTIMATE, or ODOMETRY without a pose if the autopilot reads only ODOMETRY."""
+        """Return VISION_SPEED_ESTIMATE. For an autopilot that does not read it, return ODOMETRY without a pose."""
         speeds = (value.north_m_s, value.east_m_s, value.down_m_s)
         check_finite("velocity", *speeds)
         time_us, reset_count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)

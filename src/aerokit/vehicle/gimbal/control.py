@@ -87,9 +87,10 @@ class ReleaseCommand:
             self._send()
 
         async def send_until_acknowledged() -> None:
-            """If the vehicle is silent, send the command at its next HEARTBEAT. Then wait for the acknowledgement.
+            """Wait for the acknowledgement. If the vehicle was silent, first send the command at its next HEARTBEAT.
 
-            If none arrives because the gimbal manager is silent, send the command again at its next HEARTBEAT.
+            If the gimbal manager is silent and does not acknowledge, send the command again at the manager's next
+            HEARTBEAT.
             """
             with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
                 if not can_send_now:

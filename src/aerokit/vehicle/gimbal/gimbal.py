@@ -184,8 +184,9 @@ class Gimbal(ReadOnly, PointingMixin, RoiMixin):
 
     ``vehicle.gimbal`` is the first gimbal, ``vehicle.gimbals`` has all gimbals. An order returns when the gimbal
     reports the ordered direction, and raises an error when another order is given. While the vehicle moves, the gimbal
-    keeps the direction in the frame of the order, e.g. its yaw from north or from the nose. If the manager requires
-    control, an order outside a block of :meth:`control` claims control until :meth:`release`.
+    keeps the direction in the frame of the order, e.g. its yaw from north or from the nose. If the manager accepts
+    orders only from the station in control, an order outside a block of :meth:`control` claims control, and keeps it
+    until :meth:`release`.
     """
 
     async def information(self) -> GimbalInformation:

@@ -118,7 +118,8 @@ class GimbalRates(ValueStream[tuple[float, float]]):
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         """Stop the gimbal, unless a newer order was given or control was lost.
 
-        Raises the reason in these cases, and if the stream stopped earlier, unless an error was already raised.
+        Raises an error with the reason in these two cases, and if the stream stopped earlier. If the program has
+        already got this error, or leaves the block by another error, nothing is raised.
         """
         reason = self._takeover_reason() if self._stop_error is None else None
         if reason:

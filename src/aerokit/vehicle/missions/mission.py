@@ -374,10 +374,10 @@ class MissionControl(VehiclePlan["Mission"]):
         a download shows whether the mission ends with a landing. Without them, or after another station has replaced
         the mission, the mode after the completion shows whether the vehicle lands.
 
-        When the call begins, aerokit notices a replaced mission by its number of items, by its mission id (PX4 1.15 and
-        later), or by the vehicle's answer to the other station, if both stations share a link. It does not notice a
-        mission with the same number of items that ArduPilot has received over another link or as a file: call
-        :meth:`download` first if another station may replace missions.
+        When the call begins, aerokit checks whether another station has replaced the mission. It compares the number of
+        items and the mission id (PX4 1.15 and later). If both stations share a link, it has also seen the vehicle's
+        answer to the other station. It does not notice a mission with the same number of items that ArduPilot has
+        received over another link or as a file: call :meth:`download` first if another station may replace missions.
 
         Args:
             timeout: seconds to wait; None for no limit.

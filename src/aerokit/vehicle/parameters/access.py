@@ -269,8 +269,8 @@ class ParameterAccess:
     def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
         """Raise the rate at which ArduPilot handles parameters, by SET_MESSAGE_INTERVAL of PARAM_VALUE.
 
-        The rate is raised after ``after_s`` seconds, if the block lasts that long, and restored at the end of the
-        block.
+        If the block lasts longer than ``after_s`` seconds, the rate is raised after this time, and restored at the end
+        of the block.
         """
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s == math.inf:
@@ -376,8 +376,8 @@ class ParameterAccess:
     ) -> dict[str, ParameterAnswer]:
         """Write parameters in one file if possible. Then set, one by one, those that the vehicle did not apply.
 
-        Writes by other tasks wait until all is done. Otherwise, a value that another task writes during the read-back
-        would be overwritten, because it is not the one in the file.
+        Writes by other tasks wait until all is done. A value that another task wrote during the read-back would differ
+        from the file, count as not applied, and be overwritten.
         """
         parameters = tuple(parameters)
         if not parameters:

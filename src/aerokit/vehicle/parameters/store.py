@@ -82,7 +82,7 @@ class ParameterStore:
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
-        """Return the old value given to `mark_replaced` while messages with this value are ignored, otherwise None."""
+        """Return the value given to `mark_replaced`; None unless messages with this value are still ignored."""
         if name not in self._replaced:
             return None
         value, ignored_until = self._replaced[name]

@@ -282,7 +282,7 @@ class CommandSender:
             self._pending_acks.setdefault(key, []).extend([*earlier_records, *new_records])
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
-        """Remove all recorded acks with this key, and return those that are not considered lost."""
+        """Remove the pending acks with this key. Return the recorded times of those that may still arrive."""
         lost_before = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= lost_before]
 

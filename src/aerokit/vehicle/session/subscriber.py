@@ -76,7 +76,7 @@ class ComponentSubscriber:
         *,
         entire_system: bool = False,
     ) -> Subscription[ItemT]:
-        """Return a subscription to events and messages, which requests the messages during its `with` block.
+        """Return a subscription to events and messages. During its `with` block, the messages are requested.
 
         It receives the messages of this component, or of all components if ``entire_system`` is True.
         """
