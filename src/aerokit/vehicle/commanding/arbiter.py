@@ -275,8 +275,9 @@ class CommandArbiter:
         except CommandRejected:
             order.was_refused = True
             raise
-        except BaseException:  # The command was abandoned, but its acknowledgement and its effect may follow.
-            self._record_accepted(armed, sent_at)
+        except BaseException as error:  # The command was abandoned, but its acknowledgement and effect may follow.
+            if getattr(error, "was_sent", True):
+                self._record_accepted(armed, sent_at)
             raise
         finally:
             self._sent.remove(sent)
