@@ -71,7 +71,8 @@ class CommandArbiter:
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
-        # (time, mode) of each order that was replaced, or whose block was left, before HEARTBEAT reported its mode.
+        # See `late_modes`: (time, mode) of each order that was replaced, or whose block was left, before HEARTBEAT
+        # reported its mode, and of the end of a mission.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
@@ -355,7 +356,7 @@ class CommandArbiter:
     def mode_is_in_doubt(self) -> bool:
         """True while the result of a mode change is unknown, so that the reported mode may still change."""
         is_in_doubt = self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
-        return is_in_doubt or bool(self._late_modes())
+        return is_in_doubt or bool(self.late_modes())
 
     def settle_mode(self) -> None:
         """Record that the mode that was ordered last is reported, so that the modes of earlier orders cannot follow."""
@@ -383,6 +384,10 @@ class CommandArbiter:
         finally:
             self._open_mode_changes -= 1
 
+    def expect_late(self, mode: Mode) -> None:
+        """Record that the vehicle has changed to this mode by itself, but HEARTBEAT may not report it yet."""
+        self._unreported_modes.append((self._now(), mode))
+
     def doubt_mode(self) -> None:
         """Distrust the reported mode, because a command that changes it was sent without waiting for the result."""
         self._doubt_change(next(self._order_numbers))
@@ -401,7 +406,7 @@ class CommandArbiter:
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
         newest_modes = newest.modes if is_unsettled and newest is not None else ()
-        late_modes = self._late_modes()
+        late_modes = self.late_modes()
         return self._build_order(
             modes,
             ending_topics,
@@ -448,8 +453,11 @@ class CommandArbiter:
         if order.is_effect_due and (is_recent or not is_reported):
             self._unreported_modes.extend((now, mode) for mode in order.modes if mode != present_mode)
 
-    def _late_modes(self) -> tuple[Mode, ...]:
-        """Return the modes of orders that were replaced or left so shortly ago that HEARTBEAT may report them now."""
+    def late_modes(self) -> tuple[Mode, ...]:
+        """Return the modes that HEARTBEAT may report now without a newer order, because their cause was shortly ago.
+
+        The cause is an order that was replaced or left, or the end of a mission.
+        """
         since = self._now() - MODE_GRACE_S
         return tuple(mode for at, mode in self._unreported_modes if at > since)
 

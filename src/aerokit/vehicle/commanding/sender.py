@@ -65,8 +65,10 @@ class OrderSender:
         if order.was_sent and is_steering:
             await self.await_recent_state(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
-        if CHANGED_BY_COMMAND.get(command) == MOTION and self._is_taking_off:
-            modes = ()  # PX4 ends a take-off by a change to HOLD, so a change is no effect of the command.
+        if CHANGED_BY_COMMAND.get(command) == MOTION:
+            # PX4 ends a take-off or a mission by a change to HOLD, which is no effect of the command.
+            late_modes = self._arbiter.late_modes()
+            modes = () if self._is_taking_off else tuple(mode for mode in modes if mode not in late_modes)
         started = self._session.connection.now()
         with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sent:
             try:
