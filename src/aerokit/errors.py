@@ -79,8 +79,10 @@ class OperationTimeout(AerokitError, TimeoutError):
 class CommandTimeout(OperationTimeout):
     """The vehicle did not acknowledge a command (COMMAND_ACK), despite retries."""
 
-    was_sent: bool = True
-    """False if the vehicle certainly does not execute the command, because it was not sent."""
+    def __init__(self, message: str, *, was_sent: bool = True) -> None:
+        super().__init__(message)
+        self.was_sent: bool = was_sent
+        """False if the vehicle certainly does not execute the command, because it was not sent."""
 
 
 class HeartbeatTimeout(OperationTimeout):

@@ -175,6 +175,7 @@ UNKNOWN: dict[str, Any] = {
     **dict.fromkeys(("mission_completes_at_home", "condition_yaw", "has_parameter_hash"), False),
     **dict.fromkeys(("has_upper_case_parameters", "home_is_item_0", "prearm_depends_on_mode"), False),
     **dict.fromkeys(("lands_after_return", "prefers_log_messages", "mission_starts_by_command"), False),
+    "holds_after_mission": False,
     **dict.fromkeys(("repeats_item_reached", "runs_prearm_checks", "mission_needs_take_off"), False),
     **dict.fromkeys(("sets_current_by_command", "silent_without_logs", "is_surface_vehicle"), False),
     **dict.fromkeys(("accepts_ftp_session_ids", "reports_mission_checksum", "writes_partial_missions"), False),
@@ -226,6 +227,7 @@ SUB = STEERED | {
 }
 PX4 = UNKNOWN | {
     **dict.fromkeys(("has_parameter_hash", "prearm_depends_on_mode", "lands_after_return"), True),
+    "holds_after_mission": True,
     **dict.fromkeys(("repeats_item_reached", "silent_without_logs", "reports_mission_checksum"), True),
     "runs_prearm_checks": True,
     "mission_upload_window": 6,

@@ -207,6 +207,19 @@ async def test_recording_has_only_messages_that_link_accepted(tmp_path: Path) ->
     assert [order.encode().rstrip(b"\0") in recorded for order in orders] == [True, False]
 
 
+async def test_pilot_who_arms_after_unsent_arming_keeps_vehicle() -> None:
+    copter = SimulatedCopter(boot_time_s=0)
+    async with cabled(copter) as (cable, vehicle):
+        await vehicle.wait_ready()
+        cable.pull()
+        with pytest.raises(CommandTimeout, match="was not sent"):
+            await vehicle.arm()
+        assert copter.arming.arm()
+        cable.plug_in()
+        await vehicle.armed.wait_until(bool, timeout=10)
+        assert not vehicle._arbiter.is_flown_by_program
+
+
 async def test_order_is_sent_when_link_is_restored() -> None:
     async with cabled() as (cable, vehicle):
         await vehicle.wait_ready()

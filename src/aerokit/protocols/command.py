@@ -378,9 +378,9 @@ class CommandExchange(Exchange[CommandAck]):
 
     def _time_out(self, now: float, why_not_repeated: str = "") -> None:
         """Fail; the end of the error text says why the command was not sent again."""
-        error = CommandTimeout(self._timeout_text(now) + (why_not_repeated if self._transmitted_count else ""))
-        error.was_sent = self._transmitted_count > 0
-        self._fail(error)
+        was_sent = self._transmitted_count > 0
+        text = self._timeout_text(now) + (why_not_repeated if was_sent else "")
+        self._fail(CommandTimeout(text, was_sent=was_sent))
 
     def _timeout_text(self, now: float) -> str:
         name = command_name(self._message.command)

@@ -140,6 +140,18 @@ async def test_lost_video_start_does_not_undo_later_stop() -> None:
         assert [command[0] for command in commands] == [START_VIDEO, STOP_VIDEO]
 
 
+async def test_replaced_order_says_that_it_was_not_sent() -> None:
+    camera = SimulatedCamera()
+    async with on_board(camera) as vehicle:
+        await vehicle.camera.wait_found()
+        link = vehicle.camera._shutter.link
+        older = link.begin_order("video")
+        link.begin_order("video")
+        with pytest.raises(CommandTimeout, match="was not sent: another order was given") as raised:
+            await link.command(START_VIDEO, order=older)
+        assert not raised.value.was_sent
+
+
 async def test_series_end_does_not_stop_the_next_series() -> None:
     camera = SimulatedCamera()
     async with on_board(camera) as vehicle:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 
 import anyio
 import pytest
 from flight_harness import Px4Flight, now, open_px4
 
-from aerokit import Position
+from aerokit import Position, Vehicle
 from aerokit import messages as m
 from aerokit._internal import geo
 from aerokit.connection.cells import StateCell
+from aerokit.dronekit import flight_orders
 from aerokit.errors import CommandRejected, OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.sim.px4.modes import POSITION, custom_mode
@@ -120,14 +121,29 @@ async def test_go_to_with_speed_and_heading(flying: Px4Flight) -> None:
     assert command.z == pytest.approx(flying.vehicle.home.value.altitude_amsl_m + 15.0, abs=0.01)
 
 
-async def test_lost_go_to_right_after_take_off_is_repeated() -> None:
+async def go_to_10_m_north(vehicle: Vehicle) -> None:
+    await vehicle.go_to(vehicle.home.value.position.offset(north_m=10.0))
+
+
+async def turn_east(vehicle: Vehicle) -> None:
+    await vehicle.set_heading(90.0)
+
+
+async def go_to_as_dronekit(vehicle: Vehicle) -> None:
+    home = vehicle.home.value
+    latitude, longitude = round(home.latitude_deg * 1e7), round(home.longitude_deg * 1e7)
+    await flight_orders.go_to(vehicle, latitude, longitude, home.altitude_amsl_m + 10.0)
+
+
+@pytest.mark.parametrize("order", [go_to_10_m_north, turn_east, go_to_as_dronekit])
+async def test_lost_order_right_after_take_off_is_repeated(order: Callable[[Vehicle], Awaitable[None]]) -> None:
     async with open_px4(latency_s=0.3) as flight:
         vehicle = flight.vehicle
         await vehicle.wait_ready()
         await vehicle.arm()
         await vehicle.take_off(10.0)  # The mode changes to LOITER later.
         flight.px4.faults.ignore(MavCmd.DO_REPOSITION, times=1)
-        await vehicle.go_to(vehicle.home.value.position.offset(north_m=20.0))
+        await order(vehicle)
         assert len(flight.wire.commands(MavCmd.DO_REPOSITION)) == 2
 
 

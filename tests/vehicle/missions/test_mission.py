@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -12,7 +12,7 @@ import pytest
 from flight_harness import Flight, Px4Flight, now, open_flight, open_px4
 from plan_flights import long_mission, near_home, short_mission
 
-from aerokit import events
+from aerokit import Vehicle, events
 from aerokit import messages as m
 from aerokit.connection.bus import Subscription
 from aerokit.errors import (
@@ -164,6 +164,32 @@ async def test_mission_end_with_lost_reports_is_no_takeover(lost: int, are_items
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(lose_reports_of_end)
             await mission.wait_finished(timeout=600)
+
+
+async def go_home(vehicle: Vehicle) -> None:
+    await vehicle.go_to(vehicle.home.value.position)
+
+
+async def fly_mission_again(vehicle: Vehicle) -> None:
+    await vehicle.mission.start()
+
+
+@pytest.mark.parametrize("order", [Vehicle.land, go_home, fly_mission_again])
+async def test_order_at_mission_end_is_not_taken_over_by_px4_hold(order: Callable[[Vehicle], Awaitable[None]]) -> None:
+    """HEARTBEAT reports HOLD only after the program has given the next order, whose first transmission is lost."""
+    async with armed(open_px4) as flight:
+        assert isinstance(flight, Px4Flight)
+        await flight.vehicle.mission.start()
+        await reaches(flight, 2)
+        while not flight.px4.mission.is_finished:  # noqa: ASYNC110
+            await anyio.sleep(0.02)
+        flight.px4.faults.lose(m.Heartbeat, times=1)
+        flight.px4.faults.lose(m.CurrentMode, times=1)
+        await flight.vehicle.mission.wait_finished(timeout=600)
+        assert flight.vehicle.mode_name == "MISSION"
+        for command in (MavCmd.DO_REPOSITION, MavCmd.DO_SET_MODE):
+            flight.px4.faults.ignore(command, times=1)
+        await order(flight.vehicle)
 
 
 async def test_duplicate_ack_of_upload_keeps_items_known() -> None:

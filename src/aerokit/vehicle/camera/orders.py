@@ -127,7 +127,7 @@ class CameraOrders:
         A newer order about the same topic ends the retries of ``order``.
         """
         if order is not None and not order.is_newest:
-            raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}")
+            raise CommandTimeout(f"{command_name(command)} was not sent: {SUPERSEDED}", was_sent=False)
         if order is not None and not self._session.is_closed:
             order.may_move = True  # From here on, the camera may execute the order.
         session, started_at = self._session, self._session.connection.now()
@@ -168,9 +168,11 @@ class CameraOrders:
                     raise
                 return
             except CommandTimeout as error:
+                error.was_sent = error.was_sent or attempt > 1
                 is_executed = await had_effect() if order.is_newest else None
                 if not order.is_newest:  # A newer order may have been given while the camera was asked.
-                    raise CommandTimeout(f"{error}; not sent again: {SUPERSEDED}") from None
+                    error.args = (f"{error}; not sent again: {SUPERSEDED}",)
+                    raise
                 if is_executed:
                     return
                 if is_executed is None or attempt == MAX_ORDER_ATTEMPTS:

@@ -150,6 +150,7 @@ class Shutter:
             else:
                 await self._send_image_start()
         except CommandTimeout as error:
+            error.was_sent = error.was_sent or is_repeated
             return error
         return None
 

@@ -71,7 +71,8 @@ class CommandArbiter:
         self._orders: list[Order] = []
         # Orders and commands whose `post` or `sending` block is active.
         self._posted: list[Order] = []
-        # (time, mode) of each order that was replaced, or whose block was left, before HEARTBEAT reported its mode.
+        # See `late_modes`: (time, mode) of each order that was replaced, or whose block was left, before HEARTBEAT
+        # reported its mode, and of the end of a mission.
         self._unreported_modes: deque[tuple[float, Mode]] = deque(maxlen=16)
         self._sent: list[SentCommand] = []
         self._order_numbers = itertools.count(1)
@@ -275,8 +276,9 @@ class CommandArbiter:
         except CommandRejected:
             order.was_refused = True
             raise
-        except BaseException:  # The command was abandoned, but its acknowledgement and its effect may follow.
-            self._record_accepted(armed, sent_at)
+        except BaseException as error:  # The command was abandoned, but its acknowledgement and effect may follow.
+            if getattr(error, "was_sent", True):
+                self._record_accepted(armed, sent_at)
             raise
         finally:
             self._sent.remove(sent)
@@ -354,7 +356,7 @@ class CommandArbiter:
     def mode_is_in_doubt(self) -> bool:
         """True while the result of a mode change is unknown, so that the reported mode may still change."""
         is_in_doubt = self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
-        return is_in_doubt or bool(self._late_modes())
+        return is_in_doubt or bool(self.late_modes())
 
     def settle_mode(self) -> None:
         """Record that the vehicle reports the mode ordered last. Modes of earlier orders are no longer expected."""
@@ -382,6 +384,10 @@ class CommandArbiter:
         finally:
             self._open_mode_changes -= 1
 
+    def expect_late(self, mode: Mode) -> None:
+        """Record that the vehicle has changed to this mode by itself, but HEARTBEAT may not report it yet."""
+        self._unreported_modes.append((self._now(), mode))
+
     def doubt_mode(self) -> None:
         """Distrust the reported mode, because a command that changes it was sent without waiting for the result."""
         self._doubt_change(next(self._order_numbers))
@@ -400,7 +406,7 @@ class CommandArbiter:
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
         newest_modes = newest.modes if is_unsettled and newest is not None else ()
-        late_modes = self._late_modes()
+        late_modes = self.late_modes()
         return self._build_order(
             modes,
             ending_topics,
@@ -447,8 +453,11 @@ class CommandArbiter:
         if order.is_effect_due and (is_recent or not is_reported):
             self._unreported_modes.extend((now, mode) for mode in order.modes if mode != present_mode)
 
-    def _late_modes(self) -> tuple[Mode, ...]:
-        """Return modes that HEARTBEAT may still report, because recently replaced or left orders requested them."""
+    def late_modes(self) -> tuple[Mode, ...]:
+        """Return the modes that HEARTBEAT may still report as effects of a recent event.
+
+        The event is that an order was replaced or left, or that a mission has ended.
+        """
         since = self._now() - MODE_GRACE_S
         return tuple(mode for at, mode in self._unreported_modes if at > since)
 

@@ -31,7 +31,8 @@ SUPERSEDED = "another order was given"
 
 # A new mode also changes how the vehicle moves.
 _MODE: tuple[Subject, ...] = ("mode", "motion")
-_MOTION: tuple[Subject, ...] = ("motion",)
+MOTION: tuple[Subject, ...] = ("motion",)
+"""Subjects of a command that moves the vehicle and may change its mode."""
 ARM_ALONE: tuple[Subject, ...] = ("arm",)
 """Subjects of a command that only arms or disarms."""
 CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
@@ -43,23 +44,23 @@ CHANGED_BY_COMMAND: Mapping[int, tuple[Subject, ...]] = {
     MavCmd.DO_FLIGHTTERMINATION: _MODE,
     MavCmd.OVERRIDE_GOTO: _MODE,
     MavCmd.MISSION_START: _MODE,
-    MavCmd.NAV_WAYPOINT: _MOTION,
-    MavCmd.NAV_LOITER_UNLIM: _MOTION,
-    MavCmd.NAV_LOITER_TURNS: _MOTION,
-    MavCmd.NAV_LOITER_TIME: _MOTION,
-    MavCmd.NAV_TAKEOFF: _MOTION,
-    MavCmd.DO_ORBIT: _MOTION,
-    MavCmd.DO_REPOSITION: _MOTION,
-    MavCmd.DO_PAUSE_CONTINUE: _MOTION,
+    MavCmd.NAV_WAYPOINT: MOTION,
+    MavCmd.NAV_LOITER_UNLIM: MOTION,
+    MavCmd.NAV_LOITER_TURNS: MOTION,
+    MavCmd.NAV_LOITER_TIME: MOTION,
+    MavCmd.NAV_TAKEOFF: MOTION,
+    MavCmd.DO_ORBIT: MOTION,
+    MavCmd.DO_REPOSITION: MOTION,
+    MavCmd.DO_PAUSE_CONTINUE: MOTION,
     MavCmd.COMPONENT_ARM_DISARM: ARM_ALONE,
 }
 """Maps MAV_CMD to what it changes (mode, motion, arming). A raw command supersedes actions that change the same."""
 CHANGED_BY_MESSAGE: Mapping[str, tuple[Subject, ...]] = {
     "SET_MODE": _MODE,
-    "SET_ATTITUDE_TARGET": _MOTION,
-    "SET_POSITION_TARGET_LOCAL_NED": _MOTION,
-    "SET_POSITION_TARGET_GLOBAL_INT": _MOTION,
-    "MISSION_SET_CURRENT": _MOTION,
+    "SET_ATTITUDE_TARGET": MOTION,
+    "SET_POSITION_TARGET_LOCAL_NED": MOTION,
+    "SET_POSITION_TARGET_GLOBAL_INT": MOTION,
+    "MISSION_SET_CURRENT": MOTION,
 }
 """Maps the name of a message to what it changes. Commands and mission items are not in this table."""
 FAILSAFE_STATES = (MavState.CRITICAL, MavState.EMERGENCY, MavState.FLIGHT_TERMINATION)
@@ -95,7 +96,7 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
     if message.NAME in ("COMMAND_LONG", "COMMAND_INT"):
         return CHANGED_BY_COMMAND.get(fields.command, ())
     if message.NAME in ("MISSION_ITEM", "MISSION_ITEM_INT"):
-        return _MOTION if fields.current in GUIDED_ITEM else ()
+        return MOTION if fields.current in GUIDED_ITEM else ()
     return CHANGED_BY_MESSAGE.get(message.NAME, ())
 
 

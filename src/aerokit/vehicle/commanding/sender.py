@@ -14,7 +14,7 @@ from aerokit.mavlink.enums import MavCmd, MavResult
 from aerokit.protocols.command import ATTEMPT_TIMEOUT_S, BROADCAST, MAX_ATTEMPTS, rejection
 from aerokit.vehicle.commanding.arbiter import MODE_GRACE_S, MODE_MAX_AGE_S, STEERING
 from aerokit.vehicle.commanding.ground import ImpactDetector
-from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, REQUEST_COMMANDS
+from aerokit.vehicle.commanding.order import ARM_ALONE, CHANGED_BY_COMMAND, MOTION, REQUEST_COMMANDS
 from aerokit.vehicle.commanding.progress import MAX_SILENCE_S, await_progress
 
 if TYPE_CHECKING:
@@ -65,6 +65,10 @@ class OrderSender:
         if order.was_sent and is_steering:
             await self.await_recent_state(order)
         order.may_move = order.may_move or command in CHANGED_BY_COMMAND
+        if CHANGED_BY_COMMAND.get(command) == MOTION:
+            # PX4 ends a take-off or a mission by a change to HOLD, which is no effect of the command.
+            late_modes = self._arbiter.late_modes()
+            modes = () if self._is_taking_off else tuple(mode for mode in modes if mode not in late_modes)
         started = self._session.connection.now()
         with self._arbiter.sending(order, modes=modes, armed=armed, is_done=is_done) as sent:
             try:
@@ -78,6 +82,12 @@ class OrderSender:
             except CommandTimeout as error:
                 if not sent.is_confirmed:
                     raise self._unanswered(error, order) from None
+
+    @property
+    def _is_taking_off(self) -> bool:
+        telemetry = self._session.telemetry
+        mode = self._session.autopilot.mode_for("take_off", is_vtol=telemetry.is_vtol)
+        return mode is not None and telemetry.is_in(mode)
 
     async def send_long(self, order: Order, command: int, *params: float, **options: Any) -> None:
         """Send one command of an order as COMMAND_LONG; see :meth:`run_command`."""

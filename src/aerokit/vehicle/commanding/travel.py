@@ -163,10 +163,7 @@ class TravelActions(VehicleBase):
         # -1 leaves the speed to the vehicle.
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
         params = (speed, MavDoRepositionFlags.CHANGE_MODE, 0, yaw)
-        take_off_mode = self.autopilot.mode_for("take_off", is_vtol=self.telemetry.is_vtol)
-        is_taking_off = take_off_mode is not None and self.telemetry.is_in(take_off_mode)
-        # PX4 ends a take-off by a change to HOLD, so this change would not show that the vehicle received the target.
-        modes = () if is_taking_off else (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
+        modes = (self._sender.mode_for("go_to", self.autopilot.reposition_purpose),)
         send = self._session.commands.send_int
         try:
             with self._arbiter.changing_mode():

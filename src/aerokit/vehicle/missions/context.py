@@ -89,6 +89,7 @@ class PlanContext:
         session.at_close(
             session.connection.bus.attach_frames(MissionCurrent, self._on_current, system_id=session.system_id),
             session.connection.bus.attach(MissionAck, self._on_ack, system_id=session.system_id),
+            session.connection.bus.attach_event(MissionFinished, self._on_finished),
         )
         self.tracker: MissionTracker = MissionTracker(session)
 
@@ -163,6 +164,14 @@ class PlanContext:
             is_duplicate = is_addressed and self.now() - cache.updated_at < DUPLICATE_ACK_S
             if ack.mission_type in (mission_type, MavMissionType.ALL) and not is_duplicate:
                 cache.forget(self.now())
+
+    def _on_finished(self, event: MissionFinished) -> None:
+        """Tell the arbiter of the change of mode at the end, which is no takeover of an order that is given now."""
+        session = self.session
+        hold_mode = self.autopilot.mode_for("hold", is_vtol=session.telemetry.is_vtol)
+        holds = self.autopilot.holds_after_mission and self.tracker.is_in_mission_mode
+        if event.system_id == session.system_id and holds and hold_mode is not None:
+            self.vehicle_context.arbiter.expect_late(hold_mode)
 
 
 class MissionTracker:

@@ -214,9 +214,8 @@ class CommandSender:
                 raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
             if order_status is not None and order_status.end != earlier_end and not was_just_sent:
                 # The order ended while this call waited for an earlier command to complete.
-                unsent = CommandTimeout(f"{command_name(message.command)} was not sent: {order_status.end}")
-                unsent.was_sent = False
-                raise unsent
+                text = f"{command_name(message.command)} was not sent: {order_status.end}"
+                raise CommandTimeout(text, was_sent=False)
             acks_per_sending = self._acks_of(message.command)
             pending_acks = self._pop_pending_acks(key)
             if was_just_sent:
