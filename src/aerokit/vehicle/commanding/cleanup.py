@@ -394,7 +394,7 @@ class ArmCleanup:
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
         acknowledgement, HEARTBEAT must have reported armed at most `ARM_HEARTBEAT_DELAY_S` after the order was given,
-        and no other party may have taken over since.
+        and no other party may have taken over since. If the computer slept meanwhile, the result is always False.
 
         ``mode`` is the mode at the time when the order was abandoned. If the mode is different now, and no newer order
         of this program explains that, another party has taken over.
