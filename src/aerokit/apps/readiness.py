@@ -59,7 +59,7 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
 
     Args:
         vehicle: the vehicle, whose known state is used. Nothing is sent to it.
-        reasons: result of ``vehicle.why_not_armable()``; None: health flags of SYS_STATUS, mode and estimator decide.
+        reasons: result of ``vehicle.why_not_armable()``; None: derive the reasons from the known state.
         changes_mode: True: do not report a mode that does not allow arming, because `Vehicle.arm` will change it.
     """
     grouped = _grouped(vehicle, reasons)

@@ -228,7 +228,7 @@ class Routes:
         return peers or EVERY_PEER
 
     def arrived_on_other_peer(self, frame: Frame, peer: Peer) -> bool:
-        """Return True if the frame arrived on another peer than the one that owns the route of its sender."""
+        """Return True if the frame came from ``peer``, but messages to its sender are sent to another peer."""
         route = self._routes.get((frame.system_id, frame.component_id))
         return route is not None and route.peer != peer
 
@@ -325,7 +325,7 @@ class Routes:
         return Evidence(expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
-        """Send to ``peer`` from now on, and drop all claims to the route, because they refer to the old owner."""
+        """Send to ``peer`` from now on. Drop the claims of all peers to the route: they refer to its old owner."""
         before, route.peer = route.peer, peer
         # The frame counts as a heartbeat, so that the new peer has time for its first one.
         route.heartbeat_at = route.silent_since = frame.received_at

@@ -66,14 +66,14 @@ def uninstall() -> None:
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _SubmoduleFinder)]
     for name in list(sys.modules):
-        own_name = _own_name(name)
-        is_alias = own_name is not None and sys.modules[name] is sys.modules.get(own_name)
+        aerokit_name = _aerokit_name(name)
+        is_alias = aerokit_name is not None and sys.modules[name] is sys.modules.get(aerokit_name)
         if name == ALIAS or is_alias:
             del sys.modules[name]
 
 
-def _own_name(name: str) -> str | None:
-    """Return the name of the aerokit module for an alias such as ``dronekit.lib``, or None for other modules."""
+def _aerokit_name(name: str) -> str | None:
+    """Return the aerokit module that an alias such as ``dronekit.lib`` stands for; None if the name is no alias."""
     if name == SITL_ALIAS:
         return SITL_MODULE
     return PACKAGE + name.removeprefix(ALIAS) if name.startswith(f"{ALIAS}.") else None
@@ -85,10 +85,10 @@ class _SubmoduleFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        own_name = _own_name(fullname)
-        if own_name is None:
+        aerokit_name = _aerokit_name(fullname)
+        if aerokit_name is None:
             return None
-        spec = importlib.util.find_spec(own_name)
+        spec = importlib.util.find_spec(aerokit_name)
         return None if spec is None else ModuleSpec(fullname, _SubmoduleLoader(), origin=spec.origin)
 
 
@@ -96,7 +96,7 @@ class _SubmoduleLoader(Loader):
     """Loader that returns the aerokit module for an alias. The module keeps its own ``__spec__``."""
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        module = importlib.import_module(_own_name(spec.name) or spec.name)
+        module = importlib.import_module(_aerokit_name(spec.name) or spec.name)
         self._own_spec = module.__spec__
         return module
 

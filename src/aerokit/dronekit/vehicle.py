@@ -291,7 +291,10 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
 
     def _dk_wait_for_first_values(self) -> None:
-        """Wait for the attributes in FIRST_VALUES, until no further value arrives or too much time has passed."""
+        """Wait until all attributes in FIRST_VALUES have values.
+
+        Give up after FIRST_VALUES_TIMEOUT_S, or if no further value arrives for NEXT_VALUE_TIMEOUT_S.
+        """
         names, ready = set[str](FIRST_VALUES), self._dk.ready
         now = time.monotonic()
         deadline = now + FIRST_VALUES_TIMEOUT_S

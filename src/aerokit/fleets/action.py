@@ -601,7 +601,7 @@ class SelectionBase:
             raise OperationRejected(f"{action}: {member.name} is {member.status}; {consequence}")
 
     def _check_not_ordered_since(self, orders: Mapping[str, object], action: str, consequence: str) -> None:
-        """Raise OperationRejected if the newest orders of a member are no longer those in ``orders``."""
+        """Raise OperationRejected if a member was given an order since `newest_orders` returned ``orders``."""
         for name, order in orders.items():
             if self._context.newest_orders(self._context.members[name]) != order:
                 raise OperationRejected(f"{action}: {name} got a newer order meanwhile; {consequence}")

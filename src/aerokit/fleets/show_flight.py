@@ -191,7 +191,7 @@ def track_deviation(path: Path, samples: Sequence[tuple[float, LocalPoint]]) -> 
 def max_relative_error(
     paths: Mapping[str, Path], samples: Mapping[str, Sequence[tuple[float, LocalPoint]]], duration_s: float
 ) -> float | None:
-    """Return by how many metres the position of one vehicle relative to another differed most from the plan.
+    """Return the largest difference, in metres, between the planned and the flown vector from one vehicle to another.
 
     Positions are compared at 61 moments of the show, interpolated between samples. Return None if no two vehicles have
     samples around the same moment.
@@ -236,7 +236,7 @@ class TrackRecorder:
     Each sample has the seconds since the start of the show, and metres north, east and up of the show's origin.
 
     Times are ``time_boot_ms``, converted by the clock offset that TIMESYNC has measured. If TIMESYNC turns out to use
-    another clock of the vehicle, the times at which the messages arrived are used instead.
+    another clock than ``time_boot_ms``, the times at which the messages arrived are used instead.
     """
 
     def __init__(

@@ -170,7 +170,7 @@ class Switch:
     def _admitted(self, port: Port, framer: Framer, frames: list[Frame]) -> tuple[list[Frame], list[Frame]]:
         """Return the frames that this sender is allowed to send, and those of them that arrived out of order.
 
-        If the port verifies signatures, they are removed from the frames.
+        If the port verifies signatures, the frames are returned without their signatures.
         """
         admitted: list[Frame] = []
         late: list[Frame] = []

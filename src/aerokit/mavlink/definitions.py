@@ -131,7 +131,7 @@ class EntryDefinition:
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """One enum, with its entries in one XML file or, if `merged_enums` created it, in all files."""
+    """One enum. Its entries are those of one XML file or, if `merged_enums` created it, those of all files."""
 
     name: str
     entries: tuple[EntryDefinition, ...]

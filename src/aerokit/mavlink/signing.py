@@ -320,9 +320,9 @@ class TimestampFile:
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Write ``timestamp + ahead`` to the file, unless the last written timestamp is later than ``timestamp``.
+        """Ensure that the stored timestamp is later than ``timestamp``: if it is not, write ``timestamp + ahead``.
 
-        A timestamp counts as written even if writing failed, because each new attempt may block the event loop.
+        If writing fails, the next attempt follows only at ``timestamp + ahead``, because it may block the event loop.
         """
         if timestamp < self.timestamp:
             return

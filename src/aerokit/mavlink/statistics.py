@@ -25,8 +25,8 @@ IN_ORDER, LATE, OTHERS = range(3)
 class SourceStatistics(SourceFields):
     """Counters of one sender (system, component): frames received and lost.
 
-    Two senders with the same ids are detected, because their sequence numbers form two streams. Frames then count as
-    lost only in the stream with more frames or, after that stream has been silent for 1.5 s, in the other one.
+    Two senders with the same ids are detected, because their sequence numbers form two streams. Losses are then counted
+    in only one of the streams: in the one with more frames, until it has been silent for 1.5 s.
     """
 
     expected: int

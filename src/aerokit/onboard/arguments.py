@@ -80,8 +80,8 @@ def arguments_of(function: Callable[..., Any]) -> tuple[CommandArgument, ...]:
     """Return the arguments of a handler after the first one, which is the request.
 
     Raises:
-        InvalidArgument: an annotation is missing or not supported, an argument is not positional, or the number of its
-            parameter is above seven.
+        InvalidArgument: an annotation is missing or not supported, an argument is not positional, or an argument would
+            be the eighth parameter of the command or a later one.
     """
     name = getattr(function, "__name__", repr(function))
     parameters = list(inspect.signature(function).parameters.values())

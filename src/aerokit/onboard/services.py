@@ -44,7 +44,7 @@ class ComponentServices:
         """Motions that go on until the next command: the program's function that stops each, by the part's name."""
 
     async def stop_motions(self) -> None:
-        """Stop these motions, because nobody can order it after the end of the component. Errors are reported."""
+        """Stop all motions, because no command can stop them after the end of the component. Errors are reported."""
         thread_calls = set(self.commands.thread_calls)
         motions = dict(self.motions)
         self.motions.clear()

@@ -3391,8 +3391,8 @@ class Camera(TwinOf["AsyncCamera"]):
     def wait_found(self, *, timeout: float = 10.0) -> CameraInformation:
         """Wait until the camera is found and has identified itself.
 
-        All other calls first wait in the same way, but a camera that is attached to the autopilot only has to be found;
-        it need not identify itself.
+        All other calls first wait until the camera is found. They also need its identification, unless it is attached
+        to the autopilot.
 
         Raises:
             CommandRejected: the camera refused to identify itself.

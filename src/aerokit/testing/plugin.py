@@ -184,7 +184,7 @@ def _flight_fixtures(item: pytest.Item) -> list[Any]:
 
 
 def _reported_flights(item: pytest.Item) -> list[Any]:
-    """Return the flights and fleets among all fixture values of a test, beginning with this plugin's fixtures."""
+    """Return the flights and fleets among the fixture values of a test; those of this plugin's fixtures come first."""
     fixture_values = getattr(item, "funcargs", None) or {}
     flights: list[Any] = []
     for value in (*_flight_fixtures(item), *fixture_values.values()):

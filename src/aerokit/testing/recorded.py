@@ -122,8 +122,8 @@ class RecordedMissions(MissionServer):
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
         """Return the items of the plan that the vehicle has at present; None if it has no plan of this type.
 
-        An uploaded plan takes precedence. Without one, it is the last plan recorded until the present position in the
-        recording, or the first recorded plan if there is none until then.
+        An uploaded plan takes precedence. Otherwise, this is the newest plan recorded before the present position of
+        the playback or, if no plan was recorded before it, the first recorded plan.
         """
         if mission_type in self._written:
             return self._written[mission_type]

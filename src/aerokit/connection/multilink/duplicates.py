@@ -165,9 +165,9 @@ class _Stream:
 class MergedStreams:
     """Accepts each frame once, whichever copy arrives first.
 
-    If two links carry separate streams (each port of an autopilot has its own sequence numbers), frames over the link
-    that is not in use may be older than accepted ones. From that link, only late answers and frames of components that
-    the link in use does not reach are therefore accepted. ``choices`` has the links to each system.
+    Two links to different ports of an autopilot carry separate streams, because each port has its own sequence numbers.
+    A frame over the link that is not in use may then be older than accepted frames. It is accepted only if it is a late
+    answer, or if the link in use does not reach its component. ``choices`` has the links to each system.
     """
 
     def __init__(self, link_count: int, choices: Mapping[int, LinkChoice]) -> None:

@@ -230,9 +230,9 @@ class LinkChoice:
         return candidate
 
     def start_with(self, candidate: Candidate) -> None:
-        """Register that the autopilot's first heartbeat arrived over this link; other links need proof from now on.
+        """Record that the autopilot's first heartbeat arrived over this link. Other links must be proven from now on.
 
-        If this link is not in use, forget all others, so that it is chosen.
+        If this link is not in use, forget all other links, so that `choose` selects this one.
         """
         self.needs_proof = True
         if candidate is not self.used:

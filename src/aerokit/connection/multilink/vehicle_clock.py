@@ -95,7 +95,11 @@ class VehicleClock:
 
     @property
     def _rate(self) -> float | None:
-        """The measured rate or, for SPEED_MAX_AGE_S after a pause or reboot, the one from before; otherwise None."""
+        """Rate of the clock; None if it is unknown.
+
+        After a pause or reboot, the rate measured before it is returned until a new one is measured, for at most
+        SPEED_MAX_AGE_S.
+        """
         if self._measured_rate is not None:
             return self._measured_rate
         if self._previous_rate is None:

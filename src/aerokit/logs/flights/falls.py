@@ -134,7 +134,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
     """Return True if all heights that are logged in the next 30 s, or until disarming, are about ``height_m``.
 
-    Return False if the vehicle was not disarmed in these 30 s and is higher than `_NEAR_HOME_HEIGHT_M`.
+    A vehicle above `_NEAR_HOME_HEIGHT_M` must also be disarmed in these 30 s, because it may otherwise be hovering.
     """
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)

@@ -88,7 +88,7 @@ def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float]
 
 
 def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[int]:
-    """Select about ``max_rows`` rows to draw, so that all peaks and the longer gaps of the column stay visible.
+    """Select about ``max_rows`` rows to draw, so that the chart still shows all peaks and the longer gaps.
 
     With many gaps, up to one and a half times as many rows are selected.
     """

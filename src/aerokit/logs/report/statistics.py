@@ -431,8 +431,8 @@ def _failsafes_sentence(flight: FlightLog) -> str:
 def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
     """Return the names of missing parameters that decide how the vehicle reacts to these kinds of failsafes.
 
-    A kind is skipped if the log has any of its parameters. Otherwise, these are its parameters with ACT or ENABL in
-    the name or, if there are none, all its parameters.
+    If the log has any parameter of a kind, nothing is returned for this kind. If it has none, the parameters with ACT
+    or ENABL in the name are returned, or all parameters of the kind if no name contains these.
     """
     unknown: list[str] = []
     for kind in dict.fromkeys(kinds):

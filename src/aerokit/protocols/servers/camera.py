@@ -67,9 +67,10 @@ def _information(camera: CameraDevice) -> m.CameraInformation:
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
-    """Return the images that a request selects, or the last image if ``command`` is None (periodic messages).
+    """Return CAMERA_IMAGE_CAPTURED of the requested images, or of the last image if ``command`` is None (periodic).
 
-    Param 2 is the first index (-1: all images), param 3 the last index (0: only the first image, -1: to the end).
+    Param 2 is the index of the first image (-1: all images). Param 3 is the index of the last one (0: request only
+    the image of param 2, -1: to the end).
     """
     if command is None:
         return camera.captures.images[-1:]

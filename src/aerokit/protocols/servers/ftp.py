@@ -131,7 +131,7 @@ class SessionFtpServer(Generic[FilesT]):
         """Return True if this request repeats the latest one, and ``reply`` is the reply to the latest one.
 
         Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. If ``reply``
-        ended a burst, its sequence number is not the one after the request, so the whole burst is sent again.
+        is the last of several to a burst request, the result is False, so that the whole burst is sent again.
         """
         is_same = peer.request is not None and request.repeats(peer.request)
         reply_sequence = (request.sequence + 1) & 0xFFFF

@@ -276,7 +276,7 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """LOITER, and base of the modes that fly to a place (by default, where they were entered) and circle there."""
+    """LOITER: circles where it was entered. Also the base of the modes that fly to a place and circle there."""
 
     flags: int = _NAVIGATES
 

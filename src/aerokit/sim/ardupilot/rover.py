@@ -140,8 +140,9 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     def _update_link(self, name: str, *, is_lost: bool) -> None:
         """Record whether a link is lost, and start or end the failsafe that both links share.
 
-        Like the firmware (failsafe.cpp, failsafe_trigger), use the text and the parameter of ``name`` when the timeout
-        ends, even if only the other link is lost. A link whose check is disabled while it is lost stays lost.
+        The first call after the timeout starts the failsafe, with the text and the parameter of its ``name``, even if
+        only the other link is lost (as in failsafe.cpp, failsafe_trigger). If the check of a lost link is disabled,
+        this method is no longer called for it, so the link stays lost.
         """
         rover = self.vehicle
         was_any_link_lost = bool(self._lost)

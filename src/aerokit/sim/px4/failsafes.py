@@ -291,7 +291,7 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), Action.NONE)
 
     def _position_action(self) -> FailsafeAction:
-        """Return LAND, which needs no position, if the intended mode needs one and there was none for 5 s."""
+        """Return LAND if the intended mode needs a position and there was none for 5 s; otherwise NONE."""
         px4 = self._px4
         if px4.has_position:
             self._position_at = px4.now

@@ -325,9 +325,9 @@ class PhotoInterval:
             await self._check_silence(silent_checks)
 
     def _first_after_reset(self, capture: Capture) -> Capture | None:
-        """Return the previous capture if it was the first one after the camera began to count from 0 again.
+        """Return the previous capture if it and ``capture`` show that the camera began to count from 0 again.
 
-        Only two successive low indices show such a reset, because a single index could be corrupt.
+        Both must have low, successive indices, because a single low index could be corrupt.
         """
         previous, self._possible_first = self._possible_first, None
         if (

@@ -367,8 +367,8 @@ class CommandArbiter:
     def changing_mode(self) -> Iterator[None]:
         """Keep the reported mode in doubt during a `with` block in which a command changes the mode.
 
-        If the block is cancelled or times out, the mode stays in doubt until a later change is confirmed. After
-        a refusal, it is as certain as before. Blocks may overlap, because a new order may be given during a block.
+        If the block is cancelled or times out, the mode stays in doubt until a later change is confirmed. A refused
+        command causes no such doubt. Blocks may overlap, because a new order may be given during a block.
         """
         change = next(self._order_numbers)
         self._open_mode_changes += 1

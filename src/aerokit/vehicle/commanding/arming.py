@@ -390,8 +390,8 @@ class ArmingActions(VehicleBase):
     async def _await_reboot(self, reboots_before: int) -> None:
         """Poll the time since boot until it shows a reboot.
 
-        The polls are frequent at first: a fast simulation soon has a longer uptime than before the reboot, and
-        the reboot can then no longer be recognised.
+        A reboot is recognised by a lower time than in the previous answer. The polls are frequent at first, because the
+        clock of a fast simulation soon exceeds that time again.
         """
         started = self.connection.now()
         next_request_at = started

@@ -261,10 +261,11 @@ class FlightCleanup:
 
     @contextmanager
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
-        """Create an order to change to ``mode`` for a `with` block that prepares a stream, and may wait.
+        """Create an order to change to ``mode``, for a caller that must prepare a stream before it sends the order.
 
-        The caller sends the order after the block. If the block fails, the order is abandoned: the vehicle is ordered
-        to hold if an earlier order of the program may still move it (see `hold_in_background`).
+        The caller prepares the stream in the `with` block, which may wait, and sends the order after the block. If the
+        block fails, the order is not sent, and the vehicle is told to hold if an earlier order of the program may still
+        move it (see `hold_in_background`).
 
         Raises:
             BusyError: another stream is open. No order was created.
@@ -392,10 +393,11 @@ class ArmCleanup:
         """Return True if this order, and not a pilot, has armed the vehicle. Called when HEARTBEAT has reported armed.
 
         The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
-        acknowledgement, the order armed it if HEARTBEAT reported armed at most `ARM_HEARTBEAT_DELAY_S` after the order
-        was given, and no other party has taken over since. ``mode`` is the mode in which the order was abandoned. An
-        abandoned order does not notice a change of the mode, so a change counts as a takeover, unless a newer order of
-        this program has changed the mode.
+        acknowledgement, HEARTBEAT must have reported armed at most `ARM_HEARTBEAT_DELAY_S` after the order was given,
+        and no other party may have taken over since. If the computer slept meanwhile, the result is always False.
+
+        ``mode`` is the mode at the time when the order was abandoned. If the mode is different now, and no newer order
+        of this program explains that, another party has taken over.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)

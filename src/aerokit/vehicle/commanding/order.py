@@ -91,7 +91,7 @@ REQUEST_COMMANDS = frozenset(
 
 
 def subjects_of(message: Message) -> tuple[Subject, ...]:
-    """Return the subjects that this message changes if the program sends it directly."""
+    """Return what this message changes if the program sends it directly: mode, motion, arming or nothing."""
     fields: Any = message
     if message.NAME in ("COMMAND_LONG", "COMMAND_INT"):
         return CHANGED_BY_COMMAND.get(fields.command, ())

@@ -207,7 +207,7 @@ class OrderSender:
     async def await_mode(
         self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
     ) -> None:
-        """Wait until the mode is reported by a message received after ``reported_since`` and not too long ago."""
+        """Wait until the mode is reported by a message that arrived after ``reported_since`` and is still recent."""
         telemetry = self._session.telemetry
 
         def is_reported() -> bool:

@@ -449,7 +449,7 @@ class _CachedList:
         return store.is_complete
 
     async def save(self) -> None:
-        """Save the downloaded list if the hash was known before the download and is still the same."""
+        """Save the downloaded list, unless the vehicle's parameter hash is unknown or changed during the download."""
         if self._hash is not None and self._hash == await self._read_hash():
             self._cache.save(await self._key(), self._hash, self._access.store.table)
 

@@ -136,7 +136,7 @@ class CommandSender:
         """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if the vehicle answers "unsupported".
 
         ``x`` and ``y`` are latitude and longitude in 1e-7 degrees; ``z`` is in metres above mean sea level.
-        COMMAND_LONG has no frame, so this is only for commands that always mean this altitude, such as DO_SET_HOME.
+        COMMAND_LONG has no frame, so use this only if the command's altitude is always AMSL, as for DO_SET_HOME.
         """
         try:
             return await self.send_int(

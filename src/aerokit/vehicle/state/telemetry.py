@@ -207,7 +207,7 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        """Update the cells from a message, with the time at which its frame arrived, perhaps long before this call."""
+        """Update the state cells from a message. Their timestamp is the time at which its frame arrived."""
         # Calls may be nested, because a handler may read a cell, which then decodes another message.
         outer_arrived_at = self._arrived_at
         self._arrived_at = None if frame is None else frame.received_at
