@@ -285,7 +285,7 @@ class Travel(SelectionBase):
         max_distance_m: float,
         stagger_s: float | None,
     ) -> FleetResult:
-        """Fly up to the layers, across, and down. A leg begins when all members have finished the leg before."""
+        """Fly up to the layers, across, and down. A leg begins when all members have finished the previous leg."""
         starts = {name: position_of(self._context.members[name]) for name in heights_m}
         climb = {name: _at_altitude(starts[name], height) for name, height in heights_m.items()}
         crossing = {name: _at_altitude(targets[name], height) for name, height in heights_m.items()}

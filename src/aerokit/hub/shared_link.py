@@ -109,7 +109,7 @@ class SharedLink(Link):
             self._receiver.bytes_received(unsigned.raw, None)
 
     def _on_sent(self, raw: bytes) -> None:
-        """Pass a sent frame of the connection to the hub, without its signature."""
+        """Give the hub a frame that the connection has sent, without its signature."""
         gateway = self._current_gateway()
         if self._receiver is not None:
             unsigned = raw if gateway is None else gateway.strip_signature(Frame.parse(raw)).raw

@@ -325,7 +325,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
     """Explain why a value does not fit into this type, or return None. A number is what ``struct`` accepts."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
-        try:  # With the largest type, this fails only for a huge number, or for a value that is no integer.
+        try:  # 64 bits are enough for each kind, whose range is checked below. Other values are no integers, or huge.
             struct.pack("<q" if low < 0 else "<Q", value)
         except (struct.error, OverflowError, TypeError):
             if not hasattr(value, "__index__"):

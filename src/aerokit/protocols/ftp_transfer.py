@@ -361,7 +361,10 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._reassembly.end is None else self._reassembly.end
 
     def _finish_at_end(self) -> None:
-        """Finish at the end of a file of unknown size. Fail if the file has ended before its announced size."""
+        """At the end of the file: finish, or fail if the file is shorter than its announced size.
+
+        A file whose size was not announced has any length.
+        """
         end = self._reassembly.position
         if self._size is None:  # The size of a virtual file is known only now.
             self._finish(end)

@@ -164,7 +164,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _on_request(self, seq: int, now: float) -> None:
         """Answer the request for an item. It shows that the vehicle has all items before this one."""
-        # The vehicle never skips an item, so a request beyond the next item belongs to another transfer.
+        # The vehicle never skips an item, so a request beyond the next unsent item belongs to another transfer.
         if seq > self._sent_end:
             return
         if not self._is_requesting:
@@ -178,7 +178,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             # The vehicle has restarted the transfer, or this is a delayed request.
             self._send(seq, now, unless_in_flight=True)
         elif seq in self._requested:
-            self._send_window(now)  # The item was lost, and the vehicle has ignored the items after it.
+            self._send_window(now)  # The item was lost, so it is requested again. The later ones were ignored.
         self._requested.add(seq)
         while self._sent_end < min(self._end, self._confirmed_end + self._window):
             self._send(self._sent_end, now)

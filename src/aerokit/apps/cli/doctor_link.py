@@ -165,7 +165,7 @@ class LinkExamination:
 
     @property
     def is_silent(self) -> bool:
-        """Return True if no other system was received."""
+        """True if no message of another system was received."""
         return not set(self._frames) - {self._own_ids}
 
     def _silence(self) -> Iterator[Finding]:

@@ -308,7 +308,7 @@ class Px4Mission:
             px4.flight.target = target
 
     def _climb(self, down: float | None) -> None:
-        """Start a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home."""
+        """Start a vertical climb to ``down``. A higher vehicle stays there. None selects MIS_TAKEOFF_ALT above home."""
         px4, motion = self._px4, self._px4.motion
         _, _, home_down = px4.home
         if down is None:

@@ -223,9 +223,10 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
-        """Count a refused frame, and return a notice of it, or nothing if the last notice of this message is recent.
+        """Count a refused frame, and return a notice of it.
 
-        A notice that contains an answer is always returned, because the client waits for the answer to its command.
+        Notices about the same type of message are limited in rate, except those with an answer to a command, because
+        the client waits for this answer.
         """
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME

@@ -127,7 +127,7 @@ class CalibrationRun:
             raise
 
     def finish(self) -> None:
-        """Register that the calibration has ended on the vehicle."""
+        """Record that the vehicle has ended the calibration."""
         if not self._ended.is_set():
             self._ended.set()
             self._cleanup.close()  # This also withdraws the cancel command, if one was sent: it need not be repeated.

@@ -339,7 +339,7 @@ class MissionControl(VehiclePlan["Mission"]):
         try:
             await vehicle_context.flight_cleanup.stop_in(mode, order)
         except (CommandRejected, OperationRejected):
-            # The vehicle does not hold. After a time-out or a cancellation, it may still do so.
+            # The vehicle does not hold. After other errors it may, so `_is_paused` then stays True.
             if self._order is order:
                 self._is_paused = False
             raise

@@ -182,7 +182,7 @@ class TemporaryParameters(_Block):
     async def __aenter__(self) -> dict[str, ParameterWrite]:
         """Set the values; if one of them cannot be set, restore all."""
         if self._was_entered:
-            raise InvalidArgument("this block was entered already: call temporarily() again")
+            raise InvalidArgument("this block was entered before: call temporarily() anew for each `with` block")
         self._was_entered = True
         try:
             results = await self._write(self._values)

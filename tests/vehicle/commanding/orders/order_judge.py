@@ -30,7 +30,8 @@ MODE_MAX_AGE_S = 2.6
 SETPOINTS = (SetPositionTargetLocalNed, SetPositionTargetGlobalInt, SetAttitudeTarget)
 OUTAGE_RECOVERY_S = 4.0
 """Seconds after an outage until the vehicle's state is known and the hold command is sent."""
-PX4_LOITER = 4 << 16 | 3 << 24
+PX4_AUTO, PX4_AUTO_LOITER = 4, 3
+PX4_LOITER = PX4_AUTO << 16 | PX4_AUTO_LOITER << 24
 COPTER_AUTO, COPTER_GUIDED, COPTER_BRAKE = 3, 4, 17
 INITIAL_SEND_S = 0.01
 """A command sent this soon after the call is the order itself."""
@@ -119,11 +120,13 @@ def _is_directed_turn(message: Message) -> bool:
 
 def _may_report_effect(flown: Flown, message: Message, state: State) -> bool:
     """Return True if the effect may already be reported. An abandoned order may take effect late; then aerokit orders
-    another hold. A PX4 that DO_REPOSITION stops may be in its hold mode all the time, which is not the effect.
+    another hold. A PX4 that DO_REPOSITION stops may be in its hold mode all the time, which is not the effect. Such a
+    stop is followed by an order of the hold mode.
     """
     if not isinstance(message, CommandLong):
         return False
-    if message.command == REPOSITION:
+    is_px4_hold = message.command == SET_MODE and (message.param2, message.param3) == (PX4_AUTO, PX4_AUTO_LOITER)
+    if message.command == REPOSITION or is_px4_hold:
         return state == (PX4_LOITER, True, False)
     is_hold = message.command == SET_MODE and message.param2 == COPTER_BRAKE
     return (
