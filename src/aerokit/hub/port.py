@@ -191,7 +191,7 @@ class Port:
     """One peer of one endpoint.
 
     While the link accepts data, frames are collected in ``batch``, and `Switch` writes them. While more than
-    ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. If this limit is `UNLIMITED`, they never wait.
+    ``queue_above_bytes`` bytes are unsent, frames wait in a `FrameQueue`. If the limit is `UNLIMITED`, they never wait.
 
     ``endpoint`` is the endpoint's name. ``period(message_id)`` is the minimum interval in seconds of a message, see
     `Filters.period`. ``report(kind, text)`` publishes an event of the endpoint. ``on_drop(reason, frame)`` is called

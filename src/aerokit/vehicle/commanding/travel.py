@@ -466,7 +466,7 @@ class LookActions(VehicleBase):
         return True
 
     async def _send_roi(self, command: int, *params: float) -> None:
-        """Send a command about the region of interest. Its order ends earlier orders about the region, and no others."""
+        """Send a command about the region of interest. Its order ends only earlier orders about the region."""
         with self._new_roi_order() as order:
             await self._sender.send_long(order, command, *params)
 
