@@ -151,6 +151,21 @@ async def test_result_from_another_component_does_not_count(name: str, message: 
         assert len(await steps_of(getattr(vehicle.calibrate, name)())) > 6
 
 
+async def test_pose_is_not_confirmed_into_a_silence() -> None:
+    loop = asyncio.get_running_loop()
+    async with stage(SimulatedCopter) as (copter, vehicle, wire):
+        steps = aiter(vehicle.calibrate.accelerometer())
+        while not (await anext(steps)).needs_confirmation:
+            pass
+        copter.faults.silent = True
+        await anyio.sleep(4.0)
+        silent_until = loop.time() + 3.0
+        loop.call_at(silent_until, setattr, copter.faults, "silent", False)
+        await anext(steps)
+        confirmed_at = [at for at, sent in wire.sent if getattr(sent, "command", None) == MavCmd.ACCELCAL_VEHICLE_POS]
+        assert confirmed_at[0] > silent_until
+
+
 async def test_failed_accelerometer_raises_and_can_be_repeated() -> None:
     async with stage(SimulatedCopter) as (copter, vehicle, _):
         copter.calibrations.accelerometers.is_held_wrong = True

@@ -270,6 +270,7 @@ async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncG
                 remaining = tuple(POSES.values())[request - 1 :]  # POSES has the order of ArduPilot's requests.
                 text = f"place the vehicle {pose.value}, keep it still, then continue"
                 yield run.new_step((request - 1) / len(POSES), text, pose, remaining, needs_confirmation=True)
+                await run.wait(lambda: run.context.arbiter.is_state_recent)  # Send nothing into a silence.
                 await run.command(MavCmd.ACCELCAL_VEHICLE_POS, request)
                 confirmed_pose, confirmed_at = request, now()
                 # ArduPilot has repeated its request until it received the confirmation. The repetitions are obsolete.
