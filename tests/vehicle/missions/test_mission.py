@@ -175,7 +175,7 @@ async def fly_mission_again(vehicle: Vehicle) -> None:
 
 
 @pytest.mark.parametrize("order", [Vehicle.land, go_home, fly_mission_again])
-async def test_order_at_mission_end_is_not_taken_over_by_px4_hold(order: Callable[[Vehicle], Awaitable[None]]) -> None:
+async def test_px4_hold_at_mission_end_is_no_takeover(order: Callable[[Vehicle], Awaitable[None]]) -> None:
     """HEARTBEAT reports HOLD only after the program has given the next order, whose first transmission is lost."""
     async with armed(open_px4) as flight:
         assert isinstance(flight, Px4Flight)

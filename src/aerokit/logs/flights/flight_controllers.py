@@ -190,7 +190,7 @@ def _bin_system_id(reader: Any) -> int:
     """Return the system id according to the first logged value of its parameter. Then the reader is at the start."""
     parameters: dict[str, float] = {}
     with suppress(Exception), redirect_stdout(sys.stderr):  # `_next` reports damage
-        while (row := reader.recv_match(type=["PARM"], strict=True)) is not None:
+        while (row := reader.recv_match(type=["PARM"])) is not None:
             parameters.setdefault(row.Name, row.Value)
     reader.rewind()
     return ardupilot_system_id(parameters)
