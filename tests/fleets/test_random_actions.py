@@ -282,11 +282,12 @@ class RandomFlight:
             call.names = tuple(name for name in call.names if self.fleet.members[name].is_available)
         call.began_at, call.first = now(), len(self.wire.sent)
         self.calls.append(call)
+        result: object = None
         try:
             with anyio.move_on_after(seconds if gives_orders else None) as scope:
                 result = await call.begin()
             call.is_cancelled = scope.cancelled_caught
-            if not call.is_cancelled and isinstance(result, FleetResult):
+            if isinstance(result, FleetResult):
                 self.judge_result(result)
                 failures = {**result.failed, **result.stopped, **result.skipped}
                 call.errors = {name: str(error) for name, error in failures.items()}
