@@ -424,7 +424,7 @@ class Connection:
         self._observers.close()
 
     def fail(self, error: Exception) -> None:
-        """Close the connection because of an internal error of aerokit. It becomes the cause of ConnectionClosed."""
+        """Close the connection because of an internal error of aerokit. Errors raised later have it as their cause."""
         if not self.is_open and isinstance(error, AerokitError):
             return  # A background task failed only because the connection was closed before.
         logger.error("the connection is closed because of an internal error of aerokit", exc_info=error)

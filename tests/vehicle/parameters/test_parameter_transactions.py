@@ -226,7 +226,7 @@ async def test_temporary_block_is_entered_once() -> None:
         block = flight.vehicle.parameters.temporarily({"RTL_ALT": 2000})
         async with block:
             pass
-        with pytest.raises(InvalidArgument, match="already"):
+        with pytest.raises(InvalidArgument, match="entered before"):
             async with block:
                 pass
 
@@ -358,7 +358,7 @@ async def test_transaction_is_entered_once() -> None:
     async with open_flight(copter()) as flight:
         transaction = flight.vehicle.parameters.transaction()
         async with transaction:
-            with pytest.raises(InvalidArgument, match="already"):
+            with pytest.raises(InvalidArgument, match="entered before"):
                 await transaction.__aenter__()
 
 
