@@ -358,7 +358,7 @@ async def test_transaction_is_entered_once() -> None:
     async with open_flight(copter()) as flight:
         transaction = flight.vehicle.parameters.transaction()
         async with transaction:
-            with pytest.raises(InvalidArgument, match="entered before"):
+            with pytest.raises(InvalidArgument, match="already"):
                 await transaction.__aenter__()
 
 
