@@ -22,6 +22,7 @@ from aerokit.vehicle.camera.capture import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from aerokit.connection.bus import EndSignal
     from aerokit.connection.cells import StateCell
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.camera.link import CameraLink
@@ -90,7 +91,7 @@ class CaptureLog:
 
     def __init__(self, link: CameraLink) -> None:
         self._link = link
-        self.end = link.end
+        self.end: EndSignal = link.end
         self._by_index: dict[int, _Entry] = {}
         # Indices of the captures that are being requested; an index that two calls request occurs twice.
         self._requested: list[int] = []

@@ -23,7 +23,7 @@ from aerokit.vehicle.camera.values import CameraInformation, information_of
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from aerokit.connection.bus import Detach
+    from aerokit.connection.bus import Detach, EndSignal
     from aerokit.events import Event
     from aerokit.mavlink.message import Message
     from aerokit.vehicle.commanding.context import VehicleContext
@@ -53,7 +53,7 @@ class CameraLink(CameraOrders):
     ) -> None:
         self._context = context
         self._session = context.session
-        self.end = context.session.end
+        self.end: EndSignal = context.session.end
         self._component_of = component_of
         # Called with the number of the camera as soon as it is known.
         self._on_bound = on_bound
