@@ -165,7 +165,7 @@ class BackgroundCall(concurrent.futures.Future[None]):
         self.task: asyncio.Task[None] | None = None
 
     def done(self) -> bool:
-        # Without the lock of Future, which Ctrl-C could leave acquired: waits call this method again and again.
+        # Future.done acquires a lock, which Ctrl-C could leave acquired, because waits call this method often.
         return self._state not in ("PENDING", "RUNNING")
 
 

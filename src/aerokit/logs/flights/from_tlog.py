@@ -21,7 +21,7 @@ from aerokit.mavlink.frame import MAGIC_V2, Frame, x25
 from aerokit.mavlink.tlog import read_tlog
 from aerokit.missions.item import canonical_frame
 from aerokit.parameters.encoding import value_of
-from aerokit.vehicle.state.equipment import current
+from aerokit.vehicle.state.equipment import cell_voltages_mv, current
 from aerokit.vehicle.state.movement import Attitude
 from aerokit.vehicle.state.status_text import StatusTextAssembler
 
@@ -460,10 +460,7 @@ class _Reader:
 
     def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
         """Add the values of a battery, and evidence of a failsafe if its charge state has become worse."""
-        cells_mv = [mv for mv in message.voltages if mv != _U16]
-        cells_mv += [mv for mv in message.voltages_ext if mv not in (0, _U16)]  # 0 means a missing cell
-        if not any(cells_mv):  # PX4 reports a battery on CAN that does not measure its voltage as 0 mV.
-            cells_mv = []
+        cells_mv = cell_voltages_mv(message)
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
         state = message.charge_state

@@ -54,9 +54,9 @@ class TerminationActions(VehicleBase):
             command = MavCmd.DO_FLIGHTTERMINATION
             await self._sender.send_long(order, command, TERMINATE, modes=modes, armed=False, **SEND_ONCE)
         except CommandTimeout as error:
-            if not error.was_sent:
-                raise
-            raise CommandTimeout(f"{error}; the flight may have been terminated nevertheless") from None
+            if error.was_sent:
+                error.args = (f"{error}; the flight may have been terminated nevertheless",)
+            raise
         armed, state = self.telemetry.armed, self.telemetry.system_status
 
         def is_terminated() -> bool:
@@ -100,9 +100,9 @@ class TerminationActions(VehicleBase):
         try:
             await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, SHUTDOWN, **SEND_ONCE)
         except CommandTimeout as error:
-            if not error.was_sent:
-                raise
-            raise CommandTimeout(f"{error}; the autopilot may have switched off nevertheless") from None
+            if error.was_sent:
+                error.args = (f"{error}; the autopilot may have switched off nevertheless",)
+            raise
         with suppress(LinkLost):  # The link may go down with the autopilot.
             await await_progress(
                 self._session,

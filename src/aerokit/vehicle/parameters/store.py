@@ -78,7 +78,7 @@ class ParameterStore:
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
     def unmark_replaced(self, name: str) -> None:
-        """End the effect of `mark_replaced` on a parameter, because a new write may set its previous value again."""
+        """Undo `mark_replaced` before a new write, which may set the parameter to the replaced value again."""
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
