@@ -220,6 +220,21 @@ def test_reposition_holds_at_an_amsl_altitude() -> None:
     assert client.command(MavCmd.DO_REPOSITION, -1, 0) == MavResult.UNSUPPORTED
 
 
+def test_hold_stops_without_flying_back() -> None:
+    px4, client = flying_px4()
+    stream_velocity(client, 1.0, (0.0, 0.0, 0.0))
+    set_mode(client, 6)
+    stream_velocity(client, 5.0, (6.0, 0.0, 0.0))
+    assert px4.motion.velocity_north > 5.0
+    set_mode(client, 4, 3)
+    speeds = []
+    for _ in range(80):
+        client.run(0.1)
+        speeds.append(px4.motion.velocity_north)
+    assert min(speeds) > -0.05
+    assert speeds[-1] < 0.1
+
+
 def test_return_climbs_lands_and_disarms_at_home() -> None:
     px4, client = flying_px4()
     there = px4.frame.to_global(34.0, 23.0, 0.0)

@@ -199,6 +199,14 @@ class Motion:
         """Metres north, east and down of the origin."""
         return (self.north, self.east, self.down)
 
+    @property
+    def stopping_place(self) -> Ned:
+        """The place ahead at which :meth:`seek_position` stops the vehicle without flying back."""
+        speed, deceleration = self.ground_speed_m_s, BRAKING_SHARE * self.limits.acceleration_m_s2
+        # Divided by the speed, this is the inverse of `approach_speed`.
+        seconds = 1.0 if speed <= deceleration else speed / (2.0 * deceleration) + deceleration / (2.0 * speed)
+        return (self.north + self.velocity_north * seconds, self.east + self.velocity_east * seconds, self.down)
+
     def seek_velocity(self, north: float, east: float, down: float) -> None:
         """Fly at this velocity (m/s)."""
         self._set_target((north, east, down))

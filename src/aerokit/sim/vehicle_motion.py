@@ -11,7 +11,7 @@ import math
 import random
 from dataclasses import dataclass
 
-from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, SimulatedWind, approach_speed, wrap_pi
+from aerokit.sim.motion import GRAVITY_M_S2, Motion, MotionLimits, Ned, SimulatedWind, approach_speed, wrap_pi
 
 _BANK_TIME_CONSTANT_S = 0.4
 _CLIMB_TIME_CONSTANT_S = 0.7
@@ -63,6 +63,11 @@ class FixedWing(Motion):
         self._wanted_airspeed = 0.0
         self._wanted_bank = 0.0
         self._wanted_climb = 0.0
+
+    @property
+    def stopping_place(self) -> Ned:
+        """The present place, because a plane cannot stop and circles there."""
+        return self.place
 
     def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:
         """Hold an airspeed in m/s, a bank angle in radians (positive to the right) and a climb rate in m/s."""

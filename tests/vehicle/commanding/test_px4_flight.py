@@ -216,6 +216,14 @@ async def test_land(flying: Px4Flight) -> None:
     assert flying.px4.is_landed
 
 
+async def test_land_while_px4_disarms_after_landing_returns(flying: Px4Flight) -> None:
+    await flying.vehicle.land()
+    await anyio.sleep(flying.px4.parameters["COM_DISARM_LAND"] - 0.6)
+    assert flying.px4.is_armed
+    await flying.vehicle.land()
+    assert flying.vehicle.armed.value is False
+
+
 @pytest.mark.parametrize("is_taken", [False, True])
 async def test_land_current_mode_before_heartbeat_ends_landing(
     flying: Px4Flight, monkeypatch: pytest.MonkeyPatch, is_taken: bool

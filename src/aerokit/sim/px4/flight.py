@@ -141,8 +141,9 @@ class Px4Flight:
             self._vehicle.mission.enter()
 
     def stay_here(self) -> None:
-        motion = self._vehicle.motion
-        self.target = motion.place
+        # If HOLD targeted the present place instead, the vehicle would fly back to it (`preproject_stop_point` in
+        # navigator_main.cpp).
+        self.target = self._vehicle.motion.stopping_place
 
     def update(self) -> None:
         """Fly for one tick as the present mode commands."""

@@ -25,7 +25,7 @@ from aerokit.vehicle.state.telemetry import is_reported_on_ground
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from aerokit.autopilots import TakeOff
+    from aerokit.autopilots import Mode, TakeOff
     from aerokit.vehicle.commanding.order import Order
 
 # Maps each MAV_LANDED_STATE of a flying vehicle to its name in error texts.
@@ -224,7 +224,7 @@ class FlightActions(VehicleBase):
         mode = self._sender.mode_for("land", "land")
         if self.autopilot.mode_when_landed is None:
             order = self._arbiter.order(mode)
-            await self._sender.change_mode(mode, order, reported_since=order.given_at)
+            await self._enter_landing_mode(mode, order)
         else:
             order = self._arbiter.order(mode, self.autopilot.modes.find(self.autopilot.mode_when_landed))
             with self._arbiter.changing_mode():
@@ -242,11 +242,20 @@ class FlightActions(VehicleBase):
         """
         mode = self._sender.mode_for("return_to_launch", "return")
         order = self._arbiter.order(mode)
-        await self._sender.change_mode(mode, order, reported_since=order.given_at)
+        await self._enter_landing_mode(mode, order)
         if self.autopilot.lands_after_return:
             await self._await_ground("return_to_launch", order, timeout, max_silence_s)
         else:
             await self._await_home(order, timeout, max_silence_s)
+
+    async def _enter_landing_mode(self, mode: Mode, order: Order) -> None:
+        try:
+            await self._sender.change_mode(mode, order, reported_since=order.given_at)
+        except OperationRejected:
+            # PX4 changes to LOITER when it disarms after an earlier landing. The wait for the ground then succeeds.
+            is_down = self.telemetry.is_confirmed_disarmed or is_reported_on_ground(self.telemetry)
+            if not (is_down and order.is_newest):
+                raise
 
     async def _await_ground(
         self, operation: str, order: Order, timeout: float | None, max_silence_s: float | None
