@@ -8,7 +8,7 @@ from test_routing import CAMERA, COPTER, STATION, Stage, order
 from aerokit.connection.routes import MAX_ROUTES, ROUTE_TIMEOUT_S
 from aerokit.hub.senders import REPEAT_WINDOW_S
 from aerokit.mavlink.encoder import FrameEncoder
-from aerokit.mavlink.messages import Attitude, Heartbeat, ParamRequestList
+from aerokit.mavlink.messages import Attitude, Heartbeat, LandingTarget, ParamRequestList
 
 
 def vehicle_and_camera() -> Stage:
@@ -78,6 +78,19 @@ def test_broadcast_order_reaches_a_vehicle_once() -> None:
     stage.now += ROUTE_TIMEOUT_S + 1
     stage.receive("b", COPTER)
     assert stage.receive("c", order(0, 0), 255, 190) >= {"b"}, "it is reached there now"
+
+
+def test_landing_target_reaches_a_vehicle_once() -> None:
+    stage = vehicle_and_camera()
+    stage.receive("c", STATION, 255, 190)
+    assert stage.receive("c", LandingTarget(0, 0, 0, 0.1, 0.1, 5.0, 0, 0), 255, 190) == {"a", "d"}
+
+
+def test_broadcast_command_of_vehicle_does_not_return_by_second_radio() -> None:
+    stage = vehicle_and_camera()
+    stage.receive("b", COPTER)
+    assert stage.receive("a", order(0, 0)) == {"c", "d"}
+    assert stage.receive("b", order(0, 0)) == {"c", "d"}
 
 
 def test_forged_senders_do_not_evict_a_gimbal() -> None:

@@ -226,11 +226,8 @@ class TargetFields:
         """Return True if the message is not in the dialect, so that its checksum was not checked."""
         return message_id not in self._dialect.rows
 
-    def is_order(self, message_id: int) -> bool:
-        return self.offsets.get(message_id) is not None and self.is_command(message_id)
-
     def is_command(self, message_id: int) -> bool:
-        """Like :meth:`is_order`, but include messages without a target, such as LANDING_TARGET."""
+        """Return True for a command, with or without a target (LANDING_TARGET has none)."""
         if self.is_unknown(message_id):
             return False
         return kind_of(self._dialect[message_id].NAME, has_target=True) is MessageKind.ORDER

@@ -363,6 +363,7 @@ class Router(Generic[PortT]):
         target_system, target_component = target & 0xFF, target >> 8
         ids = target_system, target_component
         stream_key = message_id << 16 | source
+        sender = self._senders.get(source, _UNKNOWN_SENDER)
         if message_id == _SETUP_SIGNING:
             return ForwardingPlan(stream_key, message_id, ids, reason="secret")
         has_target = target_system != 0
@@ -374,8 +375,9 @@ class Router(Generic[PortT]):
                 return ForwardingPlan(stream_key, message_id, ids, reason="no_route")
         else:
             numbers = dict.fromkeys(self._nodes)
-            if self._targets.is_order(message_id):  # An autopilot that is received at two ports gets an order once.
-                numbers = {number: None for number in numbers if not self._is_redundant(number)}
+            if self._targets.is_command(message_id):
+                # An autopilot that is received at two ports gets a command once, and does not get its own command.
+                numbers = {number: None for number in numbers if not self._is_redundant(number, sender)}
         numbers.pop(node.number, None)
         # Any autopilot would adapt its message rates to this radio, even if the radio is not its own.
         if message_id in _RADIOS:
@@ -394,7 +396,6 @@ class Router(Generic[PortT]):
             node.forget_plans()
         # Equal tuples become the same object, so that plans can be compared by identity.
         shared_outs = node.destinations.setdefault(tuple(outs), tuple(outs))
-        sender = self._senders.get(source, _UNKNOWN_SENDER)
         plan = ForwardingPlan(stream_key, message_id, ids, shared_outs, tuple(rate_limited), sender=sender)
         node.plans[key] = plan
         # The fast path of `route_all` is for broadcasts only. Heartbeats (0), and frames at another port than the
@@ -429,10 +430,10 @@ class Router(Generic[PortT]):
                     numbers[number] = None
         return numbers
 
-    def _is_redundant(self, number: int) -> bool:
-        """Return True if autopilots are received at this port, but messages for each of them go to another port."""
-        here = [sender for sender in self._senders.values() if sender.is_autopilot and sender.is_at(number)]
-        return bool(here) and all(sender.port_number != number for sender in here)
+    def _is_redundant(self, number: int, sender: Sender) -> bool:
+        """Return True if a command of ``sender`` reaches all autopilots of this port elsewhere, or is from one here."""
+        here = [autopilot for autopilot in self._senders.values() if autopilot.is_autopilot and autopilot.is_at(number)]
+        return sender in here or (bool(here) and all(autopilot.port_number != number for autopilot in here))
 
     def _has_autopilot(self, number: int) -> bool:
         return any(sender.is_autopilot and number in sender.ports for sender in self._senders.values())
