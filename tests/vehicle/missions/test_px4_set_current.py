@@ -10,7 +10,6 @@ from aerokit import messages as m
 from aerokit import missions
 from aerokit.errors import OperationRejected, OperationTimeout
 from aerokit.mavlink.enums import MavCmd
-from aerokit.protocols.missions import SetCurrentItem
 from aerokit.sim.px4.modes import POSITION
 
 pytestmark = pytest.mark.anyio
@@ -28,10 +27,10 @@ async def _start_mission(flight: Px4Flight) -> None:
 
 
 @pytest.mark.parametrize("party", ["a pilot", "the program"])
-async def test_set_current_is_not_resent_after_takeover(party: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_set_current_is_not_resent_after_takeover(party: str) -> None:
     async with open_px4() as flight:
         await _start_mission(flight)
-        monkeypatch.setattr(SetCurrentItem, "receive", lambda *_: None)  # it is never confirmed
+        flight.px4.faults.lose(m.MissionCurrent, times=100)
         async with anyio.create_task_group() as tasks:
 
             async def interfere() -> None:
@@ -45,6 +44,20 @@ async def test_set_current_is_not_resent_after_takeover(party: str, monkeypatch:
             with pytest.raises(OperationRejected, match=r"not sent again: (the mode|another order)"):
                 await flight.vehicle.mission.set_current(2)
         assert len(flight.wire.all(m.MissionSetCurrent)) == 1
+
+
+async def test_set_current_of_return_that_changes_the_mode_succeeds() -> None:
+    async with open_px4() as flight:
+        await flight.take_off()
+        place = flight.vehicle.position.value.offset(north_m=100.0)
+        items = [missions.waypoint(place, altitude_relative_m=10), missions.return_to_launch()]
+        await flight.vehicle.mission.upload(missions.Mission(items))
+        await flight.vehicle.mission.start()
+        await anyio.sleep(1.1)
+        flight.px4.faults.lose(m.MissionCurrent, times=2)  # HEARTBEAT reports RTL first
+        await flight.vehicle.mission.set_current(1)
+        assert flight.vehicle.mode.value.name == "RTL"
+        assert flight.vehicle.mission.current.value == 1
 
 
 async def test_set_current_is_not_resent_into_silence() -> None:

@@ -469,9 +469,14 @@ class MissionControl(VehiclePlan["Mission"]):
             try:
                 await self._set_current_by_message(seq, timeout, sent)
             except OperationTimeout as error:
-                if order.end:
-                    raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
-                raise
+                if not order.end:
+                    raise
+                # The item itself may have changed the mode: PX4 leaves MISSION for a return.
+                if order.is_newest:
+                    with anyio.move_on_after(END_GRACE_S):
+                        await self._tracker.current.wait_until(lambda current: current == item)
+                        return
+                raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
 
     async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand | None = None) -> None:
         """Send MISSION_SET_CURRENT until MISSION_CURRENT reports the item, as long as the order is valid."""
