@@ -85,7 +85,10 @@ def _add_publishing(
 
 
 def _add_common(action: argparse.ArgumentParser, default_hz: float, max_hz: float, what: str) -> None:
-    """Add the options that all bridges have. ``what`` is the word for one of the published values, for the help."""
+    """Add the options that all bridges have.
+
+    The help texts call a published value ``what``.
+    """
     action.add_argument(
         "--rate",
         type=number(0.1, max_hz),
@@ -124,7 +127,6 @@ def _without_password(broker: str) -> str:
 
 
 async def _foxglove(options: argparse.Namespace) -> int:
-    """Serve vehicles to Foxglove until Ctrl-C or the end of the connection."""
     import_extra("foxglove", "foxglove")
     from aerokit.apps.foxglove import foxglove_bridge
     from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
@@ -151,12 +153,10 @@ async def _foxglove(options: argparse.Namespace) -> int:
 
 
 def _rates(options: argparse.Namespace) -> dict[type[Message], float] | None:
-    """Return the rates to request: an empty dict for ``--listen-only``; otherwise None, which means the usual rates."""
     return {} if options.listen_only else None
 
 
 async def _publish(options: argparse.Namespace) -> int:
-    """Publish the states of all vehicles until Ctrl-C or the end of the connection."""
     import_extra(*options.module_and_extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
@@ -194,7 +194,10 @@ async def _publish(options: argparse.Namespace) -> int:
 
 
 async def _wait_until_ended(connection: Connection, stop: asyncio.Event) -> None:
-    """Wait until ``stop`` is set or the connection ends. Raise the error that ended the connection."""
+    """Wait until ``stop`` is set or the connection ends.
+
+    Raises the error that ended the connection.
+    """
     connection.on_end(lambda _: stop.set())
     await stop.wait()
     connection.raise_if_ended()
