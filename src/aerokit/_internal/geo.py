@@ -34,7 +34,7 @@ def offset(latitude_deg: float, longitude_deg: float, north_m: float, east_m: fl
 def north_east_m(
     latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float
 ) -> tuple[float, float]:
-    """Return how far the second place is north and east of the first."""
+    """Return how many metres the second place is north and east of the first."""
     line = _wgs84().Inverse(latitude_deg, longitude_deg, to_latitude_deg, to_longitude_deg)
     azimuth = math.radians(line["azi1"])
     return float(line["s12"] * math.cos(azimuth)), float(line["s12"] * math.sin(azimuth))

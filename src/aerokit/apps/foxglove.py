@@ -116,7 +116,10 @@ async def foxglove_bridge(
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
-    """Return the messages of the connection's dialect whose names match a pattern."""
+    """Return the messages whose names match a pattern.
+
+    Raises InvalidArgument if a pattern matches no message of the connection's dialect.
+    """
     by_id: dict[int, type[Message]] = {}
     for pattern in patterns:
         matching = [message for message in connection.bus.dialect if fnmatchcase(message.NAME, pattern.upper())]
@@ -185,7 +188,6 @@ class _TopicChannels:
         self._messages: dict[tuple[int, int, int], Message] = {}
 
     def send_again(self, topic: str) -> None:
-        """Send the current value of a topic again, for a new viewer."""
         if not topic.endswith("/log"):  # otherwise the other viewers would get all status texts again
             self._sent_at.pop(topic, None)  # so that `publish` sends the current value
 

@@ -54,11 +54,10 @@ class Readiness(NamedTuple):
 
 
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes_mode: bool = False) -> Readiness:
-    """Return the reasons why a vehicle cannot arm, and why it cannot fly.
+    """Return the reasons why a vehicle cannot arm, and why it cannot fly. Nothing is sent.
 
-    Nothing is sent to it. ``reasons`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against
-    arming follow from the known state. With ``changes_mode``, the present mode is no reason, because `Vehicle.arm`
-    will change it.
+    ``reasons`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against arming follow from the
+    known state. With ``changes_mode``, the present mode is no reason, because `Vehicle.arm` will change it.
     """
     grouped = _grouped(vehicle, reasons)
     if reasons is not None or changes_mode:  # `reasons` already includes the mode
@@ -174,7 +173,6 @@ def arms_but_cannot_fly_text(vehicle: Vehicle) -> str:
 
 
 def readiness_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
-    """Return the reasons as lines of text; empty if nothing is missing."""
     lines = []
     for index, text in enumerate(checks.against_arming):
         lines.append(f"{checks.prefix}: {text}" if index == 0 else f"  {text}")
@@ -211,7 +209,7 @@ class ArmingCheckRequests:
 
 
 async def run_arming_checks(vehicle: Vehicle) -> None:
-    """Ask a vehicle why it cannot arm. The answers are status texts."""
+    """Ask a vehicle why it cannot arm. It answers with status texts."""
     with contextlib.suppress(AerokitError):  # the state shows whether the vehicle answers
         await vehicle.why_not_armable()
 

@@ -109,7 +109,6 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
 
 
 def _lines(arguments: Iterable[str], indent: str) -> str:
-    """Return the arguments, one per line."""
     lines = ""
     for argument in arguments:
         # An argument that is too long is wrapped before its `| None`, if any.
@@ -309,7 +308,6 @@ TYPE_VARIABLES = {
 
 
 def generate(name: str = "twins") -> str:
-    """Return the source of one generated file."""
     page = Page(name)
     twins = [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]

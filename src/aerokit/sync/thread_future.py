@@ -65,7 +65,6 @@ class ThreadFuture(Generic[T]):
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:
-        """Return the error and clear it."""
         # The traceback of a stored error refers to this object, which is a reference cycle.
         error, self._error = self._error, None
         return error

@@ -135,7 +135,6 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     @property
     def _can_skip_polls(self) -> bool:
-        """True if no socket, executor call or debug mode requires asyncio's own iteration."""
         is_watched = self._executor_calls or self._stopping or self._debug  # type: ignore[attr-defined]
         return not is_watched and len(self._registered) == self._own_registered_count
 
@@ -180,7 +179,6 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return has_run
 
     def _schedule_sources_before_timer(self) -> None:
-        """Schedule the event sources that are due together with the next timer, so that they run before it."""
         timers = self._scheduled  # type: ignore[attr-defined]
         end = self._now + self._clock_resolution
         if timers and timers[0]._when < end:
@@ -285,7 +283,6 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 def _name_and_line(task: asyncio.Task[Any]) -> str:
-    """Return the name of a task and the line at which it waits."""
     line = ""
     awaited: object = task.get_coro()
     while isinstance(awaited, CoroutineType):

@@ -303,7 +303,6 @@ class FaultyLink(Link):
             self._incoming_path.link_drained(now - stalled_at)
 
     def _discard_in_transit(self) -> None:
-        """Discard the outgoing frames that are in transit."""
         if self._stalled_queue is not None:
             self._stalled_queue.close()
         if self._in_flight is not None:

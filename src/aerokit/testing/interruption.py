@@ -86,7 +86,7 @@ def _is_sigint_available() -> bool:
 
 
 def _is_in_context_code(frame: FrameType | None) -> bool:
-    """Return True if the frame may be entering or leaving a block."""
+    """Return True if the frame is code that enters or leaves a `with` block."""
     name = "" if frame is None else frame.f_code.co_filename
     return name == contextlib.__file__ or (name.endswith(_CONTEXT_FILES) and "aerokit" in name)
 

@@ -268,7 +268,6 @@ def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] 
 
 @contextlib.contextmanager
 def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Iterator[None]:
-    """Within the block, ``item`` runs ``test`` instead of its own function."""
     original = item.obj
     item.obj = test
     try:
@@ -278,6 +277,5 @@ def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Itera
 
 
 def _raising_vehicle_errors(item: pytest.Function) -> contextlib.AbstractContextManager[None]:
-    """Return the `ServedFlight.raising_vehicle_errors` of a test with a served flight, else an empty context."""
     served = [value for value in _flight_fixtures(item) if hasattr(value, "raising_vehicle_errors")]
     return served[0].raising_vehicle_errors() if served else contextlib.nullcontext()

@@ -120,7 +120,7 @@ class RecordedMissions(MissionServer):
         self.listen()
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the items of the plan that the vehicle has at present; None if it has no plan of this type."""
+        """Return the items of the plan that the vehicle has at present; None without such a plan."""
         if mission_type in self._written:
             return self._written[mission_type]
         items = None

@@ -98,7 +98,6 @@ class FlightRecording:
         self._received_framer.keep_unknown = True
 
     def attach(self, server: SimulatorServer) -> None:
-        """Record the traffic of this server from now on."""
         server.on_datagram = self._write
 
     def to_bytes(self) -> bytes:

@@ -158,8 +158,6 @@ def picture(text: str) -> str:
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
-    """Return a parser for numbers from ``low`` to ``high``."""
-
     def parse(text: str) -> float:
         try:
             value = float(text)

@@ -102,8 +102,8 @@ def add_address(
     """Add an argument or option for the address of a link, and ``--baud``.
 
     ``name`` has leading dashes if the address is an option. ``what`` is the beginning of its help text.
-    ``default_text`` says in the help what the command does without an address. If it is None, the command then uses
-    the default address.
+    ``default_text`` says in the help what the command does without an address. If it is None, the command uses the
+    default address.
     """
     keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
     if default_text is None:
@@ -193,11 +193,9 @@ def command_action(
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
     """Return a ``run`` function that performs one action and prints one line.
 
-    Args:
-        name: the name of the action in the ``done`` record; may contain names of options in braces.
-        text: the line that is printed without ``--json``; may also contain names of options in braces.
-        action: called with the target and the options.
-        open_target: function that opens the target of the action; None: connect to the vehicle.
+    ``name`` is the action in the ``done`` record, and ``text`` the line without ``--json``. Both may contain names of
+    options in braces. ``action`` is called with the target and the options. Without ``open_target``, the target is the
+    vehicle.
     """
 
     async def run(options: argparse.Namespace) -> int:

@@ -75,7 +75,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
 
 
 def _superfluous_connect(parser: argparse.ArgumentParser, words: list[str]) -> str | None:
-    """Return an error text if --connect is given to a command with a positional address; else None."""
+    """Return an error text if --connect is given to a command that takes the address without it."""
     if not any(word.partition("=")[0] == "--connect" for word in words):
         return None
     other_words = [word.removeprefix("--connect=") for word in words if word != "--connect"]

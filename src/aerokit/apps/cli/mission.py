@@ -47,7 +47,6 @@ def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
 
 
 def plan_warnings(plan: Plan) -> list[str]:
-    """Describe the items that are unusual, or that a vehicle will probably refuse."""
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard_commands = frozenset(MavCmd)

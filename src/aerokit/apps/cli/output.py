@@ -100,7 +100,6 @@ class _NonblockingStream:
 
 @contextmanager
 def nonblocking_stderr() -> Iterator[None]:
-    """Within the block, output to stderr never blocks the event loop."""
     original = sys.stderr
     if original is None:
         yield

@@ -18,12 +18,12 @@ from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing,
 from aerokit.apps.cli.params_metadata import (
     add_metadata,
     check_allowed,
-    defaults_source,
+    defaults_unknown_text,
     load_metadata_option,
     metadata_facts,
     metadata_for_check,
-    metadata_source,
     metadata_text,
+    ranges_unchecked_text,
     reboot_note,
 )
 from aerokit.apps.cli.terminal import progress_bar
@@ -126,7 +126,7 @@ def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle)
     try:
         return table.changed_from_default()
     except ValueUnknownError:
-        raise ValueUnknownError(defaults_source(vehicle)) from None
+        raise ValueUnknownError(defaults_unknown_text(vehicle)) from None
 
 
 async def _get(options: argparse.Namespace) -> int:
@@ -182,7 +182,7 @@ async def _set(options: argparse.Namespace) -> int:
     code = _emit_results(options, results.values(), known_names, metadata)
     has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
     if has_changed and metadata is None and not (options.force or options.json):
-        print(metadata_source(vehicle))
+        print(ranges_unchecked_text(vehicle))
     return code
 
 
@@ -212,7 +212,7 @@ async def _load(options: argparse.Namespace) -> int:
     not_set = f", {failed_count} were not set" if failed_count else ""
     print(f"{len(results)} parameters in {options.file}, {len(changed) - failed_count} of them differed{not_set}")
     if len(changed) > failed_count and metadata is None and not options.force:
-        print(metadata_source(vehicle))
+        print(ranges_unchecked_text(vehicle))
     return code
 
 

@@ -28,8 +28,7 @@ _READ_TIMEOUT_S = 10.0
 _PX4_FILE = "FILE is parameters.json, which `make parameters_metadata` writes in PX4's sources"
 
 
-def metadata_source(vehicle: Vehicle) -> str:
-    """Return a note that ranges were not checked, and where to get a file for ``--metadata``."""
+def ranges_unchecked_text(vehicle: Vehicle) -> str:
     if vehicle.autopilot.name == "PX4":
         file = _PX4_FILE
     else:
@@ -37,8 +36,7 @@ def metadata_source(vehicle: Vehicle) -> str:
     return f"ranges were not checked: --metadata FILE checks them; {file} (docs/how-to/parameters.md)"
 
 
-def defaults_source(vehicle: Vehicle) -> str:
-    """Explain why the vehicle's defaults are unknown, and what to do instead."""
+def defaults_unknown_text(vehicle: Vehicle) -> str:
     if vehicle.autopilot.name == "PX4":
         return (
             f"PX4 does not report the defaults of its parameters: --metadata FILE has them; {_PX4_FILE}. To"
@@ -121,7 +119,6 @@ def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
 
 
 def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
-    """Return the unit, range and meaning of a parameter for its record. Unknown fields are None."""
     # The parameter's other names are not tried, because their metadata may have another unit.
     entry = None if metadata is None else metadata.get(parameter.name)
     if entry is None:

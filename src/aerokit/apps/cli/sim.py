@@ -90,7 +90,7 @@ def simulated_fleet(
     """Create ``count`` vehicles with consecutive system ids and seeds, in a row eastwards from ``home``.
 
     ``components`` makes the components of one vehicle. ``name`` is the kind of vehicle or the path of a recording. A
-    recording has one vehicle, and ignores the other arguments.
+    recording needs a ``count`` of 1, and ignores the other arguments.
     """
     from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 

@@ -259,7 +259,6 @@ async def _request(vehicle: Vehicle, message: Any, cell: Any) -> None:
 
 
 def _emit_link(connection: Connection, options: argparse.Namespace, seconds: float) -> None:
-    """Print the totals of a link. ``seconds`` is the time since it was opened."""
     statistics = list(connection.statistics())
     record = {
         "address": connection.link.address,

@@ -298,7 +298,7 @@ class Monitor(App[None]):
             options.highlighted = 0
         for index, system_id in enumerate(self._listed_ids):
             is_selected = index == options.highlighted
-            row = VehicleText(vehicles[system_id]).row(is_selected=is_selected, more=self._is_wide)
+            row = VehicleText(vehicles[system_id]).list_row(is_selected=is_selected, more=self._is_wide)
             if self._has_changed(f"row {index}", row):
                 options.replace_option_prompt_at_index(index, row)
 

@@ -120,8 +120,7 @@ class VehicleText:
             ("version", cell_of_constant(vehicle.version)),
         ]
 
-    def row(self, *, is_selected: bool, more: bool) -> Text:
-        """Return this vehicle's line in the list of vehicles."""
+    def list_row(self, *, is_selected: bool, more: bool) -> Text:
         vehicle = self._vehicle
         cell = self.cell
         text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
@@ -191,7 +190,7 @@ class VehicleText:
         return f"{silence}\n{reasons}" if silence else reasons
 
     def _reasons(self) -> list[str]:
-        """Return the reasons that prevent a flight. Those that prevent arming come first."""
+        """Return the reasons that prevent a flight, first those that prevent arming."""
         checks = readiness(self._vehicle)
         if self._vehicle.armed.latest:
             failsafe = [f"failsafe: {text}" for text in self._failsafe or ()]

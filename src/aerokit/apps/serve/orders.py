@@ -328,11 +328,12 @@ class OrderRunner:
     def submit(
         self, vehicle: Vehicle, order_type: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
     ) -> OrderRecord:
-        """Start an order, or return the earlier order with this key. ``order_type.check`` has checked the arguments.
+        """Start an order, or return the earlier order with this key.
 
-        Raises HttpProblem for a missing or used key, an outdated ``seen_at_s``, or a ``force`` that is not allowed.
-        Raises BusyError if too many orders are running, HeartbeatTimeout if the vehicle is silent, and
-        ConnectionClosed or LinkLost if the connection has ended.
+        ``order_type.check`` must have accepted the arguments. Raises HttpProblem for a missing or used key, an
+        outdated ``seen_at_s``, or a ``force`` that is not allowed. Raises InvalidArgument or FileFormatError if the
+        arguments cannot be parsed, BusyError if too many orders are running, HeartbeatTimeout if the vehicle is
+        silent, and ConnectionClosed or LinkLost if the connection has ended.
         """
         if not _KEY.fullmatch(key):
             raise HttpProblem(

@@ -103,7 +103,7 @@ class ServedVehicles:
         return vehicle
 
     def crash(self, vehicle: Vehicle) -> dict[str, Any] | None:
-        """Return the impact after which a vehicle has not moved; None if it may have moved since."""
+        """Return the impact after which the vehicle has not moved; None if it may have moved."""
         # A vehicle may have moved if it is silent, or reports no velocity.
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
         is_observed = is_connected and vehicle.velocity.age <= VELOCITY_MAX_AGE_S
