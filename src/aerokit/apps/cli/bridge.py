@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import address, number, port
-from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
+from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, opened
 from aerokit.apps.cli.output import DONE, add_json, can_print, emit, import_extra
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
@@ -129,14 +129,11 @@ def _without_password(broker: str) -> str:
 async def _foxglove(options: argparse.Namespace) -> int:
     import_extra("foxglove", "foxglove")
     from aerokit.apps.foxglove import foxglove_bridge
-    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
 
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with (
-            open_connection(
-                options.address, source_system=OBSERVER_SYSTEM_ID, baud=options.baud, signing=signing_of(options)
-            ) as connection,
+            opened(options) as connection,
             foxglove_bridge(
                 connection,
                 host=options.host,
@@ -160,17 +157,13 @@ async def _publish(options: argparse.Namespace) -> int:
     import_extra(*options.module_and_extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
-    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
     from aerokit.vehicle.connect import vehicles_on
 
     stop = asyncio.Event()
-    signing = signing_of(options)
     network = options.network_text(options.network)
     with on_interrupt(stop.set):
         async with (
-            open_connection(
-                options.address, source_system=OBSERVER_SYSTEM_ID, baud=options.baud, signing=signing
-            ) as connection,
+            opened(options) as connection,
             publisher_for(options.network) as publisher,
             vehicles_on(
                 connection,
