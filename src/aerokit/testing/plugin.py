@@ -215,9 +215,7 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
 def _with_open_flights(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> Callable[..., Any]:
     @functools.wraps(test)
     async def run_with_open_flights(**arguments: Any) -> None:
-        from contextlib import AsyncExitStack
-
-        async with AsyncExitStack() as stack:
+        async with contextlib.AsyncExitStack() as stack:
             for fleet in fleets:
                 await stack.enter_async_context(fleet.open())
             await test(**arguments)

@@ -15,7 +15,7 @@ from aerokit.apps.cli.arguments import add_baud, address, number, system_id
 from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.output import DONE, add_json, emit, emit_done
 from aerokit.apps.cli.terminal import confirm, is_interactive, on_interrupt, waiting
-from aerokit.connection.opening import OBSERVER_SYSTEM_ID
+from aerokit.connection.opening import OBSERVER_SYSTEM_ID, explain_no_vehicle, open_connection
 from aerokit.errors import ConnectFailed, InvalidArgument
 
 if TYPE_CHECKING:
@@ -263,8 +263,6 @@ async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> Asy
 
     With ``reconnect``, a lost link is opened again.
     """
-    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
-
     # Tests use a `Link` in place of the address. It cannot be opened again.
     link: str | Link = options.address
     async with open_connection(
@@ -282,8 +280,6 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 
     Raises ConnectFailed if there is none within ``patience_s``. The text describes what was received instead.
     """
-    from aerokit.connection.opening import explain_no_vehicle
-
     async with waiting(options, connection.link.address, patience_s):
         with anyio.move_on_after(patience_s):
             async for _ in connection.vehicles():

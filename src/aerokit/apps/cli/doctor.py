@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.apps.cli.connecting import add_link, add_seconds, opened
-from aerokit.apps.cli.doctor_link import Finding, Level, emit_finding
+from aerokit.apps.cli.doctor_link import BAUD_RATES, Finding, Level, LinkExamination, emit_finding, listen_at
 from aerokit.apps.cli.output import DONE, FAILED, NO_VEHICLE
 from aerokit.apps.cli.terminal import waiting
 from aerokit.errors import AerokitError, LinkOpenError
@@ -182,8 +182,6 @@ def _check_computer(report: Callable[[Finding], None]) -> None:
 
 async def _check_link(options: argparse.Namespace, report: Callable[[Finding], None]) -> bool:
     """Report findings about the link. Return False if it is silent or cannot be opened."""
-    from aerokit.apps.cli.doctor_link import LinkExamination
-
     parsed = parse_address(options.address) if isinstance(options.address, str) else None
     if parsed is not None and parsed.kind == "serial":
         configured_baud = parsed.baud or options.baud
@@ -213,8 +211,6 @@ async def _find_baud_rate(
 
     If none is found, this is ``configured_baud``.
     """
-    from aerokit.apps.cli.doctor_link import BAUD_RATES, listen_at
-
     port_finding = check_serial_port(device)
     if port_finding.level != "ok":
         report(port_finding)

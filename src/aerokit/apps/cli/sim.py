@@ -34,8 +34,8 @@ from aerokit.sim import (
     SimulatedVehicle,
     SimulatorServer,
 )
-from aerokit.sim.kinds import scale_timeouts
-from aerokit.sim.motion import HOME
+from aerokit.sim.kinds import kind_class, scale_timeouts, simulated
+from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 from aerokit.transport import create_link
 from aerokit.transport.address import parse_address
 
@@ -65,8 +65,6 @@ def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
     Kinds without the option ``boot_text`` ignore it. Raises InvalidArgument if the kind, another option or a parameter
     is unknown.
     """
-    from aerokit.sim.kinds import kind_class, simulated
-
     accepted = _accepted_options(kind_class(name))
     if "boot_text" not in accepted:
         options.pop("boot_text", None)
@@ -92,8 +90,6 @@ def simulated_fleet(
     ``components`` makes the components of one vehicle. ``name`` is the kind of vehicle or the path of a recording. A
     recording needs a ``count`` of 1, and ignores the other arguments.
     """
-    from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
-
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
     last_id = system_id + count - 1
