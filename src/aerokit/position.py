@@ -75,7 +75,7 @@ class Home(Snapshot):
 
 
 def position_with_altitude(place: Position | Home) -> Position:
-    """Return a place as a Position. The altitude of a Home is kept."""
+    """Return a place as a Position. A Home keeps its altitude above mean sea level."""
     return place.position.replace(altitude_amsl_m=place.altitude_amsl_m) if isinstance(place, Home) else place
 
 

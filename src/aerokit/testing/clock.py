@@ -139,10 +139,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return not is_watched and len(self._registered) == self._own_registered_count
 
     def _next_timer(self) -> float:
-        """Return the time of the next timer; infinity if there is none.
-
-        Discards cancelled timers.
-        """
+        """Discard cancelled timers, and return the time of the next timer; infinity without timers."""
         timers: list[Any] = self._scheduled  # type: ignore[attr-defined]
         while timers and timers[0]._cancelled:
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]

@@ -50,7 +50,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def on_error(self) -> Iterator[None]:
-        """Interrupt the main thread if this block, on another thread, raises an exception."""
+        """Interrupt the main thread if an exception leaves this block on another thread."""
         try:
             yield
         except Exception:

@@ -207,10 +207,7 @@ async def _check_link(options: argparse.Namespace, report: Callable[[Finding], N
 async def _find_baud_rate(
     options: argparse.Namespace, device: str, configured_baud: int, report: Callable[[Finding], None]
 ) -> int:
-    """Return the baud rate at which MAVLink is received.
-
-    If none is found, this is ``configured_baud``.
-    """
+    """Return the baud rate at which MAVLink is received; ``configured_baud`` if there is none."""
     port_finding = check_serial_port(device)
     if port_finding.level != "ok":
         report(port_finding)

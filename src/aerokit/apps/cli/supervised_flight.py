@@ -84,7 +84,10 @@ class SupervisedFlight(ABC):
         self._has_left_mode = False  # True once the armed vehicle was in a mode other than those it was armed in
 
     async def fly(self) -> int:
-        """Perform the flight, make the vehicle safe after an error or Ctrl-C, and return the exit code."""
+        """Perform the flight, and return the exit code.
+
+        After an error or Ctrl-C, the vehicle is made safe. Errors are then raised again.
+        """
         try:
             code = await self._interrupts.run(self._fly)
         except Exception as error:

@@ -82,7 +82,7 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise InvalidArgument if an argument is unknown or missing, or is wrongly a boolean.
+        """Raise InvalidArgument for unknown and missing arguments, and for wrong uses of booleans.
 
         Ranges and all other types are checked by the method that the order calls.
         """
