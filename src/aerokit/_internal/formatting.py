@@ -70,7 +70,7 @@ def _fields(value: object) -> Mapping[str, object] | None:
 
 
 def printable(text: str) -> str:
-    """Replace unprintable characters, except newlines."""
+    """Replace unprintable characters. Newlines are kept."""
     # A terminal might interpret such characters in a text from a vehicle.
     return "".join(char if char.isprintable() or char == "\n" else "\N{REPLACEMENT CHARACTER}" for char in text)
 

@@ -192,7 +192,8 @@ class Page:
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
         """Import the names in an expression. Without ``at_run_time``, they are for type checkers only.
 
-        A name is imported from the same place as in ``modules`` or, if they do not import it, from the first of them.
+        A name that one of ``modules`` imports is imported from the same place. Other names come from the first of the
+        modules.
         """
         if node is None:
             return

@@ -232,7 +232,7 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
 
 
 def _own_members(cls: type) -> Iterator[ClassMember]:
-    """Yield methods, public attributes that ``__init__`` sets, and states, but no inherited members."""
+    """Yield the class's own methods, its states, and the public attributes that ``__init__`` sets."""
     body = _class_node(cls).body
     for index, node in enumerate(body):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):

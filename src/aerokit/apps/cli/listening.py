@@ -104,7 +104,7 @@ async def _record_link(options: argparse.Namespace) -> int:
 async def _wait_for_end(connection: Connection, options: argparse.Namespace) -> bool:
     """Wait for the end of the recording. Return True after Ctrl-C.
 
-    Requests message rates meanwhile, except with ``--as-is``.
+    Without ``--as-is``, message rates are requested meanwhile.
     """
     if options.as_is:
         return await await_end(connection, options.seconds)
