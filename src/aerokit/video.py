@@ -195,7 +195,6 @@ class _Reader(threading.Thread):
         self._is_stopped = True
 
     def run(self) -> None:
-        """Decode the stream in this thread. At its end, tell the event loop the reason."""
         # This error is reported if something other than an Exception, such as SystemExit, ends the thread.
         error: Exception = LinkLost(f"the video of {self._uri} ended")
         try:

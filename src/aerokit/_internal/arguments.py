@@ -174,7 +174,6 @@ def _hint(check: Check, value: object) -> str:
 
 
 def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
-    """Return the rule of an annotation in a module with these globals."""
     if isinstance(node, ast.BinOp):
         is_left, left_text = _rule(node.left, module_globals)
         is_right, right_text = _rule(node.right, module_globals)
@@ -268,7 +267,6 @@ def _are_items(is_item: Check, value: object) -> bool:
 
 
 def check_kind(name: str, value: object, expected_type: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of this type."""
     # If an argument is annotated with a type variable, its type is known only at run time.
     if not isinstance(value, expected_type):
         raise InvalidArgument(
@@ -291,7 +289,6 @@ def check_range(name: str, value: float, minimum: float, maximum: float, *, abov
 
 
 def check_finite(name: str, *values: float) -> None:
-    """Raise InvalidArgument unless all values are finite numbers."""
     for value in values:
         if not isinstance(value, (int, float)) or not math.isfinite(value):
             raise InvalidArgument(f"{name}: {value!r} is not a finite number")

@@ -41,7 +41,6 @@ def north_east_m(
 
 
 def check_place(latitude_deg: float, longitude_deg: float) -> None:
-    """Raise :class:`InvalidArgument` unless latitude and longitude are numbers in range."""
     for name, value, limit in (("latitude_deg", latitude_deg, 90), ("longitude_deg", longitude_deg, 180)):
         if not isinstance(value, (float, int, Real)) or not -limit <= value <= limit:
             raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be -{limit} to {limit} degrees")

@@ -32,7 +32,6 @@ def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
 
 
 def _suggestion(package: str, name: str) -> str:
-    """Return a hint if ``aerokit.errors`` or ``aerokit.events`` defines the name; otherwise ""."""
     if package != "aerokit" or name.startswith("_"):
         return ""
     for module in _NAMED_MODULES:

@@ -297,7 +297,6 @@ class _Labels:
 
 
 def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
-    """Draw the altitudes of the tracks over time, and the altitude limit of the first failed assertion."""
     paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((altitude for altitude in limits if altitude is not None), None)

@@ -168,7 +168,6 @@ def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[st
 
 
 def _flight_fixtures(item: pytest.Item) -> list[Any]:
-    """Return the values of ``flight``, ``fleet`` and ``served_flight`` in a test."""
     fixture_values = getattr(item, "funcargs", None) or {}
     named = [fixture_values[name] for name in ("flight", "fleet", "served_flight") if name in fixture_values]
     return [value for value in named if _is_of_this_package(value)]

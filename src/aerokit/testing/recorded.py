@@ -63,7 +63,6 @@ class RecordedParameters(ParameterProtocolServer):
         self._has_hash = is_complete and HASH_NAME in without_index
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
-        """Return PARAM_VALUE with the value that a client has set, or else with the recorded value."""
         recorded = self._recorded[name]
         _, latest = recorded[0]
         for time, value in recorded:

@@ -125,7 +125,6 @@ class RecordedFlight:
         self.answers = {command: answers for command, answers in acknowledged.items() if answers}
 
     def _read_request(self, message: Any, now: float) -> None:
-        """Record a request of a client, so that later answers can be assigned to it."""
         # Id 0 means all systems or all components.
         if message.target_system not in (0, self.system_id) or message.target_component not in (0, self.component_id):
             return

@@ -161,7 +161,6 @@ class LinkExamination:
 
     @property
     def is_silent(self) -> bool:
-        """True if no message of another system was received."""
         return not set(self._frames) - {self._own_ids}
 
     def _silence(self) -> Iterator[Finding]:

@@ -128,10 +128,6 @@ def _how_long(options: argparse.Namespace) -> str:
 
 
 def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
-    """Return the endpoints with their options.
-
-    Raises InvalidArgument if an option names an unknown endpoint, or if ``--signed`` is used without a key.
-    """
     from aerokit.hub import Endpoint
 
     names = [name for name, _ in options.endpoints]

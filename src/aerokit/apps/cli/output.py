@@ -310,7 +310,6 @@ def add_force(command: argparse.ArgumentParser) -> None:
 
 
 def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
-    """Raise FileExistsError if the file exists and ``--force`` is not given."""
     if not options.force and Path(file).exists():
         raise FileExistsError(errno.EEXIST, "file exists; use --force to replace it", str(file))
 

@@ -83,7 +83,6 @@ async def metadata_for_check(
 
 
 async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
-    """Return the vehicle's metadata; None if it provides none or reading fails."""
     from aerokit.parameters.metadata import parse_metadata
 
     problem = f"time-out after {_READ_TIMEOUT_S:g} s"  # unless reading fails before the time-out
@@ -104,12 +103,10 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
 
 
 def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
-    """Raise InvalidArgument if the metadata does not allow some of the values."""
     check_values(metadata, values, "--force")
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
-    """Return a note if a new value may take effect only after a reboot, otherwise ""."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
     if metadata is None:

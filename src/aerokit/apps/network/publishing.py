@@ -43,10 +43,6 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
-    """Return a context manager that opens the publisher for an address.
-
-    Raises InvalidArgument if no publisher has the scheme of the address.
-    """
     scheme = address.partition(":")[0].strip().lower()  # The error omits the rest, which may contain a password.
     if scheme not in PUBLISHERS:
         raise InvalidArgument(f"to: {scheme!r} is not a scheme of a publisher; they are {', '.join(PUBLISHERS)}")

@@ -323,8 +323,6 @@ class HttpApi:
         )
 
     def endpoint(self, operation: Operation) -> Handler:
-        """Return a Starlette endpoint that checks the token and then performs an operation."""
-
         async def answer(request: Request) -> Response:
             try:
                 if not operation.is_open:

@@ -123,7 +123,6 @@ class FlightWatch:
 
     @property
     def disarm_parameter(self) -> str | None:
-        """The parameter with the delay of the automatic disarming; None if the firmware has none."""
         return self._vehicle.autopilot.auto_disarm_parameter
 
     @property
@@ -188,7 +187,6 @@ class FlightWatch:
         self._is_impact_dismissed = not armed and at - self._armed_until > CRASH_ARMED_WITHIN_S
 
     def _evaluate_impact(self, at: float, ground_speed_m_s: float, vertical_speed_m_s: float) -> None:
-        """Decide whether the vehicle has crashed or, after a crash, whether it flies again."""
         if self._is_impact_dismissed or self._impact_at is None:
             return
         is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S

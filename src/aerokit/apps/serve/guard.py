@@ -36,7 +36,6 @@ REQUEST_TIMEOUT_S = 10.0
 
 
 def check_token(token: str) -> str:
-    """Return the token; raise InvalidArgument if it is not allowed."""
     if not (MIN_TOKEN_LENGTH <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
         # The text does not contain the token.
         raise InvalidArgument(

@@ -152,7 +152,6 @@ def parameter_order(metadata: Metadata | None) -> OrderType:
 
 
 def check_parameter(metadata: Metadata | None, values: Mapping[str, Any]) -> None:
-    """Raise InvalidArgument if the metadata does not allow the value. With ``force``, nothing is checked."""
     value = values["value"]
     # The library itself rejects values of other types, and values that MAVLink cannot represent.
     if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max and not values.get("force"):
