@@ -75,12 +75,15 @@ class Home(Snapshot):
 
 
 def position_with_altitude(place: Position | Home) -> Position:
-    """Return a place as a Position. A Home is converted with its altitude above mean sea level."""
+    """Return a place as a Position. A Home keeps its altitude above mean sea level."""
     return place.position.replace(altitude_amsl_m=place.altitude_amsl_m) if isinstance(place, Home) else place
 
 
 def travel_target(place: Position | Home) -> Position:
-    """Return the position to fly to. A Home is converted without its altitude: the vehicle keeps its present one."""
+    """Return the position to fly to.
+
+    For a Home, it has no altitude, so the vehicle keeps its present one.
+    """
     return place.position if isinstance(place, Home) else place
 
 

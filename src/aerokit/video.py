@@ -159,7 +159,6 @@ class VideoStream:
         self._changed.set()
 
     def _on_frame(self, picture: object, stream_s: float | None) -> None:
-        """Replace the frame to read next. Called for each decoded frame."""
         if self._latest is not None:
             self.missed += 1
         vehicle = self._vehicle
@@ -196,7 +195,6 @@ class _Reader(threading.Thread):
         self._is_stopped = True
 
     def run(self) -> None:
-        """Decode the stream in this thread. At its end, tell the event loop the reason."""
         # This error is reported if something other than an Exception, such as SystemExit, ends the thread.
         error: Exception = LinkLost(f"the video of {self._uri} ended")
         try:
@@ -211,7 +209,7 @@ class _Reader(threading.Thread):
             self._call_on_loop(self.ended.set)
 
     def _read(self) -> None:
-        """Pass frames to the event loop until the stream ends or stop() is called.
+        """Pass frames to the event loop until the stream ends or is stopped.
 
         Raises LinkOpenError if the stream cannot be opened, and LinkLost if it is interrupted later.
         """

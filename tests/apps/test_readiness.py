@@ -69,7 +69,7 @@ async def test_copter_in_rtl_is_armed_in_other_mode() -> None:
         await vehicle.set_mode("RTL")
         text = "ArduCopter cannot arm in RTL (Vehicle.arm changes the mode to GUIDED)"
         assert readiness(vehicle).against_arming == (text,)
-        assert VehicleText(vehicle).row(is_selected=True, more=True).plain.endswith(f"cannot arm: {text} ")
+        assert VehicleText(vehicle).list_row(is_selected=True, more=True).plain.endswith(f"cannot arm: {text} ")
         assert (
             readiness(vehicle, await vehicle.why_not_armable())
             .against_arming[0]
@@ -88,7 +88,7 @@ async def test_radio_failsafe_is_named_until_it_ends() -> None:
         assert ("failsafe", "failsafe: Radio Failsafe") in [
             (label, text.plain) for label, text in VehicleText(vehicle).rows()
         ]
-        assert VehicleText(vehicle).row(is_selected=True, more=True).plain.endswith("failsafe: Radio Failsafe ")
+        assert VehicleText(vehicle).list_row(is_selected=True, more=True).plain.endswith("failsafe: Radio Failsafe ")
         assert "  failsafe Radio Failsafe" in _vehicle_lines(vehicle, readiness(vehicle))
         for number in range(100):
             flight.copter.send_text(MavSeverity.INFO, f"SmartRTL point {number}")

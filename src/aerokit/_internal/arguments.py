@@ -67,9 +67,10 @@ _SECONDS: dict[str, Rule] = {
 
 
 def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
-    """Class decorator: the class's own public methods raise InvalidArgument for the first invalid argument.
+    """Class decorator that checks the arguments of the class's own public methods.
 
-    Inherited, static and class methods, and properties, are not checked. Time-outs and other durations must be above 0.
+    Inherited, static and class methods, and properties, are not checked. Time-outs and other durations must be above
+    0.
     """
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and inspect.isfunction(member):
@@ -78,9 +79,9 @@ def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
 
 
 def checked(function: FunctionT, *, times_are_above_zero: bool = False) -> FunctionT:
-    """Function decorator: check the arguments of each call against the annotations of the function.
+    """Decorator that raises InvalidArgument for arguments that do not fit their annotations.
 
-    A time may be 0 (often with the meaning "do not wait") unless ``times_are_above_zero`` is True.
+    With ``times_are_above_zero``, a time must not be 0.
     """
     rules = _Rules(inspect.unwrap(function), times_are_above_zero)
     if inspect.iscoroutinefunction(function):
@@ -130,7 +131,6 @@ class _Rules:
                 raise _error(rules[name], name, value, vehicle_parameter=call_arguments.get("name"))
 
     def _compute(self) -> dict[str, Rule]:
-        """Compute the rules from the signature of the function."""
         parameters = inspect.signature(self._function).parameters.values()
         rules = {param.name: self._rule(param) for param in parameters if param.annotation is not param.empty}
         self._positional = tuple(param.name for param in parameters if param.kind is param.POSITIONAL_OR_KEYWORD)
@@ -145,7 +145,6 @@ class _Rules:
 
 
 def _is_time(parameter: inspect.Parameter) -> bool:
-    """Return True if the parameter is a time in seconds. A speed is not a time, although its name ends in ``_s``."""
     name = parameter.name
     is_speed = name.endswith(("m_s", "deg_s"))
     return str(parameter.annotation) in _SECONDS and name.endswith(("timeout", "_s")) and not is_speed
@@ -154,8 +153,7 @@ def _is_time(parameter: inspect.Parameter) -> bool:
 def _error(rule: Rule, argument: str, value: object, vehicle_parameter: object) -> InvalidArgument:
     """Create the error for an invalid argument.
 
-    ``argument`` is its name. ``vehicle_parameter`` is the vehicle parameter whose value is invalid, if the call has
-    one: "RTL_ALT" for ``set(name="RTL_ALT", value="abc")``.
+    ``vehicle_parameter`` is "RTL_ALT" for ``set(name="RTL_ALT", value="abc")``. Other calls have none.
     """
     check, allowed = rule
     hint = _hint(check, value)
@@ -167,7 +165,7 @@ def _error(rule: Rule, argument: str, value: object, vehicle_parameter: object) 
 
 
 def _hint(check: Check, value: object) -> str:
-    """Return the hint to pass ``.value`` if ``value`` is a state cell whose latest value is allowed; else ""."""
+    """Return the hint to pass ``.value`` if a state cell was given in place of its value; else ""."""
     latest = getattr(value, "latest", None)
     return "; pass its .value" if latest is not None and check(latest) else ""
 
@@ -176,7 +174,6 @@ def _hint(check: Check, value: object) -> str:
 
 
 def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
-    """Return the rule of an annotation. ``module_globals`` are the globals of the module that has the annotation."""
     if isinstance(node, ast.BinOp):
         is_left, left_text = _rule(node.left, module_globals)
         is_right, right_text = _rule(node.right, module_globals)
@@ -190,14 +187,13 @@ def _rule(node: ast.expr, module_globals: Mapping[str, Any]) -> Rule:
 
 
 def _name_of(node: ast.expr) -> str:
-    """Return the last part of a name: ``Path`` for ``Path`` and ``pathlib.Path``; empty for other expressions."""
+    """Return the last part of a name: ``Path`` for ``pathlib.Path``. Other expressions have the name ""."""
     if isinstance(node, ast.Attribute):
         return node.attr
     return node.id if isinstance(node, ast.Name) else ""
 
 
 def _named_rule(name: str, module_globals: Mapping[str, Any]) -> Rule:
-    """Return the rule of an annotation that is a single name."""
     if name in _SIMPLE:
         return _SIMPLE[name]
     annotated = module_globals.get(name)
@@ -271,10 +267,7 @@ def _are_items(is_item: Check, value: object) -> bool:
 
 
 def check_kind(name: str, value: object, expected_type: type) -> None:
-    """Raise InvalidArgument unless ``value`` is an instance of this type.
-
-    Used for arguments that are annotated with a type variable, whose type is known only at run time.
-    """
+    # If an argument is annotated with a type variable, its type is known only at run time.
     if not isinstance(value, expected_type):
         raise InvalidArgument(
             f"{name} = {short_repr(value)} is not allowed: it must be {with_article(expected_type.__name__)}"
@@ -282,7 +275,10 @@ def check_kind(name: str, value: object, expected_type: type) -> None:
 
 
 def check_range(name: str, value: float, minimum: float, maximum: float, *, above: bool = False) -> None:
-    """Raise InvalidArgument unless ``value`` is between the limits. With ``above``, ``minimum`` itself is invalid."""
+    """Raise InvalidArgument unless ``value`` is between the limits.
+
+    With ``above``, it must not be ``minimum`` itself.
+    """
     try:
         is_allowed = minimum <= value <= maximum and not (above and value == minimum)
     except TypeError:
@@ -293,7 +289,6 @@ def check_range(name: str, value: float, minimum: float, maximum: float, *, abov
 
 
 def check_finite(name: str, *values: float) -> None:
-    """Raise InvalidArgument unless all values are finite numbers."""
     for value in values:
         if not isinstance(value, (int, float)) or not math.isfinite(value):
             raise InvalidArgument(f"{name}: {value!r} is not a finite number")

@@ -40,7 +40,6 @@ class _Block(AbstractAsyncContextManager[T]):
         self._name, self._block = name, block
 
     async def __aenter__(self) -> T:
-        """Enter the block. InvalidArgument if no asyncio event loop is running."""
         try:
             asyncio.get_running_loop()
         except RuntimeError:  # No asyncio loop is running, for example in trio.run.
@@ -66,7 +65,8 @@ class _Block(AbstractAsyncContextManager[T]):
         raise self._misused("with")
 
     def __exit__(self, *_: object) -> None:
-        """Not called. It must exist, because Python looks it up before it calls ``__enter__``."""
+        # Never called. It must exist, because Python looks it up before it calls `__enter__`.
+        ...
 
     def __getattr__(self, name: str) -> None:
         raise AttributeError(

@@ -23,7 +23,10 @@ _XZ_MEMORY_LIMIT = 128 << 20  # Files compressed by xz -9 need 65 MB.
 
 
 def write_atomically(path: str | os.PathLike[str], text: str) -> None:
-    """Write a UTF-8 file with Unix line ends. If writing fails (OSError), the previous content is kept."""
+    """Write a UTF-8 file with Unix line ends.
+
+    If writing fails (OSError), the previous content is kept.
+    """
     target = Path(path)
     part_file = target.with_name(target.name + ".part")
     # An earlier attempt may have left this file, and a symbolic link of this name would redirect the writing.
@@ -39,11 +42,9 @@ def write_atomically(path: str | os.PathLike[str], text: str) -> None:
 
 
 def read_bounded(path: str | os.PathLike[str]) -> bytes:
-    """Read a file of limited size.
+    """Read a file.
 
-    Raises:
-        FileFormatError: the file is larger than :data:`MAX_FILE_SIZE`.
-        OSError: the file cannot be read.
+    Raises FileFormatError if it is larger than :data:`MAX_FILE_SIZE`, and OSError if it cannot be read.
     """
     with open(path, "rb") as file:
         data = file.read(MAX_FILE_SIZE + 1)
@@ -53,16 +54,14 @@ def read_bounded(path: str | os.PathLike[str]) -> bytes:
 
 
 def file_too_large(name: str) -> FileFormatError:
-    """Create the error for a file larger than :data:`MAX_FILE_SIZE`."""
     return FileFormatError(f"{name} is too large: more than {MAX_FILE_SIZE >> 20} MB")
 
 
 def decompress(data: bytes, name: str) -> bytes:
     """Decompress ``.xz`` data. Other data is returned unchanged.
 
-    Raises:
-        FileFormatError: the data is damaged, needs too much memory, or decompresses to more than
-            :data:`MAX_FILE_SIZE`. The text begins with ``name``.
+    Raises FileFormatError if the data is damaged, needs too much memory, or decompresses to more than
+    :data:`MAX_FILE_SIZE`. The text begins with ``name``.
     """
     if not data.startswith(_XZ_MAGIC):
         return data
@@ -83,9 +82,7 @@ def decompress(data: bytes, name: str) -> bytes:
 def read_text(path: str | os.PathLike[str]) -> str:
     """Read a text file. Line ends are converted to those of Unix.
 
-    Raises:
-        FileFormatError: the file is not UTF-8, or too large.
-        OSError: the file cannot be read.
+    Raises FileFormatError if it is too large or not UTF-8, and OSError if it cannot be read.
     """
     try:
         text = read_bounded(path).decode("utf-8-sig")
@@ -128,10 +125,7 @@ class PartFile:
     def writing(self, start: int) -> Iterator[BinaryIO]:
         """Open the file for writing at offset ``start``, and truncate it there.
 
-        If an error ends the `with` block while the file is empty, the file is removed.
-
-        Raises:
-            OSError: the file cannot be written.
+        If an error ends the `with` block, an empty file is removed. Raises OSError if the file cannot be written.
         """
         try:
             with self.path.open("r+b" if start else "wb") as disk:
@@ -144,5 +138,5 @@ class PartFile:
             raise
 
     def finish(self) -> None:
-        """Rename the partial file to its final name, replacing any existing file."""
+        """Rename the partial file to its final name. An existing file is replaced."""
         os.replace(self.path, self._destination)

@@ -60,7 +60,7 @@ def _names(member: Enum) -> Any:
 
 
 def _fields(value: object) -> Mapping[str, object] | None:
-    """Return the fields of an object with ``to_dict()``, a message's name first; None for other objects."""
+    """Return the fields of an object with ``to_dict()``, or None. A message's name comes first."""
     to_dict = getattr(value, "to_dict", None)
     if to_dict is None or isinstance(value, type):
         return None
@@ -70,14 +70,15 @@ def _fields(value: object) -> Mapping[str, object] | None:
 
 
 def printable(text: str) -> str:
-    """Replace unprintable characters, except newlines, in text from a vehicle: a terminal might interpret them."""
+    """Replace unprintable characters. Newlines are kept."""
+    # A terminal might interpret such characters in a text from a vehicle.
     return "".join(char if char.isprintable() or char == "\n" else "\N{REPLACEMENT CHARACTER}" for char in text)
 
 
 def format_value(value: object) -> str:
-    """Format an event's field for people: enum members by name, floats with three significant digits.
+    """Format an event's field for people.
 
-    Floats with more than three digits before the point are formatted as integers.
+    Enum members have their name. Floats have three significant digits. Floats from 1000 are formatted as integers.
     """
     if isinstance(value, float):
         return f"{value:.0f}" if abs(value) >= 999.5 else f"{value:.3g}"  # 999.5 is rounded to 1000.
@@ -90,7 +91,7 @@ _CREDENTIALS = re.compile(r"//([^/@:\s]*):[^\s]*@")
 
 
 def short_repr(value: object) -> str:
-    """Return at most 100 characters of ``repr(value)``, without passwords in URLs. If repr fails: the type's name."""
+    """Return at most 100 characters of ``repr(value)``, without passwords in URLs."""
     try:
         text = repr(value)
     except Exception:  # repr fails for an int of 5000 digits, and a __repr__ of the program may fail, too.

@@ -19,7 +19,7 @@ def distance_m(latitude_deg: float, longitude_deg: float, to_latitude_deg: float
 
 
 def bearing_deg(latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float) -> float:
-    """Return the initial bearing from the first place to the second: 0 to below 360, clockwise from north."""
+    """Return the initial bearing from the first place to the second, clockwise from north, 0 to below 360."""
     line = _wgs84().Inverse(latitude_deg, longitude_deg, to_latitude_deg, to_longitude_deg)
     return wrap_360(float(line["azi1"]))
 
@@ -34,27 +34,26 @@ def offset(latitude_deg: float, longitude_deg: float, north_m: float, east_m: fl
 def north_east_m(
     latitude_deg: float, longitude_deg: float, to_latitude_deg: float, to_longitude_deg: float
 ) -> tuple[float, float]:
-    """Return how far the second place is north and east of the first; the inverse of :func:`offset`."""
+    """Return how many metres the second place is north and east of the first."""
     line = _wgs84().Inverse(latitude_deg, longitude_deg, to_latitude_deg, to_longitude_deg)
     azimuth = math.radians(line["azi1"])
     return float(line["s12"] * math.cos(azimuth)), float(line["s12"] * math.sin(azimuth))
 
 
 def check_place(latitude_deg: float, longitude_deg: float) -> None:
-    """Raise :class:`InvalidArgument` unless latitude and longitude are numbers in range."""
     for name, value, limit in (("latitude_deg", latitude_deg, 90), ("longitude_deg", longitude_deg, 180)):
         if not isinstance(value, (float, int, Real)) or not -limit <= value <= limit:
             raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be -{limit} to {limit} degrees")
 
 
 def wrap_360(angle_deg: float) -> float:
-    """Normalise an angle to 0 to below 360."""
+    """Convert an angle to the range from 0 to below 360."""
     wrapped = angle_deg % 360.0
     return 0.0 if wrapped == 360.0 else wrapped  # For a tiny negative angle, the remainder is rounded to 360.
 
 
 def wrap_longitude(longitude_deg: float) -> float:
-    """Normalise a longitude to -180 to below 180."""
+    """Convert a longitude to the range from -180 to below 180."""
     return wrap_360(longitude_deg + 180.0) - 180.0 if not -180.0 <= longitude_deg < 180.0 else longitude_deg
 
 

@@ -15,11 +15,12 @@ _NAMED_MODULES = ("aerokit.errors", "aerokit.events")
 
 
 def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
-    """Describe what is wrong with the installation in ``folder`` and how to repair it; None if nothing is wrong.
+    """Describe what is wrong with the installation in ``folder``; None if nothing is wrong.
 
-    PyPI has another project called aerokit, for compressible flow. Both projects install into the same folder, so
-    neither may work if both are installed. ``is_ours`` is True if the ``__init__.py`` there is this library's.
+    ``is_ours`` is True if the ``__init__.py`` there is this library's.
     """
+    # PyPI has another project called aerokit, for compressible flow. Both projects install into the same folder, so
+    # neither may work if both are installed.
     other_packages = [name for name in _OTHER_PACKAGES if os.path.isfile(os.path.join(folder, name, "__init__.py"))]
     if is_ours and not other_packages:
         return None
@@ -31,7 +32,6 @@ def installation_problem(folder: str, *, is_ours: bool = True) -> str | None:
 
 
 def _suggestion(package: str, name: str) -> str:
-    """Return a hint if ``aerokit.errors`` or ``aerokit.events`` defines the name; otherwise an empty text."""
     if package != "aerokit" or name.startswith("_"):
         return ""
     for module in _NAMED_MODULES:
@@ -45,10 +45,10 @@ def lazy_exports(
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Create ``__getattr__``, ``__dir__`` and ``__all__`` of a package that imports its names on first use.
 
-    ``exports`` maps each module to the names to import from it. If the module does not define a name, the package gets
-    the module itself under this name. For type checkers, the package repeats the names as ``import name as name`` under
-    TYPE_CHECKING.
+    ``exports`` maps each module to the names to import from it. A name that the module does not define stands for the
+    module itself.
     """
+    # For type checkers, the package repeats the names as `import name as name` under TYPE_CHECKING.
     modules = {name: module for module, names in exports.items() for name in names}
 
     def get_attribute(name: str) -> object:

@@ -25,7 +25,6 @@ class _SnapshotType(type):
     """Turns annotated names into slots and generates ``__init__``. Needs ``from __future__ import annotations``."""
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any]) -> _SnapshotType:
-        """Create the class. Its fields are those of its bases, followed by its own."""
         annotations: dict[str, str] = namespace.get("__annotations__", {})
         own_fields = tuple(field for field, annotation in annotations.items() if not annotation.startswith("ClassVar"))
         defaults: dict[str, Any] = {}
@@ -46,7 +45,7 @@ class _SnapshotType(type):
 
     @property
     def __signature__(cls) -> Signature:
-        """The signature of the constructor, for editors and notebooks, even before ``__init__`` is generated."""
+        """The signature of the constructor, for editors and notebooks."""
         from inspect import Signature, signature
 
         init: Any = getattr(cls, "__init__")  # noqa: B009 - mypy calls the plain access unsound
@@ -59,11 +58,9 @@ class _SnapshotType(type):
 
 
 def _lazy_init(cls: Any) -> Callable[..., None]:
-    """Return a temporary ``__init__``. When it is first called, it generates the class's final ``__init__``.
+    """Return an ``__init__`` that replaces itself by a generated one when it is first called."""
 
-    A program creates values of only a few of these classes, and generating takes time.
-    """
-
+    # A program creates values of only a few of these classes, and generating takes time.
     def generate_and_call(self: object, *args: Any, **kwargs: Any) -> None:
         init = _generate_init(cls)
         type.__setattr__(cls, "__init__", init)
@@ -74,8 +71,9 @@ def _lazy_init(cls: Any) -> Callable[..., None]:
 
 
 def _generate_init(cls: Any) -> Any:
-    """Generate ``def __init__(self, a, b=default)``, which sets the slots directly, bypassing ``__setattr__``."""
+    """Generate ``def __init__(self, a, b=default)``."""
     fields, defaults = cls.__match_args__, cls._defaults
+    # The slots are set directly, because `__setattr__` refuses it.
     scope: dict[str, Any] = {f"_set_{field}": getattr(cls, field).__set__ for field in fields}
     scope.update({f"_default_{field}": value for field, value in defaults.items()})
     arguments = [f"{field}=_default_{field}" if field in defaults else field for field in fields]

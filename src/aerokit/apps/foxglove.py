@@ -116,7 +116,10 @@ async def foxglove_bridge(
 
 
 def _message_types(connection: Connection, patterns: Iterable[str]) -> list[type[Message]]:
-    """Return the messages of the connection's dialect whose names match a pattern, without duplicates."""
+    """Return the messages whose names match a pattern.
+
+    Raises InvalidArgument if a pattern matches no message of the connection's dialect.
+    """
     by_id: dict[int, type[Message]] = {}
     for pattern in patterns:
         matching = [message for message in connection.bus.dialect if fnmatchcase(message.NAME, pattern.upper())]
@@ -141,7 +144,8 @@ def _serve(channels: _TopicChannels, host: str, port: int) -> Any:
 
 
 async def _stop(server: Any, host: str) -> None:
-    """Stop the server, and wait until its thread has closed the socket, which ``stop`` itself does not wait for."""
+    """Stop the server, and wait until its socket is closed."""
+    # The SDK's thread closes the socket only some time after `stop` has returned.
     port = server.port
     server.stop()
     with anyio.move_on_after(_PORT_CLOSE_TIMEOUT_S, shield=True):
@@ -184,7 +188,6 @@ class _TopicChannels:
         self._messages: dict[tuple[int, int, int], Message] = {}
 
     def send_again(self, topic: str) -> None:
-        """Send the current value of a topic again, because a new viewer has subscribed."""
         if not topic.endswith("/log"):  # otherwise the other viewers would get all status texts again
             self._sent_at.pop(topic, None)  # so that `publish` sends the current value
 
@@ -209,13 +212,11 @@ class _TopicChannels:
                 self._send(name, received_at, topics.raw_fields(message))
 
     def close(self) -> None:
-        """Remove all topics."""
         for channel in self._channels.values():
             channel.close()
         self._channels.clear()
 
     def _publish_states(self, system_id: int, vehicle: Vehicle) -> None:
-        """Send the states that are newer than the last ones sent and, at intervals, the statistics of the link."""
         for state, cell in vehicle.telemetry.cells.items():
             value, topic_name = cell.latest, topics.vehicle_topic(system_id, state)
             if value is None:
@@ -231,7 +232,6 @@ class _TopicChannels:
                 self._send(name, now, link)
 
     def _publish_location_and_pose(self, system_id: int, vehicle: Vehicle) -> None:
-        """Send the location; then, in the map frame, the transform and the pose, from position and attitude."""
         position, attitude = vehicle.position.latest, vehicle.attitude.latest
         if position is None:
             return
@@ -259,13 +259,10 @@ class _TopicChannels:
                 self._send(name, text.at, topics.log_entry(self._to_unix_time(text.at), system_id, text))
 
     def _must_send(self, name: str, updated_at: float, make_topic: Callable[[], Topic]) -> bool:
-        """Return True if a viewer subscribes to the topic, and the value is newer than the last value sent.
-
-        The first call opens the channel of the topic. This cannot be done earlier, because the channel's type depends
-        on the value.
-        """
+        """Return True if a topic has viewers, and its value is newer than the last value sent."""
         channel = self._channels.get(name)
         if channel is None:
+            # The channel cannot be opened earlier, because its type depends on the value.
             channel = self._channels[name] = self._sdk.Channel(
                 name, schema=dict(make_topic().schema), message_encoding="json", context=self.context
             )
@@ -279,5 +276,4 @@ class _TopicChannels:
         self._channels[name].log(topics.encoded(fields), log_time=topics.nanoseconds(self._to_unix_time(updated_at)))
 
     def _to_unix_time(self, loop_time: float) -> float:
-        """Convert the loop's time to UTC, in seconds since 1970."""
         return self._unix_time_at_0 + loop_time

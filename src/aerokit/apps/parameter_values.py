@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def check_values(metadata: Metadata | None, values: Mapping[str, float], force: str) -> None:
-    """Raise InvalidArgument if the metadata does not allow some of the values; the text lists those values.
+    """Raise InvalidArgument if the metadata does not allow some of the values.
 
-    Names without metadata are accepted. The text also names ``force``, the option that sets the values nevertheless.
+    Names without metadata are accepted. ``force`` is the option that sets the values nevertheless.
     """
     if metadata is None:
         return
@@ -27,9 +27,9 @@ def check_values(metadata: Metadata | None, values: Mapping[str, float], force: 
 
 
 def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: str) -> ParameterWrite:
-    """Add a note to the result if the value was set without a check of its range; return the result.
+    """Add a note to the result if the value was set without a check of its range.
 
-    ``option`` is the command line option that loads metadata. The note names it if there is no metadata at all.
+    ``option`` is the command line option that loads metadata.
     """
     if result.error is not None or result.outcome == "unchanged":
         return result
@@ -44,10 +44,6 @@ def with_range_note(metadata: Metadata | None, result: ParameterWrite, option: s
 
 
 def _problem(metadata: Metadata, name: str, value: float) -> str | None:
-    """Return why a value is not allowed, or None.
-
-    If the metadata has the parameter under another name, the text begins with ``name`` and ``value``.
-    """
     entry, convert = metadata_entry(metadata, name)
     problem = None if entry is None else entry.problem(convert(value))
     if problem is None or entry is None or entry.name == name:
@@ -58,8 +54,7 @@ def _problem(metadata: Metadata, name: str, value: float) -> str | None:
 def metadata_entry(metadata: Metadata, name: str) -> tuple[ParameterMetadata | None, Callable[[float], float]]:
     """Return the metadata of a parameter, and a function that converts its values to the unit of the metadata.
 
-    The metadata may list the parameter under a later or earlier name, with another unit. The metadata is None if there
-    is none; the function then returns values unchanged.
+    The metadata may have the parameter under an earlier or later name, with another unit.
     """
     from aerokit.parameters.renames import resolve_rename
 

@@ -11,9 +11,8 @@ if TYPE_CHECKING:
 def parse_plan_text(text: str, name: str) -> Plan:
     """Parse the text of a .plan or QGC WPL 110 file, and check the parts of the plan.
 
-    Raises:
-        FileFormatError: the text has neither format. The error text begins with ``name`` and the position.
-        InvalidArgument: an item of the plan cannot be sent to a vehicle.
+    Raises FileFormatError if the text has neither format, and InvalidArgument if an item cannot be sent to a vehicle.
+    The text of a FileFormatError begins with ``name`` and the position.
     """
     from aerokit.missions import Plan, parse_plan, parse_waypoints
 

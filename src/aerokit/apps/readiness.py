@@ -22,13 +22,12 @@ _FAILSAFE_REPORT_DURATION_S = 10.0
 
 
 def active_failsafe(vehicle: Vehicle) -> list[str] | None:
-    """Return the vehicle's texts about its active failsafe, oldest first; None if no failsafe is active.
+    """Return the vehicle's texts about its active failsafe; None if no failsafe is active.
 
-    Texts from more than ten seconds before the last one are left out. If there is no text, one line says so.
-
-    ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which means nothing while the vehicle is disarmed
-    (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).
+    The oldest text is the first. Texts more than ten seconds older than the newest one are left out.
     """
+    # ArduPilot and PX4 report a failsafe as MAV_STATE_CRITICAL, which means nothing while the vehicle is disarmed
+    # (vehicle_system_status in GCS_MAVLink_Copter.cpp, HEARTBEAT.hpp).
     if not vehicle.armed.latest or vehicle.system_status.latest not in FAILSAFE_STATES:
         return None
     texts = vehicle.telemetry.texts_about_failsafes()
@@ -55,12 +54,10 @@ class Readiness(NamedTuple):
 
 
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes_mode: bool = False) -> Readiness:
-    """Return the requirements for a flight that a vehicle does not meet, grouped by whether they prevent arming.
+    """Return the reasons why a vehicle cannot arm, and why it cannot fly. Nothing is sent.
 
-    Args:
-        vehicle: the vehicle, whose known state is used. Nothing is sent to it.
-        reasons: result of ``vehicle.why_not_armable()``; None: derive the reasons from the known state.
-        changes_mode: True: do not report a mode that does not allow arming, because `Vehicle.arm` will change it.
+    ``reasons`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against arming follow from the
+    known state. With ``changes_mode``, the present mode is no reason, because `Vehicle.arm` will change it.
     """
     grouped = _grouped(vehicle, reasons)
     if reasons is not None or changes_mode:  # `reasons` already includes the mode
@@ -70,10 +67,7 @@ def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes
 
 
 def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
-    """Like `readiness`, but without the reason that the mode itself does not allow arming.
-
-    If the vehicle's checks pass although estimates are missing, the mode decides whether these prevent arming.
-    """
+    """Like `readiness`, without the reason that the mode itself does not allow arming."""
     missing = vehicle.missing_for_flight()
     against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
     sensors = vehicle.sensors.latest
@@ -96,7 +90,7 @@ def _is_about_estimates(text: str) -> bool:
 
 
 def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
-    """Return the missing conditions that prevent arming in the present mode, as `Vehicle.why_not_armable` does."""
+    """Return the missing conditions that prevent arming in the present mode."""
     mode = vehicle.mode.latest
     needs_position = mode is None or mode.name not in vehicle.autopilot.modes_without_position
     needed = []
@@ -110,10 +104,9 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
 
 
 def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
-    """Return the known reasons why `Vehicle.arm` would fail; empty if none is known. Sends nothing.
+    """Return the known reasons why `Vehicle.arm` would fail. Sends nothing.
 
-    ``missing`` is the result of `Vehicle.missing_for_flight`. In modes that need no position, ArduPilot arms although
-    most of these conditions are missing.
+    ``missing`` is the result of `Vehicle.missing_for_flight`.
     """
     if vehicle.link_state.latest is not LinkState.CONNECTED or vehicle.armed.latest is not False:
         return []
@@ -128,6 +121,7 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     arms_in = None if mode is None else mode.name
     if unarmable is not None:
         arms_in = unarmable["arms_in"]
+    # In modes that need no position, ArduPilot arms although most of these conditions are missing.
     if arms_in is None or not autopilot.modes_without_position or arms_in in autopilot.modes_without_position:
         return []
     estimator = vehicle.estimator.latest
@@ -140,11 +134,10 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
 
 
 def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
-    """Return data about a current mode in which the vehicle cannot arm, or only if a parameter permits it; else None.
+    """Return data about the current mode if it does not allow arming; otherwise None.
 
-    None is also returned while the mode is unknown. The keys are ``mode``: the name of the current mode;
-    ``arms_in``: the mode to which ``arm`` would change, or None; ``unless``: the autopilot's parameter that can permit
-    arming in the current mode, or None. The value of this parameter is not checked.
+    ``mode`` is the name of the mode. ``arms_in`` is the mode to which ``arm`` would change, or None. ``unless`` is the
+    autopilot's parameter that can permit arming in the current mode, or None. Its value is not checked.
     """
     autopilot = vehicle.autopilot
     mode = vehicle.mode.latest
@@ -159,7 +152,7 @@ def unarmable_mode(vehicle: Vehicle) -> dict[str, str | None] | None:
 
 
 def _refused_mode(vehicle: Vehicle) -> list[str]:
-    """Return a list with one text if a disarmed vehicle is in a mode that does not allow arming, else an empty list."""
+    """Return one text if the mode does not allow arming, otherwise nothing."""
     unarmable = None if vehicle.armed.latest else unarmable_mode(vehicle)
     if unarmable is None:
         return []
@@ -180,7 +173,6 @@ def arms_but_cannot_fly_text(vehicle: Vehicle) -> str:
 
 
 def readiness_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
-    """Return the reasons as lines of text; empty if nothing is missing."""
     lines = []
     for index, text in enumerate(checks.against_arming):
         lines.append(f"{checks.prefix}: {text}" if index == 0 else f"  {text}")
@@ -202,7 +194,7 @@ class ArmingCheckRequests:
         self._requested_at: dict[Vehicle, float] = {}
 
     def take_due(self, vehicle: Vehicle) -> bool:
-        """Return True, only once, when arming checks become due. The caller must then call `run_arming_checks`."""
+        """Return True, only once, when `run_arming_checks` must be called for the vehicle."""
         failing = _failing_checks(vehicle)
         if failing is None:
             self._failing.pop(vehicle, None)
@@ -217,13 +209,16 @@ class ArmingCheckRequests:
 
 
 async def run_arming_checks(vehicle: Vehicle) -> None:
-    """Ask a vehicle why it cannot arm. Its answers are status texts, which `Vehicle.missing_for_flight` includes."""
+    """Ask a vehicle why it cannot arm. It answers with status texts."""
     with contextlib.suppress(AerokitError):  # the state shows whether the vehicle answers
         await vehicle.why_not_armable()
 
 
 def _failing_checks(vehicle: Vehicle) -> tuple[str, ...] | None:
-    """Return the failing sensors of a connected, disarmed vehicle whose arming checks fail; otherwise None."""
+    """Return the failing sensors of a disarmed vehicle.
+
+    The result is None if the vehicle is armed or silent, or if its arming checks pass.
+    """
     sensors = vehicle.sensors.latest
     is_disarmed = vehicle.armed.latest is False
     if vehicle.link_state.latest is not LinkState.CONNECTED or not is_disarmed or sensors is None:

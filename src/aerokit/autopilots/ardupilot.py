@@ -439,12 +439,11 @@ def ardupilot_for(vehicle_type: int) -> ArduPilot:
 
 
 def _landed_state(heartbeat: Heartbeat) -> int | None:
-    """Return the landed state for a MAV_STATE: STANDBY means on the ground, ACTIVE in the air, others are unknown."""
     if heartbeat.system_status == MavState.STANDBY:
         return MavLandedState.ON_GROUND
     return MavLandedState.IN_AIR if heartbeat.system_status == MavState.ACTIVE else None
 
 
 def _text_after(text: str, *prefixes: str) -> str | None:
-    """Return the text without its prefix; None if the text begins with none of the prefixes."""
+    """Return the text without its prefix, or None if it has none of the prefixes."""
     return next((text[len(prefix) :].strip() for prefix in prefixes if text.startswith(prefix)), None)

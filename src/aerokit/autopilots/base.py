@@ -359,7 +359,7 @@ class Autopilot:
         return tuple(self.modes.find(name) for name in sorted(names))
 
     def _modes_of_do_set_mode(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
-        """Return the mode that a DO_SET_MODE with these parameters sets; empty without the flag CUSTOM_MODE_ENABLED."""
+        """Return the mode that a DO_SET_MODE with these parameters sets, or nothing."""
         base_mode, custom_mode = mode_numbers((*params, 0.0, 0.0)[:2])  # Missing parameters are 0.
         return (self.mode(custom_mode, base_mode, extra),) if base_mode & CUSTOM_MODE_ENABLED else ()
 
@@ -429,7 +429,10 @@ class Autopilot:
 
     @staticmethod
     def _missing_estimates(flags: int, *, required: int, horizontal: int) -> tuple[str, ...]:
-        """Return the missing estimates. The vehicle needs all of ``required``, and one of those in ``horizontal``."""
+        """Return the missing estimates.
+
+        The vehicle needs all of ``required``, and one of those in ``horizontal``.
+        """
         missing = bit_names(required & ~flags, ESTIMATES)
         return missing if flags & horizontal else (*missing, ESTIMATES[POS_HORIZ_ABS])
 

@@ -64,9 +64,9 @@ class ExternalRules(Snapshot):
 def _external_navigation(quantity: str) -> ExternalRule:
     """Return the rule for measurements that ArduPilot reads if VISO_TYPE is set (AP_VisualOdom).
 
-    The estimator has no other source of ``quantity`` (POSXY or VELXY) if EK3_SRC1_<quantity> is 6 (ExternalNav), and
-    both EK3_SRC2_<quantity> and EK3_SRC3_<quantity> are 6 or 0 (none).
+    ``quantity`` is POSXY or VELXY.
     """
+    # With these values, the estimator has no other source of `quantity`: 6 is ExternalNav, and 0 is none.
     sole_source = (
         (f"EK3_SRC1_{quantity}", (6.0,)),
         (f"EK3_SRC2_{quantity}", (0.0, 6.0)),

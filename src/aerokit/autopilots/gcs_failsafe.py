@@ -60,12 +60,10 @@ navigator parameters of PX4.
 
 
 def gcs_failsafe(firmware: str, value_of: Callable[[str], float | None]) -> tuple[str | None, str | None]:
-    """Return the parameter that decides on the action after the loss of the ground station, and the action.
+    """Return the parameter that decides what happens without the ground station, and the action.
 
-    The parameters of :data:`GCS_FAILSAFE_ACTIONS` are tried in order, until the value of one has an action in the
-    table. ``value_of`` returns None for a parameter whose value is unknown. A parameter with an unknown value ends the
-    search and is returned without an action. If no value has an action, both results are None. The action is a part
-    of a sentence, such as ``lands``.
+    The action is a part of a sentence, such as ``lands``. It is None if ``value_of`` returns None, because the value
+    is unknown. Both results are None if no parameter sets an action.
     """
     for name, actions in GCS_FAILSAFE_ACTIONS.get(firmware, {}).items():
         value = value_of(name)

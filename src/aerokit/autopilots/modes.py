@@ -78,7 +78,7 @@ class ModeTable:
         return Mode(self.name_of(number, extra), number)
 
     def _number_of(self, name: str, extra: Mapping[int, str]) -> int:
-        """Return the number of the mode that has this name, or of a text such as "MODE 42" or "42"."""
+        """Return the number of a mode. The name may also be "MODE 42" or "42"."""
         key = _key(name)
         if key in self._numbers:
             return self._numbers[key]
@@ -110,7 +110,7 @@ def is_armed(base_mode: int) -> bool:
 
 
 def base_mode_name(base_mode: int) -> str:
-    """Return the name of a mode that has no custom_mode, from its MAV_MODE_FLAG bits."""
+    """Return the name of a mode that has no custom_mode."""
     names = {
         MavModeFlag.AUTO_ENABLED: "AUTO",
         MavModeFlag.GUIDED_ENABLED: "GUIDED",
@@ -121,5 +121,5 @@ def base_mode_name(base_mode: int) -> str:
 
 
 def _key(name: str) -> str:
-    """Return the name in the form in which names are compared: ``"auto_rtl"`` becomes ``"AUTORTL"``."""
+    """Return the name as it is compared: ``"auto_rtl"`` becomes ``"AUTORTL"``."""
     return "".join(char for char in name.upper() if char.isalnum())

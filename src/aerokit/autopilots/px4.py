@@ -207,7 +207,6 @@ class Px4(Autopilot):
         return ModeOrder((CUSTOM_MODE_ENABLED, main, sub), CUSTOM_MODE_ENABLED, mode.custom_mode)
 
     def _modes_of_do_set_mode(self, params: Sequence[float], extra: Mapping[int, str]) -> tuple[Mode, ...]:
-        """Return the mode that a DO_SET_MODE with these parameters sets; empty without the flag CUSTOM_MODE_ENABLED."""
         base_mode, main, sub = mode_numbers((*params, 0.0, 0.0, 0.0)[:3])  # Missing parameters are 0.
         if not base_mode & CUSTOM_MODE_ENABLED:
             return ()

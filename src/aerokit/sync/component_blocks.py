@@ -71,7 +71,7 @@ def opened_component(
     connection: ConnectionTwin | None,
     **options: Any,
 ) -> ComponentT:
-    """Open a component on a new loop thread; if ``connection`` is given, on the connection's loop thread."""
+    """Open a component on the connection's loop thread or, without a connection, on a new one."""
     owns_loop = connection is None
     loop = LoopThread() if connection is None else connection._loop
     try:

@@ -39,7 +39,10 @@ WIDTH = 120  # the line length of `ruff format`; the output has its style
 
 
 def outer_name(annotation: ast.expr | None) -> str:
-    """Return the name of a type without its subscript: ``list`` for ``list[int]``. Empty if it is not a plain name."""
+    """Return the name of a type without its subscript: ``list`` for ``list[int]``.
+
+    Other expressions have the name "".
+    """
     while isinstance(annotation, ast.Subscript):
         annotation = annotation.value
     return annotation.id if isinstance(annotation, ast.Name) else ""
@@ -69,7 +72,7 @@ def source_of(node: ast.expr) -> str:
 
 
 def render_call(function: str, arguments: Sequence[str], indent: str = "        ") -> str:
-    """Return the source of a call: on one line, or with one argument per line if it would be too long."""
+    """Return the source of a call, on several lines if it is too long for one."""
     line = f"{function}({', '.join(arguments)})"
     if len(indent) + len(line) < WIDTH:  # One column is left free for a comma.
         return line
@@ -88,7 +91,7 @@ def render_function(
 
 
 def arguments_of(arguments: ast.arguments) -> list[str]:
-    """Return the source of the arguments of a definition, one text for each."""
+    """Return the source of each argument of a definition."""
     positional = [*arguments.posonlyargs, *arguments.args]
     no_defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults))
     # Only the last positional arguments have defaults.
@@ -106,9 +109,9 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
 
 
 def _lines(arguments: Iterable[str], indent: str) -> str:
-    """Return the arguments, one per line. An argument that is too long is wrapped before its ``| None``, if any."""
     lines = ""
     for argument in arguments:
+        # An argument that is too long is wrapped before its `| None`, if any.
         head, none, tail = argument.rpartition(" | None")
         if none and len(indent) + len(argument) + 1 > WIDTH:
             argument = f"{head}\n{indent}{none.lstrip()}{tail}"
@@ -187,10 +190,10 @@ class Page:
         self._page_of_other_twins = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
-        """Add imports of the names in an expression, for type checkers only unless ``at_run_time`` is True.
+        """Import the names in an expression. Without ``at_run_time``, they are for type checkers only.
 
-        If one of ``modules`` imports a name, the name is imported from the same place as there. Any other name is
-        imported from the first of the modules.
+        A name that one of ``modules`` imports is imported from the same place. Other names come from the first of the
+        modules.
         """
         if node is None:
             return
@@ -203,7 +206,6 @@ class Page:
                 self._import_name(text, modules, at_run_time)
 
     def _import_name(self, name: str, modules: tuple[str, ...], at_run_time: bool) -> None:
-        """Add the import of one name, unless the file defines it or it is built in."""
         if self._page_of_other_twins.get(name) == "twins":
             self.at_run_time.add(("aerokit.sync.twins", name))
             return
@@ -220,12 +222,10 @@ class Page:
             self.for_types.add(origin)
 
     def import_literals_in(self, node: ast.AST | None, module: str) -> None:
-        """Import the Literals of an annotation at run time, because ``checked`` needs their values.
-
-        Classes need no import at run time, because ``checked`` knows them by their names.
-        """
+        """Import the Literals of an annotation at run time, because ``checked`` needs their values."""
         if node is None:
             return
+        # Classes need no import at run time, because `checked` knows them by their names.
         for part in ast.walk(node):
             if not isinstance(part, ast.Name):
                 continue
@@ -273,7 +273,6 @@ class Page:
     def _render_context_manager(
         self, node: ast.FunctionDef | ast.AsyncFunctionDef, member: ClassMember, arguments: Sequence[str]
     ) -> str:
-        """Return the source of the twin of a method that ``contextmanager`` decorates."""
         self.for_types.add(("contextlib", "AbstractContextManager"))
         yielded = node.returns.slice if isinstance(node.returns, ast.Subscript) else ast.Constant(None)
         returns = ast.Subscript(ast.Name("AbstractContextManager"), yielded)
@@ -285,10 +284,6 @@ class Page:
         return render_function(node, returns, member.text, body)
 
     def _property_twin(self, twin: Twin, member: ClassMember) -> str:
-        """Return the source of a property of a twin.
-
-        A property that returns another twin is a cached property, so that each access returns the same object.
-        """
         name = member.name
         read = f"self.aio.{name}"
         if name in twin.called:
@@ -296,6 +291,7 @@ class Page:
         wrapped = self.wrapped_in_twin(read, member.returns)
         if name in twin.parts:
             wrapped = f'self._part("{name}", {outer_name(member.returns)})'
+        # A property that returns a new twin is cached, so that each access returns the same object.
         decorator = "property" if wrapped == read or name in twin.parts else "cached_property"
         if member.returns is None:
             raise ValueError(f"the type of {twin.name}.{name} is not annotated")
@@ -313,7 +309,6 @@ TYPE_VARIABLES = {
 
 
 def generate(name: str = "twins") -> str:
-    """Return the source of one generated file: its imports, ``__all__``, classes and functions."""
     page = Page(name)
     twins = [twin for twin in TWINS if twin.page == name]
     classes = [_class(page, twin) for twin in twins]
@@ -346,7 +341,6 @@ def generate(name: str = "twins") -> str:
 
 
 def _class(page: Page, twin: Twin) -> str:
-    """Return the source code of the blocking class that wraps one async class."""
     original = getattr(importlib.import_module(twin.module), twin.name)
     base = f"{twin.base}[{twin.parameter}]" if twin.parameter else twin.base
     if base in GENERIC_BASES:
@@ -360,7 +354,7 @@ def _class(page: Page, twin: Twin) -> str:
 
 
 def _opener(page: Page, path: str) -> str:
-    """Return the source code of a blocking function that opens an object on a loop thread, such as ``connect``."""
+    """Return the source of a blocking function that opens an object on a loop thread, such as ``connect``."""
     module, _, name = path.rpartition(".")
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):
@@ -392,7 +386,6 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
 
 
 def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
-    """Return the ``from … import`` statements for the names of one module."""
     imported = sorted((name for name_module, name in names if name_module == module and name), key=_by_kind)
     plain_names = [name for name in imported if " as " not in name]
     # Statements are sorted by their first imported name, which is the key in `statements`. As in ruff's format, each

@@ -80,24 +80,23 @@ class LoopThread:
         """Await ``function(*args, **kwargs)`` on the loop; return its result or raise its exception.
 
         Ctrl-C cancels the function, waits at most `INTERRUPTED_CALL_TIMEOUT_S` for its clean-up, and raises
-        KeyboardInterrupt.
-
-        Raises:
-            BusyError: called on the loop's own thread, which would be a deadlock.
-            ConnectionClosed: the loop was closed before or during the call.
+        KeyboardInterrupt. Raises BusyError on the loop's own thread, where the call would be a deadlock, and
+        ConnectionClosed if the loop was closed before or during the call.
         """
         return self._run(False, False, function, *args, **kwargs)
 
     def run_shielded(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """Like :meth:`run`, for short clean-up functions that must not be interrupted.
 
-        Ctrl-C waits for the function and then raises KeyboardInterrupt, with the function's error as its cause. A
-        second Ctrl-C does not wait.
+        Ctrl-C waits for the function and then raises KeyboardInterrupt. A second Ctrl-C does not wait.
         """
         return self._run(True, True, function, *args, **kwargs)
 
     def run_exit(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Like :meth:`run`, for the exit of a block: the function starts even after Ctrl-C, which then cancels it."""
+        """Like :meth:`run`, for the exit of a block.
+
+        The function starts even after Ctrl-C, which then cancels it.
+        """
         return self._run(False, True, function, *args, **kwargs)
 
     def _run(
@@ -109,9 +108,9 @@ class LoopThread:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run a function. If the wait is interrupted, cancel the call, and wait INTERRUPTED_CALL_TIMEOUT_S for its end.
+        """Run a function. With ``must_start``, it is started even after Ctrl-C.
 
-        With ``must_start``, a call is started even after Ctrl-C. The end of a shielded call is awaited without limit.
+        If the wait is interrupted, the call is cancelled. The end of a shielded call is then awaited without limit.
         """
         call: _Call[T] | None = None
         try:
@@ -144,7 +143,7 @@ class LoopThread:
         return call.result()
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Like :meth:`run`, but for a synchronous function, which is called on the loop's thread."""
+        """Like :meth:`run`, but for a synchronous function."""
 
         async def call() -> T:
             return function(*args, **kwargs)
@@ -152,9 +151,9 @@ class LoopThread:
         return self.run(call)
 
     def enter(self, context: AbstractAsyncContextManager[T]) -> T:
-        """Enter a context manager on the loop. The caller must exit the context manager with :meth:`run_shielded`.
+        """Enter a context manager on the loop.
 
-        If Ctrl-C arrives after the context manager was entered, but before this method returns, this method exits it.
+        The caller must exit it with :meth:`run_shielded`.
         """
         is_entered = False
 
@@ -167,6 +166,7 @@ class LoopThread:
         try:
             return self.run_shielded(enter)
         except BaseException as error:
+            # Ctrl-C arrived after the context manager was entered, so the caller will not exit it.
             if is_entered:
                 self.run_shielded(context.__aexit__, type(error), error, error.__traceback__)
             raise
@@ -176,15 +176,14 @@ class LoopThread:
         return self.enter(_AsyncContext(context))
 
     def feed(self) -> None:
-        """Record that the program is running, unless called on the loop's own thread."""
+        """Record that the program is running. A call on the loop's own thread has no effect."""
         if not self.is_current:
             self.activity.feed()
 
     def call_soon(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Schedule a synchronous function on the loop, in order, from any thread. The function must not raise.
+        """Schedule a synchronous function on the loop from any thread. It must not raise.
 
-        Raises:
-            ConnectionClosed: the loop was closed.
+        Functions run in the order of these calls. Raises ConnectionClosed if the loop was closed.
         """
         self.feed()
         with self._lock:
@@ -196,7 +195,7 @@ class LoopThread:
         return OpenContext(self, context)
 
     def close(self) -> None:
-        """Cancel all calls, and end the loop and its thread. Idempotent; waits at most five seconds."""
+        """Cancel all calls, and end the loop and its thread. Waits at most five seconds."""
         with self._lock:
             if self._is_closed:
                 return
@@ -223,7 +222,10 @@ class LoopThread:
         return threading.current_thread() is self._thread
 
     def wait_for(self, future: ThreadFuture[Any]) -> None:
-        """Wait for a future; Ctrl-C interrupts the wait on every system. ConnectionClosed if the loop ends first."""
+        """Wait for a future. Ctrl-C interrupts the wait on every system.
+
+        Raises ConnectionClosed if the loop ends first.
+        """
         self.check_may_wait()
         while not future.wait(SIGNAL_CHECK_INTERVAL_S):
             if not self._thread.is_alive() and not future.is_done:
@@ -238,7 +240,6 @@ class LoopThread:
             )
 
     def _start(self, call: _Call[Any]) -> None:
-        """Schedule the start of a call on the loop."""
         self.check_may_wait()
         with self._lock:
             self._check_open()
@@ -284,7 +285,7 @@ class OpenContext(Generic[T]):
         self.value = opened.result()
 
     def close(self) -> None:
-        """Exit the context manager, and wait for it at most CLOSE_TIMEOUT_S. Idempotent."""
+        """Exit the context manager, and wait for it at most CLOSE_TIMEOUT_S."""
         if self._loop.is_current:  # The loop's own thread must not wait for the loop.
             self._task.close_requested.set()
         elif not self._call.is_done:
@@ -340,7 +341,7 @@ class _Calls:
         return self._process == os.getpid()
 
     def begin(self, call: _Call[Any]) -> None:
-        """Run a call in a new task, unless it has started."""
+        """Run a call in a new task. A second start has no effect."""
         if call.has_started:
             return
         call.has_started = True
@@ -351,7 +352,10 @@ class _Calls:
         task.add_done_callback(lambda task: self._tasks.pop(task).finish())
 
     def end_soon(self, function: Callable[[], object] | None = None) -> None:
-        """Call a function on the loop, then end the loop. May be called from any thread; never blocks; idempotent."""
+        """Call a function on the loop, then end the loop.
+
+        May be called from any thread and more than once. Never blocks.
+        """
         if self._loop is not None and self.is_of_this_process:
             with contextlib.suppress(RuntimeError):  # The loop may be closed.
                 self._loop.call_soon_threadsafe(self._end_after, function, context=self.context)
@@ -362,7 +366,7 @@ class _Calls:
         thread.join(CLOSE_TIMEOUT_S)
 
     async def run(self, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
-        """Keep the loop running until `end_soon`, then cancel all calls. The main function of the thread's loop."""
+        """Keep the loop running until `end_soon`, then cancel all calls."""
         self.context = contextvars.copy_context()
         self._loop = asyncio.get_running_loop()
         started.set_result(self._loop)
@@ -410,7 +414,7 @@ class _Call(ThreadFuture[T]):
 
 
 def _run(calls: _Calls, started: ThreadFuture[asyncio.AbstractEventLoop]) -> None:
-    """Run the loop. This is the thread's main function. An error before the loop starts is stored in ``started``."""
+    """Run the loop. An error before the loop starts is stored in ``started``."""
     try:
         anyio.run(calls.run, started)
     except BaseException as error:

@@ -154,7 +154,10 @@ def tree(module: str) -> ast.Module:
 
 @cache
 def imports_of(module: str) -> dict[str, tuple[str, str]]:
-    """Map each name that a module imports to (module, name there), or to (module, "") after a plain ``import``."""
+    """Map each name that a module imports to (module, name there).
+
+    After a plain ``import``, the name there is "".
+    """
     imports: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -229,7 +232,7 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
 
 
 def _own_members(cls: type) -> Iterator[ClassMember]:
-    """Yield methods, public attributes that ``__init__`` sets, and declared states, but no inherited members."""
+    """Yield the class's own methods, its states, and the public attributes that ``__init__`` sets."""
     body = _class_node(cls).body
     for index, node in enumerate(body):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -246,16 +249,14 @@ def _own_members(cls: type) -> Iterator[ClassMember]:
 
 
 def _attributes(init: ast.FunctionDef, module: tuple[str, ...]) -> Iterator[ClassMember]:
-    """Yield the public attributes that ``__init__`` sets, with the docstrings below them.
-
-    The type of an attribute is its annotation or, without one, the class that is called to create the value.
-    """
+    """Yield the public attributes that ``__init__`` sets, with the docstrings below them."""
     for index, node in enumerate(init.body):
         target: ast.expr | None = node.target if isinstance(node, ast.AnnAssign) else None
         if isinstance(node, ast.Assign) and len(node.targets) == 1:
             target = node.targets[0]
         if not isinstance(target, ast.Attribute) or target.attr.startswith("_"):
             continue
+        # The type is the annotation or, without one, the class that is called to create the value.
         type_: ast.expr | None = None
         if isinstance(node, ast.AnnAssign):
             type_ = node.annotation

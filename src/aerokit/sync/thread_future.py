@@ -39,19 +39,24 @@ class ThreadFuture(Generic[T]):
         self.finish()
 
     def finish(self) -> None:
-        """Mark the future as done, with or without a result. Later calls do nothing; all must be made on one thread."""
+        """Mark the future as done. Later calls do nothing.
+
+        All calls must be made on one thread.
+        """
         if not self.is_done:
             self.is_done = True
             self._gate.release()
 
     def wait(self, timeout: float) -> bool:
-        """Wait at most ``timeout`` seconds and return True if done."""
         if not self.is_done and self._gate.acquire(timeout=max(timeout, 0.0)):  # A lock takes -1 as "no limit".
             self._gate.release()  # Let the next waiting thread continue.
         return self.is_done
 
     def result(self) -> T:
-        """Return the result, or raise the error. An error is raised only once. LookupError if there is neither."""
+        """Return the result, or raise the error. An error is raised only once.
+
+        Raises LookupError if there is neither.
+        """
         error = self.pop_exception()
         if error is not None:
             raise error
@@ -60,7 +65,7 @@ class ThreadFuture(Generic[T]):
         return self._values[0]
 
     def pop_exception(self) -> BaseException | None:
-        """Return the error and clear it, because its traceback refers to this object (a reference cycle)."""
+        # The traceback of a stored error refers to this object, which is a reference cycle.
         error, self._error = self._error, None
         return error
 

@@ -100,10 +100,10 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return remove
 
     def _run_once(self) -> None:
-        """Run one iteration of the loop. Without sockets, poll only rarely, to notice signals and other threads."""
         self._iterations += 1
         ready = self._ready  # type: ignore[attr-defined]
         timers = self._scheduled  # type: ignore[attr-defined]
+        # Without sockets, the loop polls only rarely, to notice signals and other threads.
         needs_poll = self._iterations >= _POLL_EVERY or not self._can_skip_polls
         if not needs_poll and not ready:
             has_run = self._run_sources()
@@ -135,12 +135,11 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     @property
     def _can_skip_polls(self) -> bool:
-        """True unless a socket, an executor call, a stop of the loop or debug mode requires asyncio's own iteration."""
         is_watched = self._executor_calls or self._stopping or self._debug  # type: ignore[attr-defined]
         return not is_watched and len(self._registered) == self._own_registered_count
 
     def _next_timer(self) -> float:
-        """Discard leading cancelled timers, and return the time of the next timer; infinity if there is no timer."""
+        """Discard cancelled timers, and return the time of the next timer; infinity without timers."""
         timers: list[Any] = self._scheduled  # type: ignore[attr-defined]
         while timers and timers[0]._cancelled:
             self._timer_cancelled_count -= 1  # type: ignore[attr-defined]
@@ -148,9 +147,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return timers[0]._when if timers else math.inf
 
     def _run_sources(self) -> bool:
-        """Run the event sources that are due before the next timer. Return True if at least one has run.
+        """Run the event sources that are due before the next timer.
 
-        Stop when a callback is ready or the selector must be polled.
+        Returns True if at least one has run. Stops when a callback is ready or the selector must be polled.
         """
         sources = self._sources
         ready = self._ready  # type: ignore[attr-defined]
@@ -177,7 +176,6 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return has_run
 
     def _schedule_sources_before_timer(self) -> None:
-        """If a timer is due, schedule the event sources that are due at the same time, so that they run before it."""
         timers = self._scheduled  # type: ignore[attr-defined]
         end = self._now + self._clock_resolution
         if timers and timers[0]._when < end:
@@ -208,7 +206,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return events
 
     def _wait(self, poll: Callable[[float], list[Any]], timeout: float | None) -> list[Any]:
-        """Return the selector's events. If there are none, run due event sources; if none is due, advance the clock."""
+        """Return the selector's events. Without events, run the event sources or advance the clock."""
         events = poll(0)
         if events or (timeout is not None and timeout <= 0):
             return events
@@ -237,7 +235,6 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return events
 
     def _may_be_woken(self) -> bool:
-        """Return True if a socket or another thread could still wake the loop."""
         return len(self._registered) != self._own_registered_count or threading.active_count() > 1
 
     def _deadlock_error(self, reason: str) -> DeadlockError:
@@ -283,7 +280,6 @@ class _JumpingSelector(selectors.DefaultSelector):
 
 
 def _name_and_line(task: asyncio.Task[Any]) -> str:
-    """Return the name of a task and the line at which its innermost coroutine waits."""
     line = ""
     awaited: object = task.get_coro()
     while isinstance(awaited, CoroutineType):

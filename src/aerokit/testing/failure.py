@@ -19,10 +19,10 @@ _MAX_TEXTS = 6
 
 
 def failure_report(opened: Iterable[SimulatedFleet | Flight | ServedFlight], test: str, directory: str | None) -> str:
-    """Return the report on a failed test: a few lines about each vehicle.
+    """Describe each vehicle of a failed test in a few lines.
 
-    If ``directory`` is given, also save files there: a picture of all tracks, the recordings, and reports on the
-    recordings. Their names begin with the name of the test.
+    If ``directory`` is given, a picture of the tracks, the recordings and reports on them are saved there. Their names
+    begin with the name of the test.
     """
     flights = _flatten(opened)
     lines: list[str] = []
@@ -79,7 +79,7 @@ def _write_picture(flights: Sequence[Flight | ServedFlight], test: str, director
 
 
 def _write_recordings(flights: Sequence[Flight | ServedFlight], test: str, directory: Path) -> list[str]:
-    """Save each recording, and a report on each vehicle that has a recording. Return the lines about these files."""
+    """Save the recordings and their reports. Return the lines about these files."""
     # The vehicles of a fleet share one recording.
     by_recording: dict[int, list[Flight | ServedFlight]] = {}
     for flight in flights:
@@ -102,7 +102,7 @@ def _write_recordings(flights: Sequence[Flight | ServedFlight], test: str, direc
 
 
 def _write_report(path: Path, flight: Flight | ServedFlight, *, shares_recording: bool) -> str:
-    """Write the report on one vehicle of the recording at ``path``. Return the report's path or the error as text."""
+    """Write the report on one vehicle of a recording. Return its path or the error as text."""
     from aerokit.logs.report import write_report
 
     system_id = flight.simulated.system_id

@@ -100,7 +100,7 @@ class FaultyPath:
         self._latest_due = -math.inf  # arrival of the last frame that was not reordered
 
     def start(self, now: float) -> None:
-        """Start the clock of the outages at ``now``. Without this call, the clock starts at the first frame."""
+        """Start the clock of the outages. Without this call, it starts at the first frame."""
         self._started_at = now
 
     def carry(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
@@ -113,7 +113,6 @@ class FaultyPath:
         return arrivals
 
     def _carry_frame(self, frame: bytes, now: float) -> list[tuple[float, bytes]]:
-        """Return the arrivals of one frame: none if it is lost, two if it is duplicated."""
         # Draw five random numbers for every frame, even for a lost frame. A change of one share then does not change
         # which frames the other faults affect.
         model = self.model
@@ -176,8 +175,7 @@ class FaultyPath:
 def split_frames(data: bytes) -> Sequence[bytes]:
     """Split a write or datagram into MAVLink frames.
 
-    Where no complete frame follows, the remaining data is the last piece. Only the lengths of frames are checked, not
-    their checksums.
+    The last piece may be an incomplete frame or other data. Checksums are not checked.
     """
     pieces: list[bytes] = []
     size = len(data)
@@ -192,7 +190,7 @@ def split_frames(data: bytes) -> Sequence[bytes]:
 
 
 def _end_of_frame(data: bytes, begin: int) -> int | None:
-    """Return the end of the frame that begins at ``begin``, according to its header; None if no frame begins there."""
+    """Return the end of the frame that begins at ``begin``; None if no frame begins there."""
     # The header begins with the magic byte, the payload length and (in MAVLink 2) the flags.
     has_length = len(data) >= begin + 3
     if not has_length or data[begin] not in (MAGIC_V1, MAGIC_V2):

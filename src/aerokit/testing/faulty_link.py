@@ -65,11 +65,9 @@ class StalledQueue:
 
     @property
     def unsent_bytes(self) -> int:
-        """Number of bytes in the queues and in the simulated operating system."""
         return sum(outbox.unsent_bytes for outbox in self._outboxes.values())
 
     def write(self, data: bytes, peer: Peer) -> None:
-        """See `Link.write`."""
         outbox = self._outboxes.get(peer)
         if outbox is None:
             outbox = self._new_outbox(peer)
@@ -82,7 +80,7 @@ class StalledQueue:
             outbox.discard()
 
     def drain(self) -> None:
-        """End the stall: send the bytes in the simulated operating system, then the unexpired bytes in the queues."""
+        """End the stall and send the accepted bytes, then the unexpired queued bytes."""
         self._is_stalled = False
         accepted, self._accepted = self._accepted, []
         for data, peer in accepted:
@@ -119,7 +117,6 @@ class StalledQueue:
 
     @property
     def _is_full(self) -> bool:
-        """True if the simulated operating system accepts no more bytes."""
         return self._is_stalled and sum(len(data) for data, _ in self._accepted) >= self._system_limit
 
     def _accepted_bytes_of(self, peer: Peer) -> int:
@@ -293,7 +290,6 @@ class FaultyLink(Link):
         self._expired_writes += writes
 
     def _on_stalled(self, is_stalled: bool) -> None:
-        """Report the beginning or the end of a stall to the receiver, by `link_stalled` or `link_drained`."""
         stalled_at = self._stalled_at
         was_stalled = stalled_at is not None
         if self._incoming_path is None or is_stalled == was_stalled:  # Report only a change, and only while open.
@@ -307,7 +303,6 @@ class FaultyLink(Link):
             self._incoming_path.link_drained(now - stalled_at)
 
     def _discard_in_transit(self) -> None:
-        """Discard the outgoing frames that are in transit."""
         if self._stalled_queue is not None:
             self._stalled_queue.close()
         if self._in_flight is not None:
@@ -331,40 +326,34 @@ class _IncomingPath:
         self._is_closed = False
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
-        """See `Receiver`."""
         for due, piece in self._path.carry(data, self._in_flight.loop.time()):
             if self._is_closed:  # The receiver has closed the link while it processed the previous piece.
                 return
             self._in_flight.put(due, partial(self._receiver.bytes_received, piece, peer))
 
     def link_lost(self, error: LinkLost) -> None:
-        """See `Receiver`. Frames in transit are delivered first."""
+        # Frames in transit are delivered first.
         self._on_lost()
         if not self._is_closed:
             self._in_flight.put(self._in_flight.latest_due, lambda: self._receiver.link_lost(error))
 
     def link_stalled(self, unsent_bytes: int) -> None:
-        """See `DrainListener`."""
         if not self._is_closed and isinstance(self._receiver, DrainListener):
             self._receiver.link_stalled(unsent_bytes)
 
     def link_drained(self, stalled_s: float) -> None:
-        """See `DrainListener`."""
         if not self._is_closed and isinstance(self._receiver, DrainListener):
             self._receiver.link_drained(stalled_s)
 
     def order_refused(self, message: str, reason: str, lease_holder: str | None, answers: tuple[bytes, ...]) -> None:
-        """See `OrderRefusalListener`."""
         if not self._is_closed and isinstance(self._receiver, OrderRefusalListener):
             self._receiver.order_refused(message, reason, lease_holder, answers)
 
     def peer_joined(self, peer: Peer) -> None:
-        """See `PeerListener`."""
         if not self._is_closed and isinstance(self._receiver, PeerListener):
             self._receiver.peer_joined(peer)
 
     def peer_left(self, peer: Peer) -> None:
-        """See `PeerListener`."""
         if not self._is_closed and isinstance(self._receiver, PeerListener):
             self._receiver.peer_left(peer)
 
@@ -391,8 +380,9 @@ class _DeliveryQueue:
         return not self._waiting
 
     def put(self, due: float, action: Callable[[], None]) -> None:
-        """Queue an action. Run it at once if it is due and the queue is empty: a link without faults adds no delay."""
+        """Queue an action. It runs at once if it is due and the queue is empty."""
         if due <= self.loop.time() and not self._waiting:
+            # A link without faults adds no delay.
             action()
             return
         self.latest_due = max(self.latest_due, due)
@@ -407,7 +397,6 @@ class _DeliveryQueue:
         self._timer = None
 
     def _schedule(self) -> None:
-        """Ensure that the timer fires no later than the first action is due."""
         due, _, _ = self._waiting[0]
         if self._timer is not None:
             if self._timer_at <= due:
@@ -417,7 +406,6 @@ class _DeliveryQueue:
         self._timer_at = due
 
     def _run(self) -> None:
-        """Run the actions that are due, and set the timer for the others."""
         first_due, _, _ = self._waiting[0]
         now = max(self.loop.time(), first_due)  # A timer may fire slightly early.
         try:

@@ -146,7 +146,7 @@ class SimulatedFleet(Sequence[Flight]):
         save_picture([flight.track for flight in self], path)
 
     def _closest_approach(self) -> tuple[float, float, str]:
-        """Return the minimum 3D distance between two vehicles in metres, its time, and the names of these vehicles."""
+        """Return the minimum 3D distance between two vehicles in metres, its time, and their names."""
         closest = (math.inf, 0.0, "")
         for first, second in combinations(self, 2):
             distance_m, time_s = min_distance_m(first.track, second.track)
@@ -224,7 +224,7 @@ class SimulatedFleet(Sequence[Flight]):
             )
 
     def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
-        """Advance the vehicles to the current time, call ``plan`` with the scheduler, and run events that are due."""
+        """Call ``plan`` with the scheduler at the current time, and run events that are due."""
         self._refresh()
         plan(self._scheduler)
         if self._server is not None:
@@ -234,7 +234,7 @@ class SimulatedFleet(Sequence[Flight]):
 def _create_vehicles(
     kinds: Sequence[str], spacing_m: float, *, system_id: int = 1, seed: int = 0, **options: Any
 ) -> list[SimulatedVehicle]:
-    """Create a vehicle of each kind. The first is at its home, the others stand in a row to the east of it."""
+    """Create a vehicle of each kind, in a row eastwards from the home of the first."""
     vehicles: list[Any] = []
     for number, kind in enumerate(kinds):
         if vehicles:

@@ -33,7 +33,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def allowed(self) -> Iterator[None]:
-        """Allow interruptions in this block, but only on the main thread, and only if `_is_sigint_available`."""
+        """Allow interruptions in this block. This has an effect only on the main thread."""
         if threading.current_thread() is not threading.main_thread() or not _is_sigint_available():
             yield
             return
@@ -50,7 +50,7 @@ class Interruption:
 
     @contextlib.contextmanager
     def on_error(self) -> Iterator[None]:
-        """For a block on another thread: an exception that leaves the block interrupts the main thread."""
+        """Interrupt the main thread if an exception leaves this block on another thread."""
         try:
             yield
         except Exception:
@@ -60,7 +60,7 @@ class Interruption:
             raise
 
     def _send_signal(self) -> bool:
-        """Interrupt the main thread if it is in the `allowed` block and not interrupted yet. Return True if sent."""
+        """Interrupt the main thread if this is allowed and still needed. Return True if a signal was sent."""
         with self._lock:
             is_needed = self._is_allowed and not self._is_delivered
             if is_needed:
@@ -78,18 +78,15 @@ class Interruption:
 
 
 def _is_sigint_available() -> bool:
-    """Return True if an Interruption may replace the handler of SIGINT.
-
-    It may replace the default handler, the handler of another Interruption, and SIG_IGN, which shells set for
-    background jobs of a script.
-    """
+    """Return True if an Interruption may replace the handler of SIGINT."""
+    # Shells set SIG_IGN for background jobs of a script.
     handler = signal.getsignal(signal.SIGINT)
     is_of_interruption = isinstance(getattr(handler, "__self__", None), Interruption)
     return is_of_interruption or handler in (signal.default_int_handler, signal.SIG_IGN)
 
 
 def _is_in_context_code(frame: FrameType | None) -> bool:
-    """Return True if the frame may be entering or leaving a block, because it is in contextlib or `_CONTEXT_FILES`."""
+    """Return True if the frame is code that enters or leaves a `with` block."""
     name = "" if frame is None else frame.f_code.co_filename
     return name == contextlib.__file__ or (name.endswith(_CONTEXT_FILES) and "aerokit" in name)
 

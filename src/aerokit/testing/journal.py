@@ -94,7 +94,7 @@ class Journal:
         return [message for message in messages if isinstance(message, CommandLong | CommandInt)]
 
     def _command_counts(self) -> list[str]:
-        """Return the names of the received commands, with counts above 1, in the order of the first receptions."""
+        """Return the names of the received commands in order, with counts above 1."""
         counts = Counter(_name(message.command) for message in self._received_commands())
         return [name if count == 1 else f"{name}, {count} times" for name, count in counts.items()]
 

@@ -49,7 +49,7 @@ class Drawable(Protocol):
     def __len__(self) -> int: ...
 
     def local(self, origin: Position | None = None) -> list[tuple[float, float, float]]:
-        """Return each point as metres north and east of ``origin``, and metres above home. Default origin: home."""
+        """Return each point as metres north and east of ``origin`` (default: home), and metres above home."""
         ...
 
     def snapshot(self) -> Drawable:
@@ -83,7 +83,7 @@ def save_picture(tracks: Iterable[Drawable], path: str | PathLike[str]) -> None:
 
 
 def draw_svg(tracks: Sequence[Drawable]) -> str:
-    """Return the picture as SVG text. North is up, and distances are in metres from the first vehicle's home."""
+    """Return the picture as SVG text. North is up, and distances are in metres from the first home."""
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{_HEIGHT}"'
         f' font-family="sans-serif" font-size="{_FONT_SIZE}">',
@@ -191,7 +191,6 @@ class _Axes:
         return self.left + from_left, self.top + self.height - from_bottom
 
     def grid(self, x_unit: str, y_unit: str) -> list[_Shape]:
-        """Return grid lines at round values of both axes, with the values as labels."""
         shapes: list[_Shape] = []
         bottom = self.top + self.height
         right = self.left + self.width
@@ -209,10 +208,6 @@ class _Axes:
 
 
 def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
-    """Draw the tracks from above, relative to the first home: east to the right, north upwards.
-
-    The circle or polygon of a failed assertion is dashed, and a mark shows where its track failed.
-    """
     origin = tracks[0].home
     paths = []
     outlines = []
@@ -222,6 +217,7 @@ def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
     easts, norths = zip(*chain(*paths, *outlines), strict=True)
     axes = _Axes(easts, norths, top=30, height=_MAP_HEIGHT - 60, same_scale=True)
     shapes = axes.grid("m", "m")
+    # The circle or polygon of a failed assertion is dashed.
     shapes += [_Line([axes.place(*corner) for corner in outline], _FAILED, is_dashed=True) for outline in outlines]
     labels = _Labels()
     for track, path, colour in zip(tracks, paths, _colours(len(paths)), strict=True):
@@ -234,7 +230,7 @@ def _map(tracks: Sequence[Drawable]) -> list[_Shape]:
 
 
 def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float]]]:
-    """Return the outlines of the circle and the polygon of the failed assertion, in metres east and north."""
+    """Return the circle and the polygon of the failed assertion, in metres east and north."""
     failure = track.failure
     if failure is None:
         return []
@@ -253,7 +249,6 @@ def _outlines(track: Drawable, origin: Position) -> list[list[tuple[float, float
 
 
 def _failed_point(track: Drawable, places: Sequence[tuple[float, float]]) -> list[_Shape]:
-    """Return a cross where the assertion failed."""
     if track.failure is None:
         return []
     x, y = places[_index_of(track, track.failure.point)]
@@ -278,7 +273,7 @@ class _Labels:
         self._label_places: list[tuple[float, float]] = []  # places of the labels so far
 
     def modes(self, track: Drawable, places: Sequence[tuple[float, float]], colour: str) -> list[_Shape]:
-        """Return a dot for each point of the track at which a mode starts, and a label with its name if it has room."""
+        """Return a dot for each mode change of the track, with the name of the mode if it has room."""
         shapes: list[_Shape] = []
         previous_mode = None
         for point, (x, y) in zip(track, places, strict=True):
@@ -302,7 +297,6 @@ class _Labels:
 
 
 def _profile(tracks: Sequence[Drawable]) -> list[_Shape]:
-    """Draw the altitudes of the tracks over time, and the altitude limit of the first failed assertion."""
     paths = [[(point.time_s, point.altitude_m) for point in track] for track in tracks]
     limits = [track.failure.altitude_m for track in tracks if track.failure is not None]
     limit = next((altitude for altitude in limits if altitude is not None), None)
@@ -363,7 +357,7 @@ def _ticks(bounds: tuple[float, float], max_count: int) -> list[float]:
 
 
 def _save_png(shapes: Sequence[_Shape], path: str | PathLike[str]) -> None:
-    """Draw the shapes at double size and scale the picture down, which makes the lines smooth."""
+    # Scaling the picture down makes the lines smooth.
     scale = 2
     image = _pillow("Image").new("RGB", (_WIDTH * scale, _HEIGHT * scale), "white")
     drawing = _pillow("ImageDraw").Draw(image)

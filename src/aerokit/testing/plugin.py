@@ -35,7 +35,6 @@ _REPORTED_CLASSES = ("SimulatedFleet", "Flight", "ServedFlight")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option ``--flight-pictures``."""
     parser.getgroup("aerokit").addoption(
         _PICTURES_OPTION,
         metavar="DIR",
@@ -46,10 +45,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
-    """Exclude aerokit from assertion rewriting, which pytest applies to all modules of a package with a plugin.
-
-    Rewriting is slow, and two threads that import at once can fail in Python 3.10 to 3.12.
-    """
+    """Exclude aerokit from assertion rewriting."""
+    # pytest rewrites all modules of a package with a plugin. This is slow, and two threads that import at once can fail
+    # in Python 3.10 to 3.12.
     rewriting = getattr(early_config.pluginmanager, "rewrite_hook", None)
     marked = getattr(rewriting, "_must_rewrite", None)  # pytest has no public API to exclude a package.
     if rewriting is not None and isinstance(marked, set):
@@ -58,7 +56,6 @@ def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker."""
     config.addinivalue_line(
         "markers",
         f"{_MARKER}(*kinds, count=None, connect=True, speedup=10, **options): the vehicle of aerokit's fixtures,"
@@ -132,7 +129,7 @@ def dronekit() -> Iterator[ModuleType]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Open ``flight`` and ``fleet`` before pytest-asyncio runs the test, if the test has the asyncio marker."""
+    """Open ``flight`` and ``fleet`` before pytest-asyncio runs the test."""
     fleets = _fleets(item)
     if not fleets or item.get_closest_marker("asyncio") is None:
         return (yield)
@@ -143,17 +140,14 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
-    """Open ``flight`` and ``fleet`` around an ``async def`` test, and run it if there is no async plugin.
-
-    A test with ``served_flight`` fails as soon as the simulated vehicle raises an exception.
-    """
+    """Open ``flight`` and ``fleet`` around an ``async def`` test, and run it if there is no async plugin."""
+    # A test with `served_flight` fails as soon as the simulated vehicle raises an exception.
     with _function_replaced(pyfuncitem, _runnable_function(pyfuncitem)), _raising_vehicle_errors(pyfuncitem):
         return (yield)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Add a description of the flight to the report of a failed test."""
     report = yield
     flights = _reported_flights(item) if report.when == "call" and report.failed else []
     if flights:
@@ -165,10 +159,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the kinds and options of the test's marker ``simulated``, by default a copter.
-
-    The option ``record`` is added: by default, it is True if ``--flight-pictures`` is given.
-    """
+    """Return the kinds and options of the test's marker ``simulated``. The default is a copter."""
     marker = request.node.get_closest_marker(_MARKER)
     options = {} if marker is None else dict(marker.kwargs)
     options.setdefault("record", request.config.getoption(_PICTURES_OPTION) is not None)
@@ -177,14 +168,13 @@ def _requested(request: pytest.FixtureRequest) -> tuple[tuple[str, ...], dict[st
 
 
 def _flight_fixtures(item: pytest.Item) -> list[Any]:
-    """Return the values of ``flight``, ``fleet`` and ``served_flight`` in a test, if their classes are aerokit's."""
     fixture_values = getattr(item, "funcargs", None) or {}
     named = [fixture_values[name] for name in ("flight", "fleet", "served_flight") if name in fixture_values]
     return [value for value in named if _is_of_this_package(value)]
 
 
 def _reported_flights(item: pytest.Item) -> list[Any]:
-    """Return the flights and fleets among the fixture values of a test; those of this plugin's fixtures come first."""
+    """Return the flights and fleets among the fixture values of a test, those of this plugin first."""
     fixture_values = getattr(item, "funcargs", None) or {}
     flights: list[Any] = []
     for value in (*_flight_fixtures(item), *fixture_values.values()):
@@ -199,15 +189,13 @@ def _is_of_this_package(value: object) -> bool:
 
 
 def _fleets(item: pytest.Item) -> list[SimulatedFleet]:
-    """Return the fleets of a test that the plugin has to open. A served flight (without ``run``) is open already."""
+    """Return the fleets of a test that the plugin has to open."""
+    # A served flight (without `run`) is open already.
     return [getattr(value, "_fleet", value) for value in _flight_fixtures(item) if hasattr(value, "run")]
 
 
 def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
-    """Return the function that pytest must call to run the test.
-
-    If the test is an ``async def`` with flights, the function opens them, runs the test and closes them.
-    """
+    """Return the function that pytest must call to run the test."""
     fleets = _fleets(item)
     test: Callable[..., Any] = item.obj
     marked_test = getattr(test, _TEST_WITH_OPEN_FLIGHTS, None)
@@ -224,13 +212,9 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
 
 
 def _with_open_flights(test: Callable[..., Any], fleets: list[SimulatedFleet]) -> Callable[..., Any]:
-    """Return a test that opens the fleets, awaits ``test`` and closes them."""
-
     @functools.wraps(test)
     async def run_with_open_flights(**arguments: Any) -> None:
-        from contextlib import AsyncExitStack
-
-        async with AsyncExitStack() as stack:
+        async with contextlib.AsyncExitStack() as stack:
             for fleet in fleets:
                 await stack.enter_async_context(fleet.open())
             await test(**arguments)
@@ -243,7 +227,7 @@ class _NotVirtualTime(Exception):
 
 
 def _only_on_virtual_time(test_with_open_flights: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a test that raises `_NotVirtualTime` at its beginning if pytest-asyncio's loop runs in real time."""
+    """Return a test that raises `_NotVirtualTime` if pytest-asyncio's loop runs in real time."""
 
     @functools.wraps(test_with_open_flights)
     async def run(**arguments: Any) -> None:
@@ -263,8 +247,7 @@ def _only_on_virtual_time(test_with_open_flights: Callable[..., Any]) -> Callabl
 def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] | None = None) -> Callable[..., None]:
     """Return a function that runs an ``async def`` test on virtual time.
 
-    ``try_first`` is the test as wrapped by pytest-asyncio, and is called first. If pytest-asyncio's event loop is not
-    on virtual time, ``try_first`` raises `_NotVirtualTime` before the test begins, and ``test`` runs on a new loop.
+    It calls ``try_first`` first. If this raises `_NotVirtualTime`, ``test`` runs on a new loop.
     """
 
     @functools.wraps(test)
@@ -282,7 +265,6 @@ def _on_virtual_time(test: Callable[..., Any], *, try_first: Callable[..., Any] 
 
 @contextlib.contextmanager
 def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Iterator[None]:
-    """Within the block, ``item`` runs ``test`` instead of its own function."""
     original = item.obj
     item.obj = test
     try:
@@ -292,6 +274,5 @@ def _function_replaced(item: pytest.Function, test: Callable[..., Any]) -> Itera
 
 
 def _raising_vehicle_errors(item: pytest.Function) -> contextlib.AbstractContextManager[None]:
-    """Return the `ServedFlight.raising_vehicle_errors` of a test with a served flight, else an empty context."""
     served = [value for value in _flight_fixtures(item) if hasattr(value, "raising_vehicle_errors")]
     return served[0].raising_vehicle_errors() if served else contextlib.nullcontext()

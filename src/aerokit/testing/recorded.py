@@ -63,7 +63,6 @@ class RecordedParameters(ParameterProtocolServer):
         self._has_hash = is_complete and HASH_NAME in without_index
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
-        """Return PARAM_VALUE with the value that a client has set, otherwise with the recorded value of this time."""
         recorded = self._recorded[name]
         _, latest = recorded[0]
         for time, value in recorded:
@@ -99,7 +98,7 @@ class RecordedParameters(ParameterProtocolServer):
         self.send(name, self.names.index(name), None)
 
     def _refuse(self, request: m.ParamRequestRead | m.ParamSet, index: int, channel: Channel) -> None:
-        """Answer with PARAM_ERROR if the recorded vehicle ever sent PARAM_ERROR. Otherwise, do not answer."""
+        # The recorded vehicle answers with PARAM_ERROR only if it ever sent PARAM_ERROR.
         if self._vehicle.recording.has_parameter_errors:
             self.send_error(sender_of(request), request.param_id, index, MavParamError.DOES_NOT_EXIST, channel)
 
@@ -120,11 +119,7 @@ class RecordedMissions(MissionServer):
         self.listen()
 
     def items(self, mission_type: int) -> tuple[AnyItem, ...] | None:
-        """Return the items of the plan that the vehicle has at present; None if it has no plan of this type.
-
-        An uploaded plan takes precedence. Otherwise, this is the newest plan recorded before the present position of
-        the playback or, if no plan was recorded before it, the first recorded plan.
-        """
+        """Return the items of the plan that the vehicle has at present; None without such a plan."""
         if mission_type in self._written:
             return self._written[mission_type]
         items = None
@@ -179,14 +174,14 @@ class RecordedMissions(MissionServer):
         """Do nothing: the recording decides which item is current."""
 
     def _recorded_result(self, request: str, results: list[int], mission_type: int) -> int:
-        """Return the next of the recorded results. After the last result, return that result again."""
+        """Return the next of the recorded results. The last one repeats."""
         number = self._result_counts.get((request, mission_type), 0)
         self._result_counts[request, mission_type] = number + 1
         return results[min(number, len(results) - 1)]
 
 
 def _item_message(item: AnyItem, seq: int, client: tuple[int, int], *, wants_float: bool) -> AnyItem:
-    """Convert a recorded item to the message that the client requests: MISSION_ITEM or MISSION_ITEM_INT."""
+    """Convert a recorded item to MISSION_ITEM (``wants_float``) or MISSION_ITEM_INT."""
     # Degrees for global frames, metres for local ones. In MAV_FRAME_MISSION, x and y are neither.
     scale = 1.0 if item.frame == MavFrame.MISSION else 1e4 if item.frame in LOCAL_FRAMES else 1e7
     was_float = isinstance(item, m.MissionItem)
@@ -294,7 +289,6 @@ class RecordedVehicle(SimulatedVehicle):
             self.call_at(self._began_at + self.recording.duration_s - self._start_s, self._end)
 
     def _play(self) -> None:
-        """Send the next frame, and the frames after it that have the same time."""
         stream = self.recording.stream
         due_at, _ = stream[self._next]
         while self._next < len(stream):
@@ -312,7 +306,6 @@ class RecordedVehicle(SimulatedVehicle):
             self._is_on = False
 
     def _on_command(self, command: ReceivedCommand) -> int | None:
-        """Send the recorded acknowledgements of a command with their delays; return UNSUPPORTED if there are none."""
         answer = self._answer_to(command)
         if answer is None:
             return MavResult.UNSUPPORTED
@@ -332,7 +325,10 @@ class RecordedVehicle(SimulatedVehicle):
         return None  # The acknowledgements were recorded, so no further one is sent.
 
     def _answer_to(self, command: ReceivedCommand) -> RecordedAnswer | None:
-        """Return the recorded answer to a command. Equal commands get successive answers. The last answer repeats."""
+        """Return the recorded answer to a command, or None.
+
+        Equal commands get successive answers. The last answer repeats.
+        """
         answers = self.recording.answers.get(command.command, [])
         params = (command.param1, command.param2, command.param3, command.param4)
         # The params are compared by repr(), because NaN is not equal to NaN.

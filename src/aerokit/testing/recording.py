@@ -97,7 +97,7 @@ class RecordedFlight:
         self._read(frames)
 
     def _read(self, frames: list[tuple[float, Frame]]) -> None:
-        """Divide the frames into requests of clients, answers of the vehicle, and messages without a request."""
+        """Divide the frames into requests of clients, answers of the vehicle, and other messages."""
         now = 0.0  # seconds since the vehicle's first message, without long gaps
         previous_unix_s = None
         for unix_s, frame in frames:
@@ -119,14 +119,12 @@ class RecordedFlight:
         self._discard_unanswered()
 
     def _discard_unanswered(self) -> None:
-        """Remove from `answers` the commands that were not acknowledged."""
         acknowledged = {
             command: [answer for answer in answers if answer.acks] for command, answers in self.answers.items()
         }
         self.answers = {command: answers for command, answers in acknowledged.items() if answers}
 
     def _read_request(self, message: Any, now: float) -> None:
-        """Record a request of a client, so that later answers of the autopilot can be assigned to it."""
         # Id 0 means all systems or all components.
         if message.target_system not in (0, self.system_id) or message.target_component not in (0, self.component_id):
             return
@@ -146,7 +144,6 @@ class RecordedFlight:
             self._clearing.add(message.mission_type)
 
     def _read_answer(self, message: Message, now: float) -> None:
-        """Record a message of the vehicle that answers a request."""
         readers: dict[type[Message], Callable[..., None]] = {
             m.CommandAck: self._read_ack,
             m.ParamValue: self._read_value,
@@ -210,7 +207,7 @@ def _frames(source: str | PathLike[str] | BinaryIO) -> list[tuple[float, Frame]]
 
 
 def _autopilot(frames: list[tuple[float, Frame]], system_id: int | None) -> tuple[int, int]:
-    """Return system id and component id of the first autopilot, or of the autopilot with this system id."""
+    """Return system id and component id of the first autopilot, or of the one with this system id."""
     for _, frame in frames:
         if frame.message_id != m.Heartbeat.ID or system_id not in (None, frame.system_id):
             continue

@@ -114,12 +114,11 @@ def hosted_flight(
     record: bool = False,
     **options: Any,
 ) -> Iterator[ServedFlight]:
-    """Serve a vehicle on an address while the block runs; ``options`` are the options of the vehicle.
+    """Serve a vehicle on an address while the block runs. ``options`` are the options of the vehicle.
 
-    Timeouts after which the vehicle reacts to a silent client are multiplied by ``speedup``, except those in
-    ``parameters``; see `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind or address, and
-    LinkOpenError if the address cannot be opened. If the vehicle has failed with an exception, the end of the block
-    raises it, unless `ServedFlight.raising_vehicle_errors` has raised it already.
+    The vehicle's timeouts are scaled as by `aerokit.sim.kinds.scale_timeouts`. Raises InvalidArgument for a wrong kind
+    or address, and LinkOpenError if the address cannot be opened. The end of the block raises the exception with which
+    the vehicle has failed.
     """
     from anyio.from_thread import start_blocking_portal
 

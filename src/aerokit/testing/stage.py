@@ -39,7 +39,7 @@ class FlightScheduler(SimulatedVehicle):
             vehicle.journal = journal
 
     def step(self, now: float) -> None:
-        """For each due action, advance all vehicles to the time of the action, then run it."""
+        """Advance all vehicles to the time of each due action, then run the action."""
         while (due := self.next_due) <= now:
             for vehicle in self._vehicles:
                 vehicle.step(max(due, vehicle.now))
@@ -47,7 +47,6 @@ class FlightScheduler(SimulatedVehicle):
         super().step(now)
 
     def receive(self, data: bytes, now: float, peer: Hashable = None, channel: Channel | None = None) -> None:
-        """Ignore the data."""
         self.step(now)
 
     def boot(self) -> None:
@@ -57,14 +56,17 @@ class FlightScheduler(SimulatedVehicle):
         """Send nothing."""
 
     def do(self, action: Callable[[], None], *, after_s: float) -> None:
-        """Run an action after ``after_s`` simulated seconds. 0 runs the action at once."""
+        """Run an action after ``after_s`` simulated seconds. 0 means at once."""
         if after_s:
             self.call_later(after_s, action)
         else:
             action()
 
     def do_when(self, condition: Callable[[], bool], action: Callable[[], None]) -> None:
-        """Run an action once, as soon as a condition is true. It is checked ten times per simulated second."""
+        """Run an action once, as soon as a condition is true.
+
+        It is checked ten times per simulated second.
+        """
         if condition():
             action()
         else:
@@ -76,7 +78,6 @@ class FlightScheduler(SimulatedVehicle):
             track.append(true_point(vehicle))
 
     def refresh_with(self, refresh: Callable[[], None] | None) -> None:
-        """See `Track.refresh_with`."""
         for track in self.tracks:
             track.refresh_with(refresh)
 
@@ -97,11 +98,9 @@ class FlightRecording:
         self._received_framer.keep_unknown = True
 
     def attach(self, server: SimulatorServer) -> None:
-        """Record the traffic of this server from now on."""
         server.on_datagram = self._write
 
     def to_bytes(self) -> bytes:
-        """Return the content of the file."""
         return self._file.getvalue()
 
     def _write(self, time_s: float, data: bytes, is_sent: bool) -> None:

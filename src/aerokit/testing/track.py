@@ -249,7 +249,6 @@ class Track(Sequence[TrackPoint]):
             assert name in modes, f"{name} is missing in {' → '.join(names)}: the modes were {' → '.join(self.modes)}"
 
     def _record_failure_unless(self, passes: bool, failure: TrackFailure) -> None:
-        """Store the details of an assertion in `failure`, unless the assertion passes."""
         if not passes:
             self.failure = failure
 
@@ -269,10 +268,7 @@ class Track(Sequence[TrackPoint]):
         return math.hypot(*offset_of(farthest)), farthest
 
     def _nearest(self, place: Position) -> tuple[float, TrackPoint]:
-        """Return the minimum distance between a position and the track in metres, and the nearest point.
-
-        If the minimum is between two points of the track, return the later one.
-        """
+        """Return the minimum distance between a position and the track in metres, and the nearest point."""
         self._check_not_empty()
         offset_of = metres_from(place)
         altitude = place.altitude_relative_m
@@ -314,8 +310,7 @@ def true_point(vehicle: SimulatedVehicle) -> TrackPoint:
 def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track:
     """Record the true position of a vehicle every ``interval_s`` simulated seconds, also after reboots.
 
-    Recording uses the vehicle's timers, and changes neither its messages nor its random numbers. Raises InvalidArgument
-    for a vehicle without a true position, and for an interval that is not positive.
+    Raises InvalidArgument for a vehicle without a true position, and for an interval that is not positive.
     """
     if not interval_s > 0:
         raise InvalidArgument(f"interval_s = {interval_s!r} is not allowed: it must be above 0")
@@ -331,14 +326,15 @@ def record_track(vehicle: SimulatedVehicle, *, interval_s: float = 0.1) -> Track
         append_point()
         vehicle.every(interval_s, append_point)
 
+    # Recording uses the vehicle's timers, and changes neither its messages nor its random numbers.
     vehicle.on_power_on(start_recording)
     return track
 
 
 def min_distance_m(first: Track, second: Track) -> tuple[float, float]:
-    """Return the minimum 3D distance between two vehicles, in metres, and the time of the minimum.
+    """Return the minimum 3D distance between two vehicles in metres, and its time.
 
-    Return (infinity, 0) if the two vehicles never ran at the same time.
+    The result is (infinity, 0) if the two vehicles never ran at the same time.
     """
     first_home_m = first.home.altitude_amsl_m or 0.0
     second_home_m = second.home.altitude_amsl_m or 0.0
@@ -367,7 +363,6 @@ _TimedPlace = tuple[float, tuple[float, float, float]]
 
 
 def _interpolated(before: _TimedPlace, after: _TimedPlace, time_s: float) -> tuple[float, float, float]:
-    """Return the place at a time between the times of two recorded places."""
     start_s, start = before
     end_s, end = after
     share = (time_s - start_s) / (end_s - start_s) if end_s > start_s else 0.0

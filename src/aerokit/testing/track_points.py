@@ -50,10 +50,8 @@ class TrackFailure:
 
 
 def metres_from(origin: Position) -> Callable[[Position | TrackPoint], tuple[float, float]]:
-    """Return a function that converts a position to metres north and east of ``origin``.
-
-    The metres are measured on the tangent plane of the earth's ellipsoid at ``origin``.
-    """
+    """Return a function that converts a position to metres north and east of ``origin``."""
+    # The metres are measured on the tangent plane of the earth's ellipsoid at `origin`.
     latitude = origin.latitude_deg
     longitude = origin.longitude_deg
     # Metres per degree, from the length of a hundredth of a degree around the origin.

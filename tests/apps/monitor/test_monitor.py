@@ -263,9 +263,9 @@ async def test_wide_terminal_shows_more_and_puts_texts_below_map() -> None:
 async def test_wide_row_of_armed_vehicle_is_not_ready() -> None:
     async with open_flight() as flight:
         await flight.vehicle.wait_ready()
-        assert VehicleText(flight.vehicle).row(is_selected=True, more=True).plain.split()[-1] == "ready"
+        assert VehicleText(flight.vehicle).list_row(is_selected=True, more=True).plain.split()[-1] == "ready"
         await flight.vehicle.arm()
-        assert VehicleText(flight.vehicle).row(is_selected=True, more=True).plain.split()[-1] == "armed"
+        assert VehicleText(flight.vehicle).list_row(is_selected=True, more=True).plain.split()[-1] == "armed"
 
 
 @pytest.mark.parametrize(

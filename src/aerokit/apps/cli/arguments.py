@@ -29,15 +29,13 @@ _TEMPLATE_FIELD = re.compile(r"\{(?:(\d{1,5})\+)?(\d{0,3})(n|id)\}")
 
 
 def is_address_template(address: str) -> bool:
-    """Return True if the address has placeholders. Each vehicle then gets its own link."""
     return _TEMPLATE_FIELD.search(address) is not None
 
 
 def expand_address(address: str, number: int, system_id: int) -> str:
-    """Fill in the placeholders of an address template for one vehicle.
+    """Replace ``{n}`` in an address by ``number``, and ``{id}`` by ``system_id``.
 
-    ``{n}`` is the number of the vehicle, from 0, and ``{id}`` is its system id. A placeholder can have a factor and a
-    summand: ``{5760+10n}`` is 5760, 5770, 5780 …
+    A placeholder can have a factor and a summand: ``{5760+10n}`` is 5760, 5770, 5780 …
     """
 
     def expand(match: re.Match[str]) -> str:
@@ -64,7 +62,7 @@ def address_or_template(text: str) -> str:
 
 
 def vehicle_kind(text: str) -> str:
-    """Parse the kind of a simulated vehicle, or the path of a recording (.tlog) that it replays."""
+    """Parse the kind of a simulated vehicle, or the path of a recording (.tlog)."""
     from aerokit.sim.kinds import kind_class
 
     if text.endswith(".tlog"):
@@ -79,7 +77,10 @@ def vehicle_kind(text: str) -> str:
 
 
 def integer(low: int, high: int, what: str) -> Callable[[str], int]:
-    """Return a parser for integers from ``low`` to ``high``; ``what`` describes them in the error."""
+    """Return a parser for integers from ``low`` to ``high``.
+
+    ``what`` describes the integer in the error.
+    """
 
     def parse(text: str) -> int:
         if not (text.isascii() and text.isdigit() and low <= int(text) <= high):
@@ -108,7 +109,10 @@ TRANSMITTER_ON_S = 1.0
 
 
 def fault(text: str) -> tuple[str, bool | float | list[str], float]:
-    """Parse ``NAME[=VALUE][@SECONDS]`` into a simulated fault, its value, and the simulated time at which it begins."""
+    """Parse ``NAME[=VALUE][@SECONDS]`` into the name, the value and the time of a simulated fault.
+
+    The time is in simulated seconds.
+    """
     name_and_value, _, begin_text = text.partition("@")
     name, equals, value = name_and_value.partition("=")
     if name not in FAULTS:
@@ -154,8 +158,6 @@ def picture(text: str) -> str:
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
-    """Return a parser for numbers from ``low`` to ``high``."""
-
     def parse(text: str) -> float:
         try:
             value = float(text)
@@ -169,7 +171,10 @@ def number(low: float, high: float) -> Callable[[str], float]:
 
 
 def assignment(text: str) -> tuple[str, int | float]:
-    """Parse ``NAME=VALUE`` for a parameter; whole numbers may be hexadecimal (0x1F)."""
+    """Parse ``NAME=VALUE`` for a parameter.
+
+    Integers may be hexadecimal (0x1F).
+    """
     name, equals, value = text.partition("=")
     if not equals:
         raise ArgumentTypeError(f"{text!r} has no value; expected NAME=VALUE, without spaces")
@@ -203,7 +208,6 @@ def home(text: str) -> tuple[float, float, float]:
 
 
 def writable_file(text: str) -> str:
-    """Parse the path of a file to write, in an existing directory."""
     path = Path(text)
     if path.is_dir() or not path.parent.is_dir():
         reason = "the path is a directory" if path.is_dir() else f"directory {str(path.parent)!r} does not exist"
@@ -212,7 +216,6 @@ def writable_file(text: str) -> str:
 
 
 def log_file(text: str) -> str:
-    """Parse the path of a recording to write."""
     if is_address(text):
         raise ArgumentTypeError(f"{text!r} is an address; the recording must follow the address: ADDRESS flight.tlog")
     if not text.lower().endswith(".tlog"):
@@ -221,7 +224,7 @@ def log_file(text: str) -> str:
 
 
 def directory(text: str) -> Path:
-    """Parse the path of a directory. If it does not exist, the command will create it."""
+    """Parse the path of a directory, which need not exist yet."""
     path = Path(text)
     for directory_path in (path, *path.parents):
         if directory_path.exists() and not directory_path.is_dir():
@@ -242,7 +245,6 @@ def add_baud(command: argparse._ActionsContainer) -> None:
 
 
 def add_record(command: argparse._ActionsContainer) -> None:
-    """Add ``--record FILE``; see `aerokit.apps.cli.output.new_recording`."""
     command.add_argument(
         "--record",
         type=log_file,
@@ -252,7 +254,6 @@ def add_record(command: argparse._ActionsContainer) -> None:
 
 
 def add_faults(command: argparse._ActionsContainer) -> None:
-    """Add ``--fault NAME[=VALUE][@S]`` for simulated vehicles."""
     faults = command.add_argument(
         "--fault",
         action="append",
@@ -267,7 +268,6 @@ def add_faults(command: argparse._ActionsContainer) -> None:
 
 
 def add_conditions(command: argparse._ActionsContainer) -> None:
-    """Add ``--parameter``, ``--wind``, ``--battery`` and ``--fault`` for simulated vehicles."""
     parameters = command.add_argument(
         "--parameter",
         action="append",
@@ -289,7 +289,7 @@ def add_conditions(command: argparse._ActionsContainer) -> None:
 
 
 def conditions(options: argparse.Namespace) -> dict[str, Any]:
-    """Return parameters, wind and battery from the options of `add_conditions`, as arguments of a simulated vehicle."""
+    """Convert the options of `add_conditions` to arguments of a simulated vehicle."""
     from aerokit.sim import SimulatedWind
 
     arguments: dict[str, Any] = {}

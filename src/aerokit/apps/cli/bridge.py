@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from aerokit.apps.cli.arguments import address, number, port
-from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, signing_of
+from aerokit.apps.cli.connecting import SIGNING_KEY_VARIABLE, add_address, add_signing_key, opened
 from aerokit.apps.cli.output import DONE, add_json, can_print, emit, import_extra
 from aerokit.apps.cli.terminal import on_interrupt
 from aerokit.errors import InvalidArgument
@@ -85,7 +85,10 @@ def _add_publishing(
 
 
 def _add_common(action: argparse.ArgumentParser, default_hz: float, max_hz: float, what: str) -> None:
-    """Add the options that all bridges have. ``what`` is the word for one of the published values, for the help."""
+    """Add the options that all bridges have.
+
+    The help texts call a published value ``what``.
+    """
     action.add_argument(
         "--rate",
         type=number(0.1, max_hz),
@@ -124,17 +127,13 @@ def _without_password(broker: str) -> str:
 
 
 async def _foxglove(options: argparse.Namespace) -> int:
-    """Serve vehicles to Foxglove until Ctrl-C or the end of the connection."""
     import_extra("foxglove", "foxglove")
     from aerokit.apps.foxglove import foxglove_bridge
-    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
 
     stop = asyncio.Event()
     with on_interrupt(stop.set):
         async with (
-            open_connection(
-                options.address, source_system=OBSERVER_SYSTEM_ID, baud=options.baud, signing=signing_of(options)
-            ) as connection,
+            opened(options) as connection,
             foxglove_bridge(
                 connection,
                 host=options.host,
@@ -151,26 +150,20 @@ async def _foxglove(options: argparse.Namespace) -> int:
 
 
 def _rates(options: argparse.Namespace) -> dict[type[Message], float] | None:
-    """Return the rates to request: an empty dict for ``--listen-only``; otherwise None, which means the usual rates."""
     return {} if options.listen_only else None
 
 
 async def _publish(options: argparse.Namespace) -> int:
-    """Publish the states of all vehicles until Ctrl-C or the end of the connection."""
     import_extra(*options.module_and_extra)
     from aerokit.apps.network import Publishing
     from aerokit.apps.network.publishing import publisher_for
-    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
     from aerokit.vehicle.connect import vehicles_on
 
     stop = asyncio.Event()
-    signing = signing_of(options)
     network = options.network_text(options.network)
     with on_interrupt(stop.set):
         async with (
-            open_connection(
-                options.address, source_system=OBSERVER_SYSTEM_ID, baud=options.baud, signing=signing
-            ) as connection,
+            opened(options) as connection,
             publisher_for(options.network) as publisher,
             vehicles_on(
                 connection,
@@ -194,7 +187,10 @@ async def _publish(options: argparse.Namespace) -> int:
 
 
 async def _wait_until_ended(connection: Connection, stop: asyncio.Event) -> None:
-    """Wait until ``stop`` is set or the connection ends. Raise the error that ended the connection."""
+    """Wait until ``stop`` is set or the connection ends.
+
+    Raises the error that ended the connection.
+    """
     connection.on_end(lambda _: stop.set())
     await stop.wait()
     connection.raise_if_ended()

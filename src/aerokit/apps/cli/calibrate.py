@@ -115,7 +115,10 @@ def _calibration(vehicle: Vehicle, sensor: str) -> Calibration:
 
 
 async def _guide(options: argparse.Namespace, calibration: Calibration) -> int:
-    """Show the steps of a calibration until it ends. Ctrl-C cancels the calibration on the vehicle."""
+    """Show the steps of a calibration until it ends.
+
+    Ctrl-C cancels the calibration on the vehicle.
+    """
     display = Display(options)
     scope = anyio.CancelScope()
     with on_interrupt(scope.cancel):
@@ -154,7 +157,6 @@ class Display:
         self._shown: tuple[CalibrationPose | None, str] = (None, "")
 
     def show(self, step: CalibrationStep) -> None:
-        """Print the result, a new pose with its picture, or a new instruction; in a terminal, also the progress."""
         if step.result is not None:
             self._show_result(step)
             return
@@ -182,7 +184,6 @@ class Display:
 
 
 def lines_of(step: CalibrationStep) -> list[str]:
-    """Return a step as lines of text: the picture of the pose, the poses that follow, and the instruction."""
     lines = []
     if step.pose is not None:
         view = "seen from behind" if step.pose in _FROM_BEHIND else "seen from the right side"
@@ -196,6 +197,5 @@ def lines_of(step: CalibrationStep) -> list[str]:
 
 
 def bar(progress: float) -> str:
-    """Return a progress bar: ``  [######------]  50 %``."""
     done = round(progress * _BAR_WIDTH)
     return f"  [{'#' * done}{'-' * (_BAR_WIDTH - done)}] {100 * progress:3.0f} %"

@@ -38,7 +38,6 @@ async def run_completion(options: argparse.Namespace) -> int:
 
 
 def set_completions(action: argparse.Action, values: Callable[[], Iterable[str]]) -> None:
-    """Set the values that the shell offers for an argument. argcomplete filters them by the typed characters."""
     setattr(action, "completer", lambda **_: list(values()))  # noqa: B010 - not an attribute of argparse.Action
 
 
@@ -62,7 +61,10 @@ def kinds() -> tuple[str, ...]:
 
 
 def parameter_names(autopilot: str | None = None) -> list[str]:
-    """Return the sorted parameter names of the simulated vehicles of "ArduPilot" or "PX4", by default of both."""
+    """Return the sorted parameter names of the simulated vehicles.
+
+    ``autopilot`` is "ArduPilot" or "PX4"; None means both.
+    """
     paths: list[str] = []
     for name, paths_of_autopilot in _PARAMETER_TABLES.items():
         if autopilot is None or autopilot == name:

@@ -15,7 +15,7 @@ from aerokit.apps.cli.arguments import add_baud, address, number, system_id
 from aerokit.apps.cli.completion import addresses, set_completions
 from aerokit.apps.cli.output import DONE, add_json, emit, emit_done
 from aerokit.apps.cli.terminal import confirm, is_interactive, on_interrupt, waiting
-from aerokit.connection.opening import OBSERVER_SYSTEM_ID
+from aerokit.connection.opening import OBSERVER_SYSTEM_ID, explain_no_vehicle, open_connection
 from aerokit.errors import ConnectFailed, InvalidArgument
 
 if TYPE_CHECKING:
@@ -38,10 +38,9 @@ _CONNECT_TIMEOUT_S = 30.0
 
 
 async def _check_only_vehicle(vehicle: Vehicle, options: argparse.Namespace) -> None:
-    """Check that no other vehicle is on the link, unless ``--system-id`` is given.
+    """Raise InvalidArgument if several vehicles are on the link.
 
-    Raises:
-        InvalidArgument: there are several vehicles.
+    Nothing is checked if the user chose one with ``--system-id``.
     """
     if options.system_id is not None:
         return
@@ -67,7 +66,6 @@ def add_signing_key(command: argparse._ActionsContainer, text: str) -> None:
 
 
 def key_file(path: str) -> SigningKey:
-    """Read a signing key from the file at this path, for argparse."""
     from aerokit.mavlink.signing import SigningKey
 
     try:
@@ -81,7 +79,10 @@ def key_file(path: str) -> SigningKey:
 
 
 def signing_of(options: argparse.Namespace) -> Signing | None:
-    """Return the signing for a connection, from ``--signing-key`` or the environment; None without a key."""
+    """Return the signing for a connection, or None without a key.
+
+    The key is that of ``--signing-key`` or of the environment variable.
+    """
     key: SigningKey | None = options.signing_key
     text = os.environ.get(SIGNING_KEY_VARIABLE, "")
     if key is None and not text.strip():
@@ -92,20 +93,17 @@ def signing_of(options: argparse.Namespace) -> Signing | None:
 
 
 def default_address() -> str:
-    """Return the address from the environment or, by default, the UDP port on which ground stations listen."""
     return os.environ.get(ADDRESS_VARIABLE, "").strip() or _DEFAULT_ADDRESS
 
 
 def add_address(
     command: argparse._ActionsContainer, name: str = "address", *, what: str = "", default_text: str | None = None
 ) -> None:
-    """Add the address, as an argument or an option, and ``--baud``.
+    """Add an argument or option for the address of a link, and ``--baud``.
 
-    Args:
-        command: the parser or group.
-        name: name of the argument; with leading dashes, name of the option.
-        what: beginning of the help text, before the examples.
-        default_text: what the command does without an address, for the help; None if it uses the default address.
+    ``name`` has leading dashes if the address is an option. ``what`` is the beginning of its help text.
+    ``default_text`` says in the help what the command does without an address. If it is None, the command uses the
+    default address.
     """
     keywords: dict[str, Any] = {} if name.startswith("-") else {"nargs": "?"}
     if default_text is None:
@@ -140,7 +138,6 @@ def _vehicle_parser() -> argparse.ArgumentParser:
 
 
 def add_vehicle(command: argparse.ArgumentParser) -> None:
-    """Add the options that select a vehicle and its connection."""
     group = command.add_argument_group("vehicle")
     add_address(group, "--connect")
     group.add_argument(
@@ -164,7 +161,10 @@ def add_action(
     *,
     connects: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add the action ``name`` to a command; with ``connects``, also the options for a connection to a vehicle."""
+    """Add the action ``name`` to a command.
+
+    With ``connects``, it also has the options for a connection to a vehicle.
+    """
     parents = [_vehicle_parser()] if connects else []
     summary = text[0].lower() + text[1:].partition(". ")[0].rstrip(".")
     action = actions.add_parser(name, help=summary, description=text, parents=parents)
@@ -174,9 +174,10 @@ def add_action(
 
 
 async def is_declined(options: argparse.Namespace, action: str, question: str, outcome: str) -> bool:
-    """Ask a question before a connection is opened, unless ``--yes`` is given. Say "nothing was ``outcome``" after no.
+    """Ask the user a question; return True if the answer is no.
 
-    The answer is no if stdin is not a terminal.
+    With ``--yes``, the question is not asked. The answer is no if stdin is not a terminal. After a no, the user is
+    told that nothing was ``outcome``.
     """
     if options.yes or (is_interactive() and await confirm(question)):
         return False
@@ -192,11 +193,9 @@ def command_action(
 ) -> Callable[[argparse.Namespace], Awaitable[int]]:
     """Return a ``run`` function that performs one action and prints one line.
 
-    Args:
-        name: the name of the action in the ``done`` record; may contain names of options in braces.
-        text: the line that is printed without ``--json``; may also contain names of options in braces.
-        action: called with the target and the options.
-        open_target: function that opens the target of the action; None: connect to the vehicle.
+    ``name`` is the action in the ``done`` record, and ``text`` the line without ``--json``. Both may contain names of
+    options in braces. ``action`` is called with the target and the options. Without ``open_target``, the target is the
+    vehicle.
     """
 
     async def run(options: argparse.Namespace) -> int:
@@ -213,8 +212,8 @@ def command_action(
 async def connected(options: argparse.Namespace, *, changes: bool = False) -> AsyncIterator[Vehicle]:
     """Connect to the vehicle that the options name, without requesting message rates.
 
-    Actions that change something on the vehicle set ``changes``. The vehicle must then be the only one on the link, or
-    be chosen by ``--system-id``.
+    Commands that change something on the vehicle set ``changes``. The user must then choose a vehicle with
+    ``--system-id`` if several are on the link.
     """
     async with connect_to(
         options,
@@ -231,9 +230,9 @@ async def connected(options: argparse.Namespace, *, changes: bool = False) -> As
 async def connect_to(
     options: argparse.Namespace, link: str | Link, *, changes: bool, **connecting: Any
 ) -> AsyncIterator[Vehicle]:
-    """Connect to the vehicle on a link, and show a countdown. ``connecting`` is passed to :func:`aerokit.connect`.
+    """Connect to the vehicle on a link, and show a countdown while waiting.
 
-    ``changes`` is as in :func:`connected`.
+    ``changes`` is as in :func:`connected`. Other arguments are passed to :func:`aerokit.connect`.
     """
     from aerokit.vehicle.connect import connect
 
@@ -249,7 +248,6 @@ async def connect_to(
 
 
 def add_link(command: argparse.ArgumentParser, *, default_text: str | None = None) -> None:
-    """Add the address, ``--baud``, ``--signing-key`` and ``--json``; ``default_text`` is as in :func:`add_address`."""
     add_address(command, default_text=default_text)
     add_signing_key(command, f"signing key of the vehicles (${SIGNING_KEY_VARIABLE})")
     add_json(command)
@@ -261,12 +259,11 @@ def add_seconds(command: argparse.ArgumentParser, text: str, default: float | No
 
 @asynccontextmanager
 async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> AsyncIterator[Connection]:
-    """Open a connection to the address. Only heartbeats are sent.
+    """Open a connection that sends only heartbeats.
 
-    With ``reconnect``, a lost link is reopened, unless the options have a `Link` in place of the address, as in tests.
+    With ``reconnect``, a lost link is opened again.
     """
-    from aerokit.connection.opening import OBSERVER_SYSTEM_ID, open_connection
-
+    # Tests use a `Link` in place of the address. It cannot be opened again.
     link: str | Link = options.address
     async with open_connection(
         link,
@@ -281,12 +278,8 @@ async def opened(options: argparse.Namespace, *, reconnect: bool = False) -> Asy
 async def await_vehicle(connection: Connection, options: argparse.Namespace, patience_s: float) -> None:
     """Wait for the first heartbeat of an autopilot.
 
-    Raises:
-        ConnectFailed: no heartbeat arrived; the text describes what was received instead.
-        ConnectionClosed, LinkLost: the connection ended.
+    Raises ConnectFailed if there is none within ``patience_s``. The text describes what was received instead.
     """
-    from aerokit.connection.opening import explain_no_vehicle
-
     async with waiting(options, connection.link.address, patience_s):
         with anyio.move_on_after(patience_s):
             async for _ in connection.vehicles():
@@ -298,7 +291,6 @@ async def await_vehicle(connection: Connection, options: argparse.Namespace, pat
 
 
 def _simulator_hint(connection: Connection) -> str:
-    """Return a hint on how to simulate a vehicle, if the link is a UDP port that has received nothing, else ""."""
     link_address = connection.link.address.replace("0.0.0.0", "127.0.0.1")
     if not link_address.startswith("udpin:127.0.0.1:") or any(peer.bytes for peer in connection.statistics()):
         return ""
@@ -306,9 +298,9 @@ def _simulator_hint(connection: Connection) -> str:
 
 
 async def await_end(connection: Connection, seconds: float | None, work: asyncio.Task[None] | None = None) -> bool:
-    """Wait for Ctrl-C or for ``seconds``. Return True after Ctrl-C.
+    """Wait for Ctrl-C, for the time to pass, or for ``work`` to end.
 
-    Raise the connection's error if the connection ends first. The wait also ends when the task ``work`` ends.
+    Returns True after Ctrl-C. Raises the connection's error if the connection ends first.
     """
     ended = asyncio.Event()
     interrupted = False

@@ -68,7 +68,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_demo(options: argparse.Namespace) -> int:
-    """Fly the demonstration. Return 0 when the vehicle is back on the ground."""
     if options.connect is not None and options.faults:
         raise InvalidArgument("--fault works with the simulated vehicle only: remove --connect, or remove --fault")
     interrupts = InterruptStack()
@@ -81,7 +80,6 @@ async def run_demo(options: argparse.Namespace) -> int:
 
 
 async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptStack) -> int:
-    """Fly the square with a given or a simulated vehicle. Return the exit code."""
     async with _address(options) as address, AsyncExitStack() as stack:
         emit(options, "connecting", {"address": address}, f"connecting to {address}")
         stack.enter_context(new_recording(options.record))
@@ -102,7 +100,10 @@ async def _connect_and_fly(options: argparse.Namespace, interrupts: InterruptSta
 
 @asynccontextmanager
 async def _address(options: argparse.Namespace) -> AsyncIterator[str]:
-    """Yield the address of the vehicle. Without ``--connect``, simulate a vehicle while the block lasts."""
+    """Yield the address of the vehicle.
+
+    Without ``--connect``, a vehicle is simulated while the block lasts.
+    """
     if options.connect is not None:
         yield options.connect
         return
@@ -128,7 +129,6 @@ class _SquareFlight(SupervisedFlight):
         self._was_overruled = False  # True if another party's mode change has ended the flight along the square
 
     async def fly_square(self, altitude_m: float, side_m: float) -> int:
-        """Fly the square and land. Return the exit code."""
         self._altitude_m = altitude_m
         self._side_m = side_m
         try:
@@ -150,7 +150,6 @@ class _SquareFlight(SupervisedFlight):
         return DONE
 
     async def _take_off(self, altitude_m: float) -> None:
-        """Wait until the vehicle is ready, then arm it and take off."""
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}; waiting until it is ready")
         # This only describes a take-off, and sends nothing. The altitude of home does not matter for the check.

@@ -111,7 +111,10 @@ async def _photo(options: argparse.Namespace) -> int:
 
 
 async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -> bool:
-    """Print a picture's data and, with ``--to``, download it. Return False if taking or downloading it failed."""
+    """Print a picture's data and, with ``--to``, download it.
+
+    Returns False if taking or downloading it failed.
+    """
     position = capture.place
     place_text = "position unknown"
     if position is not None:
@@ -137,22 +140,18 @@ async def _show(options: argparse.Namespace, camera: Camera, capture: Capture) -
 
 
 def _printable_text(text: str) -> str:
-    """Replace the control characters of a text, because a terminal would execute them."""
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
 
 
 def _file_name(capture: Capture) -> str | None:
-    """Return the file name ``INDEX-NAME`` for a picture, with the last part of its address as NAME.
-
-    Return None if this is not a portable file name.
-    """
+    """Return a file name such as ``00003-IMG_3.JPG`` for a picture; None if it is not portable."""
     name = unquote(capture.file_url.rpartition("/")[2]) or "capture.jpg"
     is_portable = name.isprintable() and not set(name) & set('/\\:*?"<>|') and name.strip(" .") == name
     return f"{capture.index:05}-{name}" if is_portable and len(name) <= _MAX_FILE_NAME else None
 
 
 def _write_new(folder: Path, name: str, content: bytes) -> Path:
-    """Write data to a new file. If a file with this name exists, a number is appended to the name."""
+    """Write a new file. A number is appended to the name if the file exists."""
     stem, dot, ending = name.rpartition(".")
     target = folder / name
     number = 1
@@ -237,7 +236,6 @@ async def _gimbal(options: argparse.Namespace, *, changes: bool = True) -> Async
 
 
 async def _gimbal_info(options: argparse.Namespace) -> int:
-    """Print the description of the gimbal and, if it arrives soon, the attitude."""
     async with _gimbal(options, changes=False) as gimbal:
         try:
             information = await gimbal.information()

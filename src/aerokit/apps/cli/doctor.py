@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import anyio
 
 from aerokit.apps.cli.connecting import add_link, add_seconds, opened
-from aerokit.apps.cli.doctor_link import Finding, Level, emit_finding
+from aerokit.apps.cli.doctor_link import BAUD_RATES, Finding, Level, LinkExamination, emit_finding, listen_at
 from aerokit.apps.cli.output import DONE, FAILED, NO_VEHICLE
 from aerokit.apps.cli.terminal import waiting
 from aerokit.errors import AerokitError, LinkOpenError
@@ -54,7 +54,6 @@ BAUD_RATE_TIMEOUT_S = 2.5
 
 
 def check_installation() -> Iterator[Finding]:
-    """Check the version, the extras, and whether another package named ``aerokit`` has overwritten files."""
     import aerokit
     from aerokit._internal.imports import installation_problem
     from aerokit._internal.wire import wire_implementation
@@ -79,10 +78,7 @@ def check_installation() -> Iterator[Finding]:
 
 
 def check_serial_port(device: str, description: str = "") -> Finding:
-    """Check the permissions of a serial port, and whether another program uses the port.
-
-    The port is not opened, because opening it toggles DTR, which resets some boards.
-    """
+    # The port is not opened, because opening it toggles DTR, which resets some boards.
     name = f"{device} ({description})" if description and description != "n/a" else device
     if os.name == "posix" and os.path.exists(device) and not os.access(device, os.R_OK | os.W_OK):
         return Finding("problem", "serial port", f"{name}: permission denied", _permission_advice(device))
@@ -97,7 +93,10 @@ def check_serial_port(device: str, description: str = "") -> Finding:
 
 
 def _programs_using(device: str) -> list[str]:
-    """Return the names of other programs that have opened the port. Only root can see programs of other users."""
+    """Return the names of other programs that have opened the port.
+
+    Only root can see programs of other users.
+    """
     programs: list[str] = []
     if sys.platform != "linux" or os.path.realpath(device).startswith("/dev/pts/"):
         return programs  # a pseudo-terminal is always open in the program that created it
@@ -128,7 +127,6 @@ def _permission_advice(device: str) -> str:
 
 
 def check_network_port(port: int, meaning: str, *, udp: bool) -> Finding:
-    """Check whether a program on this computer uses a network port."""
     name = f"{'UDP' if udp else 'TCP'} port {port}"
     error = port_bind_error("0.0.0.0" if udp else "127.0.0.1", port, udp=udp)
     if error is None:
@@ -152,7 +150,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_doctor(options: argparse.Namespace) -> int:
-    """Print all findings. Return FAILED if there is a problem, NO_VEHICLE if the link is silent or cannot be opened."""
     levels: set[Level] = set()
 
     def report(finding: Finding) -> None:
@@ -167,7 +164,6 @@ async def run_doctor(options: argparse.Namespace) -> int:
 
 
 def _check_computer(report: Callable[[Finding], None]) -> None:
-    """Report findings on the installation, the serial ports and the common network ports."""
     for finding in check_installation():
         report(finding)
     ports = serial_ports()
@@ -185,9 +181,7 @@ def _check_computer(report: Callable[[Finding], None]) -> None:
 
 
 async def _check_link(options: argparse.Namespace, report: Callable[[Finding], None]) -> bool:
-    """Check the link and report findings. Return False if it cannot be opened, or no other system was received."""
-    from aerokit.apps.cli.doctor_link import LinkExamination
-
+    """Report findings about the link. Return False if it is silent or cannot be opened."""
     parsed = parse_address(options.address) if isinstance(options.address, str) else None
     if parsed is not None and parsed.kind == "serial":
         configured_baud = parsed.baud or options.baud
@@ -213,9 +207,7 @@ async def _check_link(options: argparse.Namespace, report: Callable[[Finding], N
 async def _find_baud_rate(
     options: argparse.Namespace, device: str, configured_baud: int, report: Callable[[Finding], None]
 ) -> int:
-    """Return the baud rate at which MAVLink is received, or ``configured_baud`` if none is found."""
-    from aerokit.apps.cli.doctor_link import BAUD_RATES, listen_at
-
+    """Return the baud rate at which MAVLink is received; ``configured_baud`` if there is none."""
     port_finding = check_serial_port(device)
     if port_finding.level != "ok":
         report(port_finding)

@@ -59,7 +59,6 @@ class BaudRateProbe:
 
     @property
     def is_mavlink(self) -> bool:
-        """Return True if enough valid frames were received."""
         return self.frames >= _MIN_FRAMES
 
     def bytes_received(self, data: bytes, peer: Peer) -> None:
@@ -82,9 +81,7 @@ class BaudRateProbe:
 async def listen_at(device: str, baud: int, seconds: float) -> BaudRateProbe:
     """Listen to a serial port at one baud rate.
 
-    Raises:
-        LinkOpenError: the port cannot be opened.
-        LinkLost: the port was lost.
+    Raises LinkOpenError if the port cannot be opened, and LinkLost if it is lost.
     """
     probe = BaudRateProbe(baud)
     link = SerialLink(device, baud)
@@ -155,7 +152,6 @@ class LinkExamination:
         self._duplicate_sources.add((event.system_id, event.component_id))
 
     def findings(self) -> Iterator[Finding]:
-        """Yield all findings, the most severe kinds first."""
         yield from self._silence()
         yield from self._ids()
         yield from self._senders()
@@ -165,11 +161,9 @@ class LinkExamination:
 
     @property
     def is_silent(self) -> bool:
-        """True if no message of another system was received."""
         return not set(self._frames) - {self._own_ids}
 
     def _silence(self) -> Iterator[Finding]:
-        """If no autopilot was received, yield this problem, with advice that depends on what was received instead."""
         connection = self._connection
         if any(is_autopilot(heartbeat) for heartbeat in connection.heartbeats.values()):
             return
@@ -194,11 +188,6 @@ class LinkExamination:
         yield Finding("problem", "vehicle", text, advice)
 
     def _ids(self) -> Iterator[Finding]:
-        """Yield findings about system and component ids.
-
-        Reported are ids that two senders use, systems with several autopilots, another ground station with aerokit's
-        default ids, and system id 0.
-        """
         ambiguous = {source for source, pairs in self._types_and_autopilots.items() if len(pairs) > 1}
         for system, component in sorted((self._duplicate_sources | ambiguous) - {self._own_ids}):
             yield Finding(
@@ -235,7 +224,6 @@ class LinkExamination:
             )
 
     def _senders(self) -> Iterator[Finding]:
-        """Yield a finding for each component that has sent a heartbeat."""
         for source, heartbeat in sorted(self._connection.heartbeats.items()):
             if source == self._own_ids:
                 continue
@@ -256,7 +244,6 @@ class LinkExamination:
                 yield Finding("ok", "sender", text, _STATUS_ADVICE if is_autopilot(heartbeat) else "")
 
     def _signing(self) -> Iterator[Finding]:
-        """Yield problems with signatures: the given key does not fit, or frames are signed and no key is given."""
         signing = self._connection.signing
         if signing is not None:
             if problems := self._connection.describe_signature_problems():
@@ -272,7 +259,6 @@ class LinkExamination:
             )
 
     def _undecoded(self) -> Iterator[Finding]:
-        """Yield findings on messages of unknown dialects, and on bytes that are not MAVLink."""
         unknown_messages: Counter[int] = Counter()
         for statistics in self._connection.statistics():
             unknown_messages.update(statistics.unknown_messages)

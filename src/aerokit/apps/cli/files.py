@@ -54,7 +54,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def _action_on_path(method: str) -> Callable[[Vehicle, argparse.Namespace], Awaitable[object]]:
-    """Return an action that calls a method of `vehicle.files` with the path that was given."""
+    """Return an action that calls a method of `vehicle.files` with the path of the options."""
     return lambda vehicle, options: getattr(vehicle.files, method)(options.path, idle_timeout_s=options.patience)
 
 
@@ -85,7 +85,6 @@ async def _get(options: argparse.Namespace) -> int:
 
 
 def _destination(options: argparse.Namespace) -> Path:
-    """Return the local file to write. If ``to`` is missing or a directory, the file keeps its name on the vehicle."""
     name = PurePosixPath(options.path).name
     target = Path(options.to or name)
     return target / name if target.is_dir() else target
@@ -137,7 +136,6 @@ async def _list_logs(options: argparse.Namespace) -> int:
 
 
 async def _get_logs(options: argparse.Namespace) -> int:
-    """Download the chosen logs into the folder ``--to``. Return FAILED if the vehicle has no logs."""
     async with connected(options) as vehicle:
         entries = await vehicle.logs.list(idle_timeout_s=options.patience)
         options.to.mkdir(parents=True, exist_ok=True)
@@ -158,7 +156,6 @@ async def _get_logs(options: argparse.Namespace) -> int:
 
 
 def _chosen(entries: Sequence[LogEntry], options: argparse.Namespace) -> Sequence[LogEntry]:
-    """Return the logs to download: those with the given ids, all with ``--all``, by default the newest."""
     if options.all:
         return entries
     if not options.ids:

@@ -43,7 +43,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def _convert(options: argparse.Namespace) -> int:
-    """Convert a log, and print what was written. An existing target is replaced only with ``--force``."""
     # Without a suffix, OUT is a folder of tables.
     suffix = options.out.suffix.lower() or f".{options.tables}"
     module = _REQUIRED_MODULES.get(suffix)
@@ -102,7 +101,6 @@ def add_report_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def _report(options: argparse.Namespace) -> int:
-    """Write the report on one log or on the comparison of two logs, and print its summary."""
     import_extra("plotly", "report")
     logs = [options.log] if options.other is None else [options.log, options.other]
     if any(log.suffix.lower() == ".ulg" for log in logs):
@@ -132,7 +130,6 @@ async def _report(options: argparse.Namespace) -> int:
 
 
 def _report_text(report: Report) -> str:
-    """Return the summaries and failsafes of the flights; the last line has the report's file and each fall."""
     lines = []
     # A report covers one log, or two logs called A and B.
     for letter, sentences, failsafes in zip("AB", report.summaries, report.failsafes, strict=False):

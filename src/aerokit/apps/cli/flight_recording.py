@@ -27,11 +27,12 @@ _MAX_HEIGHT_M = 3.0
 
 
 async def record_parameters(vehicle: Vehicle, print_line: Callable[[str], None]) -> None:
-    """Request all parameters, so that a report on the recording can explain failsafes. Gives up after 10 s.
+    """Request all parameters, so that a report on the recording can explain failsafes.
 
-    The faster MAVFTP is not used, because reports need a PARAM_VALUE message for each parameter.
+    Gives up after 10 s.
     """
     try:
+        # The faster MAVFTP is not used, because reports need a PARAM_VALUE message for each parameter.
         table = await vehicle.parameters.download(method="list", timeout=_PARAMETERS_TIMEOUT_S)
     except OperationTimeout:
         print_line(f"  the recording lacks parameters: not all were received within {_PARAMETERS_TIMEOUT_S:g} s")
@@ -46,8 +47,7 @@ async def record_to_end(
 ) -> None:
     """Stay connected to an armed vehicle until it is disarmed or silent for 10 s, or until Ctrl-C.
 
-    A crashed vehicle may stay armed. Near the ground, the recording therefore also ends after 20 s without motion. In
-    a simulation, the 20 s are simulated time, which passes ``speedup`` times as fast.
+    Near the ground, the recording also ends after 20 s without motion, in simulated time.
     """
     if not vehicle.is_armed or not vehicle.connection.is_open:
         return
@@ -59,6 +59,7 @@ async def record_to_end(
         f" is silent for {MAX_SILENCE_S:g} s, or Ctrl-C"
     )
 
+    # A crashed vehicle may stay armed. Simulated time passes `speedup` times as fast.
     stillness = _StillnessNearGround(vehicle, _MAX_STILL_S / speedup)
 
     async def wait() -> int:
@@ -85,10 +86,7 @@ class _StillnessNearGround:
         """True if the vehicle had been still for the whole time at the last `update`."""
 
     def update(self) -> None:
-        """Update ``has_lasted`` from the vehicle's latest position. Call this regularly.
-
-        If the position is old or has no height, the vehicle may be moving or high, so the time is counted anew.
-        """
+        """Update ``has_lasted`` from the vehicle's latest position. Call this regularly."""
         now = self._vehicle.connection.now()
         position = self._vehicle.position.latest
         if position is None:
@@ -97,6 +95,7 @@ class _StillnessNearGround:
         has_moved = self._still_at is None or position.distance_to(self._still_at) > _MAX_DRIFT_M
         height_m = position.altitude_relative_m
         is_near_ground = height_m is not None and abs(height_m) <= _MAX_HEIGHT_M
+        # If the position is old or has no height, the vehicle may be moving or high.
         if is_old or has_moved or not is_near_ground:
             self._still_at = position
             self._still_since = now

@@ -61,7 +61,6 @@ class PlanFlight(SupervisedFlight):
         """Text about what was sent to the vehicle before arming, for the message after Ctrl-C."""
 
     async def _fly(self) -> int:
-        """Upload the plan, ask for confirmation if needed, arm, and fly the mission to its end."""
         vehicle = self._vehicle
         self._print(f"found {vehicle.autopilot.firmware}, system {vehicle.system_id}")
         self._check_vehicle()
@@ -99,7 +98,6 @@ class PlanFlight(SupervisedFlight):
         return tuple((await self._vehicle.mission.download(idle_timeout_s=self._options.patience)).items)
 
     def _check_vehicle(self) -> None:
-        """Raise an error if the vehicle is armed, cannot fly the mission, or has no mode for ``--on-interrupt``."""
         vehicle = self._vehicle
         interrupt_action = self._options.on_interrupt
         self._check_disarmed()
@@ -153,7 +151,6 @@ class PlanFlight(SupervisedFlight):
             self._report.prints_status = True
 
     async def _print_progress(self) -> None:
-        """Print each new mission item. If the mode changes, explain why the flight does not end at once."""
         async with anyio.create_task_group() as group:
             with (
                 self._vehicle.subscribe(events.MissionCurrentChanged, events.ModeChanged, capacity=100) as changes,
@@ -167,9 +164,9 @@ class PlanFlight(SupervisedFlight):
             group.cancel_scope.cancel()
 
     async def _explain_wait(self, mode: str) -> None:
-        """Print how long the flight will wait, after a change to ``mode``, for a report that the mission has ended.
+        """After a change to ``mode``, print how long the flight waits for the end of the mission.
 
-        Nothing is printed if this report arrives within the first quarter of the wait.
+        Nothing is printed if the mission is reported as ended within the first quarter of this time.
         """
         delay_s = END_GRACE_S / 4
         await anyio.sleep(delay_s)
@@ -235,7 +232,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_fly(options: argparse.Namespace) -> int:
-    """Fly a plan. Return 0 if the mission was flown to its end."""
     plan = read_plan(options.file)
     _check_arguments(options, plan)
     for part in PARTS:
@@ -272,7 +268,6 @@ def _check_arguments(options: argparse.Namespace, plan: Plan) -> None:
 async def _connect_and_fly(
     options: argparse.Namespace, plan: Plan, interrupts: InterruptStack, flights: list[PlanFlight]
 ) -> int:
-    """Connect to the vehicle or simulate one, fly the plan, and print the summary. Return the exit code."""
     async with AsyncExitStack() as stack:
         stack.enter_context(new_recording(options.record))
         link: str | Link = options.connect or default_address()
@@ -311,7 +306,6 @@ async def _connect_and_fly(
 
 
 async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: AsyncExitStack) -> Link:
-    """Start a simulated vehicle of the plan's vehicle type, at the place where the mission starts."""
     from aerokit.apps.cli.sim import injecting_faults, simulated_vehicle
     from aerokit.sim import simulated_link
     from aerokit.sim.kinds import scale_timeouts
@@ -337,7 +331,6 @@ async def _start_simulation(options: argparse.Namespace, plan: Plan, stack: Asyn
 
 
 def _kind_for(plan: Plan) -> str:
-    """Return the kind of simulated vehicle for a plan. VTOLs are simulated as planes."""
     from aerokit.mavlink.enums import MavAutopilot, MavType
 
     vtols = range(MavType.VTOL_TAILSITTER_DUOROTOR, MavType.VTOL_RESERVED5 + 1)

@@ -69,7 +69,10 @@ def _named_address(text: str) -> tuple[str, str]:
 
 
 def _messages(text: str) -> tuple[str, tuple[str, ...]]:
-    """Parse ``MESSAGE,…[@NAME]`` into the name of the endpoint ("" for all) and patterns of message names."""
+    """Parse ``MESSAGE,…[@NAME]`` into the endpoint and the patterns of message names.
+
+    The endpoint is "" for all endpoints.
+    """
     names, at, endpoint = text.partition("@")
     patterns = tuple(name.strip() for name in names.split(",") if name.strip())
     if not patterns:
@@ -80,7 +83,10 @@ def _messages(text: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _rate(text: str) -> tuple[str, dict[str, float]]:
-    """Parse ``MESSAGE=HZ,…[@NAME]`` into the name of the endpoint ("" for all) and the rates of messages."""
+    """Parse ``MESSAGE=HZ,…[@NAME]`` into the endpoint and the rates of messages.
+
+    The endpoint is "" for all endpoints.
+    """
     endpoint, parts = _messages(text)
     rates = {}
     for part in parts:
@@ -93,7 +99,6 @@ def _rate(text: str) -> tuple[str, dict[str, float]]:
 
 
 async def _hub(options: argparse.Namespace) -> int:
-    """Run the hub until Ctrl-C or ``--seconds``, and print its statistics at intervals and at the end."""
     from aerokit.hub import Hub
 
     endpoints = _endpoints(options)
@@ -123,11 +128,6 @@ def _how_long(options: argparse.Namespace) -> str:
 
 
 def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
-    """Return the endpoints with their options.
-
-    Raises:
-        InvalidArgument: an option names an unknown endpoint, or ``--signed`` is used without a key.
-    """
     from aerokit.hub import Endpoint
 
     names = [name for name, _ in options.endpoints]
@@ -157,9 +157,9 @@ def _endpoints(options: argparse.Namespace) -> list[Endpoint]:
 
 
 def _patterns_for(name: str, filters: Sequence[tuple[str, tuple[str, ...]]]) -> tuple[str, ...]:
-    """Return the patterns of the filters that apply to this endpoint; a filter with the name "" applies to all."""
     patterns: list[str] = []
     for endpoint, filter_patterns in filters:
+        # "" stands for all endpoints.
         if endpoint in ("", name):
             patterns += filter_patterns
     return tuple(patterns)

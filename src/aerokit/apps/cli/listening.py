@@ -69,13 +69,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_record(options: argparse.Namespace) -> int:
-    """Record a link until Ctrl-C, or for ``--seconds``. A lost link is reopened."""
     with new_recording(options.file):
         return await _record_link(options)
 
 
 async def _record_link(options: argparse.Namespace) -> int:
-    """Record until the end, print the number of messages, and return the exit code."""
     counts: Counter[tuple[int, int]] = Counter()
 
     def count(frame: Frame, peer: Peer) -> None:
@@ -106,7 +104,7 @@ async def _record_link(options: argparse.Namespace) -> int:
 async def _wait_for_end(connection: Connection, options: argparse.Namespace) -> bool:
     """Wait for the end of the recording. Return True after Ctrl-C.
 
-    Without ``--as-is``, connect to the vehicles, which requests message rates.
+    Without ``--as-is``, message rates are requested meanwhile.
     """
     if options.as_is:
         return await await_end(connection, options.seconds)
@@ -117,7 +115,10 @@ async def _wait_for_end(connection: Connection, options: argparse.Namespace) -> 
 
 
 def _emit_counts(options: argparse.Namespace, counts: Counter[tuple[int, int]], seconds: float) -> None:
-    """Print how many frames of which messages were recorded. The keys of ``counts`` are (system id, message id)."""
+    """Print which messages were recorded, and how many.
+
+    The keys of ``counts`` are (system id, message id).
+    """
     from aerokit.mavlink.dialect import STANDARD
 
     messages: Counter[str] = Counter()
@@ -152,7 +153,6 @@ def add_events_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_events(options: argparse.Namespace) -> int:
-    """Print events until Ctrl-C, or for ``--seconds``. A lost link is reopened."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with AsyncExitStack() as stack:
@@ -166,7 +166,6 @@ async def run_events(options: argparse.Namespace) -> int:
 
 
 async def _print_all(connection: Connection, options: argparse.Namespace) -> None:
-    """Print the events of a connection until it ends, with a countdown before the first event."""
     unix_time_at_0 = connection.unix_time() - connection.now()
     # get() raises an error when the connection ends. The error is suppressed, because await_end() raises it as well.
     with suppress(AerokitError), connection.subscribe(Event, capacity=_MAX_WAITING_EVENTS) as events:
@@ -219,7 +218,6 @@ def add_monitor_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_monitor(options: argparse.Namespace) -> int:
-    """Show the vehicles until the user quits."""
     import_extra("textual", "monitor")
     from aerokit.apps.monitor.app import run_monitor as run_app
 
@@ -249,10 +247,11 @@ async def run_monitor(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _printing_kept_name(path: str | None) -> Iterator[None]:
-    """If the block renames the file ``path``, print its new name afterwards. Textual hides the log message about it."""
+    """If the block renames the existing file at ``path``, print its new name afterwards."""
     if path is None or not os.path.isfile(path):
         yield
         return
+    # Textual hides the log message about the new name.
     earlier = os.stat(path)
     yield
     for kept in Path(path).resolve().parent.iterdir():
@@ -261,10 +260,7 @@ def _printing_kept_name(path: str | None) -> Iterator[None]:
 
 
 def _detach_terminal() -> None:
-    """Redirect stdout and stderr to the null device.
-
-    Textual's output thread ends when it writes to a closed terminal. Later writes would then block the event loop.
-    """
+    # Textual's output thread ends when it writes to a closed terminal. Later writes would then block the event loop.
     with open(os.devnull, "w") as null_device:
         for stream in (1, 2):  # stdout and stderr
             os.dup2(null_device.fileno(), stream)

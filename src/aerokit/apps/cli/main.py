@@ -51,11 +51,9 @@ class CliCommand:
 
     @property
     def help(self) -> str:
-        """The first sentence of the description, for the list of commands."""
         return self.description[0].lower() + self.description[1:].partition(". ")[0].rstrip(".")
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Import the command's module and add the command's arguments to the parser."""
         module, _, function = self.location.partition(":")
         getattr(import_module(f"aerokit.apps.cli.{module}"), function or "add_arguments")(parser)
 
@@ -163,16 +161,13 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]  # typeshed has overloads for other namespaces
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
-        """Parse arguments; exit if one is not recognized.
-
-        argparse would leave this to the top-level parser, whose usage does not show the options of the subcommand.
-        """
         if args is not None and not isinstance(self, _TopParser):
             if self._subparsers is None:
                 self._check_option_names(args)
             if problem := misplaced_address(self, args):
                 self.error(problem)
         namespace, unknown = super().parse_known_args(args, namespace)
+        # argparse would leave this to the top-level parser, whose usage does not show the options of the subcommand.
         if unknown:
             self._exit_unrecognized(unknown)
         return namespace, unknown
@@ -192,7 +187,6 @@ class Parser(argparse.ArgumentParser):
         self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and the message, and exit with code 2."""
         # Add a suggestion to argparse's message about an unknown choice.
         match = re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message)
         if match is not None:
@@ -217,7 +211,6 @@ class _TopParser(Parser):
     """The parser of ``aerokit`` itself. Its help lists the commands by task."""
 
     def format_help(self) -> str:
-        """Return the help, in which the commands are grouped as in `GROUPS`."""
         *options, subparsers = self._actions
         assert isinstance(subparsers, argparse._SubParsersAction)
         commands = {action.dest: action for action in subparsers._get_subactions()}
@@ -284,9 +277,8 @@ def _report(error: BaseException, options: argparse.Namespace) -> int:
 def make_parser(only: str | None = None) -> argparse.ArgumentParser:
     """Make the parser for the command line.
 
-    Args:
-        only: the only command whose arguments are added, because importing all modules is slow. "" adds no command's
-            arguments, None those of all commands.
+    Only the arguments of the command ``only`` are added, because importing all modules is slow. "" adds those of no
+    command, and None those of all commands.
     """
     from aerokit import __version__
 
@@ -307,7 +299,6 @@ def make_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 
 def complete() -> int:
-    """Print completions for the command line in COMP_LINE, for argcomplete's shell functions."""
     try:
         argcomplete = import_extra("argcomplete", "completion")
     except NotInstalled:

@@ -28,15 +28,14 @@ _COMMANDS_BY_SUFFIX = {
 
 
 def is_address(word: str) -> bool:
-    """Return True if a word is certainly the address of a link and not another argument."""
     return _ADDRESS_PATTERN.fullmatch(word) is not None
 
 
 def misplaced_file(word: str) -> str | None:
-    """Return an error text if the user gave a file name instead of an address; otherwise None.
+    """Return an error text if a file was given in place of an address; otherwise None.
 
-    A recording (.tlog) is a valid address. A name with a known suffix, such as .plan, counts as a file even if no such
-    file exists. The error text then names the command for this type of file.
+    A name with a known suffix, such as .plan, counts as a file even if no such file exists. The text then names the
+    command for this type of file.
     """
     path = Path(word)
     suffix = path.suffix.lower()
@@ -49,7 +48,7 @@ def misplaced_file(word: str) -> str | None:
 
 
 def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> str | None:
-    """Return an error text, with the right command line, if an address is in the wrong place; otherwise None."""
+    """Return an error text with the right command line if an address is in the wrong place; else None."""
     words = list(words[: words.index("--")] if "--" in words else words)
     command = parser.prog.split()
     if parser._subparsers is not None:
@@ -76,7 +75,7 @@ def misplaced_address(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
 
 
 def _superfluous_connect(parser: argparse.ArgumentParser, words: list[str]) -> str | None:
-    """Return the error text if --connect is given to a command with a positional address; otherwise None."""
+    """Return an error text if --connect is given to a command that takes the address without it."""
     if not any(word.partition("=")[0] == "--connect" for word in words):
         return None
     other_words = [word.removeprefix("--connect=") for word in words if word != "--connect"]
@@ -85,7 +84,7 @@ def _superfluous_connect(parser: argparse.ArgumentParser, words: list[str]) -> s
 
 
 def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) -> str:
-    """Return the error text for words that begin with an address, as in ``aerokit params udpin:… list``."""
+    """Return the error text for words such as ``aerokit params udpin:… list``."""
     address, *after_address = words
     action, *arguments = after_address or ["ACTION"]
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
@@ -98,12 +97,11 @@ def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) ->
 
 
 def _takes_value(parser: argparse.ArgumentParser, option: str) -> bool:
-    """Return True if this option, possibly abbreviated, takes the next word as its value."""
+    # The option may be abbreviated.
     actions = (action for name, action in parser._option_string_actions.items() if name.startswith(option))
     return option.startswith("--") and any(action.nargs != 0 for action in actions)
 
 
 def _required_arguments(parser: argparse.ArgumentParser) -> list[str]:
-    """Return the names of the positional arguments that a command requires."""
     positional = (action for action in parser._actions if not action.option_strings)
     return [str(action.metavar or action.dest).upper() for action in positional if action.nargs not in ("?", "*")]

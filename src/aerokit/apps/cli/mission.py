@@ -32,24 +32,21 @@ _LANDINGS = (MavCmd.NAV_LAND, MavCmd.NAV_VTOL_LAND)
 def read_plan(path: str) -> Plan:
     """Read and check a .plan or QGC WPL 110 file.
 
-    Raises:
-        OSError: the file cannot be read.
-        FileFormatError: the file has neither format; the text names the position of the error.
-        InvalidArgument: an item cannot be sent to a vehicle.
+    Raises OSError if the file cannot be read, FileFormatError if it has neither format, and InvalidArgument if an item
+    cannot be sent to a vehicle.
     """
     return parse_plan_text(read_text(path), Path(path).name)
 
 
 def begins_with_take_off(items: Sequence[MissionItem]) -> bool:
-    """Return True if the first navigation command is a take-off. Like in AP_Mission, a delay may precede it."""
     for item in items:
+        # As in AP_Mission, a delay may precede the take-off.
         if item.command < MavCmd.NAV_LAST and item.command != MavCmd.NAV_DELAY:
             return item.command in _TAKE_OFFS
     return False
 
 
 def plan_warnings(plan: Plan) -> list[str]:
-    """Return warnings about items that can be sent, but are unusual or will probably be refused by a vehicle."""
     from aerokit.autopilots.ardupilot import COPTERS
 
     standard_commands = frozenset(MavCmd)
@@ -70,10 +67,6 @@ def plan_warnings(plan: Plan) -> list[str]:
 
 
 def _altitude_warnings(plan: Plan) -> list[str]:
-    """Return warnings about take-offs to 0 m, and about altitudes below home.
-
-    Altitudes below home are usual only for submarines and for landings.
-    """
     from aerokit.missions.item import canonical_frame
 
     if plan.vehicle_type == MavType.SUBMARINE:
@@ -85,6 +78,7 @@ def _altitude_warnings(plan: Plan) -> list[str]:
         # A take-off has an altitude even without a position. In other commands without a position, z is no altitude.
         has_altitude = is_relative_to_home and (is_take_off or item.position is not None)
         is_too_low = item.z < 0.0 or (is_take_off and item.z == 0.0)
+        # Altitudes below home are usual only for submarines and for landings.
         if has_altitude and is_too_low and item.command not in _LANDINGS:
             warnings.append(f"mission item {index}: {item.name} at {item.z:g} m above home")
     return warnings
@@ -95,7 +89,6 @@ def emit_part(options: argparse.Namespace, part: str, items: int, state: str, te
 
 
 def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionItem], state: str) -> None:
-    """Print the items of a part of a plan. NaN, which means "not set" in MAVLink, is printed as "–"."""
     emit_part(options, part, len(items), state, f"{part}: {len(items)} items")
     for index, item in enumerate(items):
         position = item.position
@@ -113,8 +106,8 @@ def emit_items(options: argparse.Namespace, part: str, items: Sequence[MissionIt
 async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace) -> None:
     """Upload the parts that the plan contains. Other parts on the vehicle stay unchanged.
 
-    Raises:
-        InvalidArgument: a position is farther than ``--max-distance-m`` from the vehicle. The text names its item.
+    Raises InvalidArgument if a position is farther than ``--max-distance-m`` from the vehicle. The text names the
+    item.
     """
     for part in PARTS:
         content = getattr(plan, part)
@@ -137,13 +130,13 @@ async def upload_parts(vehicle: Vehicle, plan: Plan, options: argparse.Namespace
 
 
 def _place_text(item: MissionItem) -> str:
-    """Return the position of an item; for an item without a position, its parameters, unless all are 0."""
     position = item.position
     if position is not None:
         return f"{position.latitude_deg:.7f} {position.longitude_deg:.7f} {item.z:g} m"
     parameters = (item.param1, item.param2, item.param3, item.param4, item.x, item.y, item.z)
     if not any(parameters):
         return ""
+    # In MAVLink, NaN means "not set".
     return " ".join("–" if math.isnan(parameter) else f"{parameter:g}" for parameter in parameters)
 
 
@@ -223,7 +216,6 @@ async def _show(options: argparse.Namespace) -> int:
 
 
 async def _download(options: argparse.Namespace) -> int:
-    """Write the mission to a waypoint file or, with fence and rally points, to a ``.plan`` file."""
     from aerokit.missions import Plan, write_plan_file, write_waypoint_file
 
     check_not_existing(options.file, options)
@@ -252,7 +244,6 @@ async def _upload(options: argparse.Namespace) -> int:
 
 
 async def _check(options: argparse.Namespace) -> int:
-    """Print the items of a plan file, and warnings and notes about them. Nothing is sent."""
     plan = read_plan(options.file)
     has_items = False
     for part in PARTS:
@@ -279,7 +270,7 @@ def _emit_warnings(plan: Plan, options: argparse.Namespace) -> list[str]:
 
 
 def _notes(plan: Plan) -> list[str]:
-    """Return a note if the plan has items that only ArduPilot accepts, but is not marked as one for ArduPilot."""
+    """Return a note if only ArduPilot accepts the items, and the plan does not say that it is for ArduPilot."""
     if plan.firmware_type == MavAutopilot.ARDUPILOTMEGA:
         return []
     try:

@@ -43,11 +43,8 @@ def add_json(command: argparse._ActionsContainer) -> None:
 def emit(options: argparse.Namespace, kind: str, record: Mapping[str, object], text: str | None) -> None:
     """Print one record: a JSON object with ``--json``, otherwise text.
 
-    Args:
-        options: the parsed options of the command.
-        kind: type of the record, which is its first field: ``{"type": "parameter", …}``.
-        record: the other fields (docs/command-line.md), in types that `aerokit._internal.formatting.to_jsonable` takes.
-        text: text to print without ``--json``; None: print nothing.
+    ``kind`` is the type of the record and its first field: ``{"type": "parameter", …}``. ``record`` has the other
+    fields (docs/command-line.md). If ``text`` is None, nothing is printed without ``--json``.
     """
     if options.json:
         assert "type" not in record, record
@@ -66,9 +63,10 @@ def _print_json(fields: Mapping[str, object]) -> None:
 
 
 def can_print(stream: TextIO | None = None) -> bool:
-    """Return False while printing to the stream (default: stdout) would block: after Ctrl-S, or if a pipe is not read.
+    """Return False while printing would block: after Ctrl-S, or if a pipe is not read.
 
-    Commands on which vehicles depend must not print then, because heartbeats and forwarding would stop.
+    Commands on which vehicles depend must not print then, because heartbeats and forwarding would stop. The default
+    stream is stdout.
     """
     try:
         _, writable, _ = select.select([], [sys.stdout if stream is None else stream], [], 0)
@@ -102,7 +100,6 @@ class _NonblockingStream:
 
 @contextmanager
 def nonblocking_stderr() -> Iterator[None]:
-    """Within the block, warnings, progress bars and other output to stderr never block the event loop."""
     original = sys.stderr
     if original is None:
         yield
@@ -124,12 +121,10 @@ def _print(text: str) -> None:
 
 
 def emit_done(options: argparse.Namespace, action: str, text: str) -> None:
-    """Print the ``done`` record of an action that has no other result. Without ``--json``, print ``text`` instead."""
     emit(options, "done", {"action": action}, text)
 
 
 def emit_error(error: BaseException, code: int, *, as_json: bool) -> None:
-    """Print an error to stderr and, with ``--json``, also as the last object on stdout."""
     text = _text(error)
     if as_json:
         _print_json({"type": "error", "error": type(error).__name__, "message": text, "exit_code": code})
@@ -163,10 +158,10 @@ _CALL = re.compile(rf"({'|'.join(map(re.escape, _PLAIN_NAMES))})(?:\(([^()]*)\))
 
 
 def plain_text(error: BaseException) -> str:
-    """Return the text of an error, in which the name of the call that raised it is replaced by words for users.
+    """Return the text of an error in the words of the command line.
 
-    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. If the
-    error lists reasons, those that only announce a mission item, such as ``Mission: 3 WP``, are left out.
+    ``mission.wait_finished: the mode changed to RTL`` becomes ``flying the mission: the mode changed to RTL``. Reasons
+    that only announce a mission item, such as ``Mission: 3 WP``, are left out.
     """
     text = _MISSION_REASON.sub("", str(error))
     call = _CALL.match(text)
@@ -179,10 +174,7 @@ def plain_text(error: BaseException) -> str:
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Within the block, adapt aerokit's warnings and log messages to the users of a command.
-
-    Warnings are printed without source lines, and log messages do not advise to change code.
-    """
+    """Within the block, print warnings without source lines, and log messages without advice on code."""
     import logging
     import warnings
 
@@ -205,7 +197,7 @@ def plain_warnings() -> Iterator[None]:
 
 
 def _rewrite_for_commands(record: logging.LogRecord) -> bool:
-    """Logging filter that rewords messages about the program's code, because users of a command have no such code."""
+    # The original messages advise to change code, but users of a command have no such code.
     if str(record.msg).startswith("the async with block of vehicle %d was left: "):
         record.msg = "disconnected from vehicle %d: %s"
     if str(record.msg).startswith("the event loop was blocked") and isinstance(record.args, tuple):
@@ -262,8 +254,7 @@ def exit_codes_help() -> str:
 def import_extra(module: str, extra: str) -> Any:
     """Import a module that an extra provides.
 
-    Raises:
-        NotInstalled: a package is missing. The text has the command that installs it.
+    Raises NotInstalled if a package is missing. The text has the command that installs it.
     """
     try:
         return import_module(module)
@@ -274,7 +265,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def _requirement(extra: str) -> str:
-    """Return pip's argument to install an extra from where aerokit itself was installed: PyPI, a folder or a URL."""
+    """Return pip's argument that installs an extra from the same source as aerokit itself."""
     from importlib.metadata import PackageNotFoundError, distribution
     from urllib.parse import unquote
 
@@ -319,25 +310,16 @@ def add_force(command: argparse.ArgumentParser) -> None:
 
 
 def check_not_existing(file: str | Path, options: argparse.Namespace) -> None:
-    """Check that the output file does not exist, before anything is sent.
-
-    Raises:
-        FileExistsError: the file exists, and ``--force`` is not given.
-    """
     if not options.force and Path(file).exists():
         raise FileExistsError(errno.EEXIST, "file exists; use --force to replace it", str(file))
 
 
 @contextmanager
 def new_recording(path: str | None) -> Iterator[None]:
-    """Check that a recording can be written. After the block, delete it if it is empty.
+    """Check that a recording can be written, and remove it after the block if it is empty.
 
-    The connection creates the file when the first frame arrives, and renames an existing file to a numbered name
-    (`aerokit.connection.frame_observers.keep_existing`). A file that existed before the block is never deleted. If
-    ``path`` is None, nothing is done.
-
-    Raises:
-        PermissionError: the folder is not writable.
+    A file that existed before the block is never removed. None stands for no recording. Raises PermissionError if the
+    folder is not writable.
     """
     if path is None:
         yield

@@ -18,12 +18,12 @@ from aerokit.apps.cli.output import DONE, FAILED, add_force, check_not_existing,
 from aerokit.apps.cli.params_metadata import (
     add_metadata,
     check_allowed,
-    defaults_source,
+    defaults_unknown_text,
     load_metadata_option,
     metadata_facts,
     metadata_for_check,
-    metadata_source,
     metadata_text,
+    ranges_unchecked_text,
     reboot_note,
 )
 from aerokit.apps.cli.terminal import progress_bar
@@ -87,7 +87,6 @@ def _add_writing(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 
 def connected(options: argparse.Namespace, *, changes: bool = False) -> AbstractAsyncContextManager[Vehicle]:
-    """Connect like :func:`aerokit.apps.cli.connecting.connected`, after importing the parameters' module."""
     # Imported before connecting, because the import would block the event loop.
     import aerokit.vehicle.parameters.parameters  # noqa: F401
 
@@ -95,7 +94,6 @@ def connected(options: argparse.Namespace, *, changes: bool = False) -> Abstract
 
 
 async def _list(options: argparse.Namespace) -> int:
-    """Print the parameters whose names match a pattern. A pattern without wildcards matches parts of names."""
     metadata = load_metadata_option(options)
     async with connected(options) as vehicle:
         table = await _download(vehicle, options)
@@ -114,10 +112,10 @@ async def _list(options: argparse.Namespace) -> int:
 
 
 def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle) -> ParameterTable:
-    """Return the parameters that differ from their default, which the vehicle or else the metadata provides.
+    """Return the parameters that differ from their default.
 
-    Raises:
-        ValueUnknownError: no default is known; the text names the options that help.
+    Defaults that the vehicle has not reported are those of the metadata. Raises ValueUnknownError if no default is
+    known.
     """
     if metadata is not None:
         table = table.updated_with(
@@ -128,7 +126,7 @@ def _changed(table: ParameterTable, metadata: Metadata | None, vehicle: Vehicle)
     try:
         return table.changed_from_default()
     except ValueUnknownError:
-        raise ValueUnknownError(defaults_source(vehicle)) from None
+        raise ValueUnknownError(defaults_unknown_text(vehicle)) from None
 
 
 async def _get(options: argparse.Namespace) -> int:
@@ -152,7 +150,6 @@ async def _save(options: argparse.Namespace) -> int:
 
 
 async def _diff(options: argparse.Namespace) -> int:
-    """Print the differences from a file. Return FAILED if there are any."""
     from aerokit.parameters import read_parameter_file
 
     file_values = read_parameter_file(options.file)
@@ -168,7 +165,6 @@ async def _diff(options: argparse.Namespace) -> int:
 
 
 async def _set(options: argparse.Namespace) -> int:
-    """Set parameters, after a check of the values against the metadata, and print the results."""
     values = dict(options.values)
     metadata = load_metadata_option(options)
     if not options.force:
@@ -186,12 +182,11 @@ async def _set(options: argparse.Namespace) -> int:
     code = _emit_results(options, results.values(), known_names, metadata)
     has_changed = any(result.error is None and result.outcome != "unchanged" for result in results.values())
     if has_changed and metadata is None and not (options.force or options.json):
-        print(metadata_source(vehicle))
+        print(ranges_unchecked_text(vehicle))
     return code
 
 
 async def _load(options: argparse.Namespace) -> int:
-    """Set the parameters of a file, and print the results that are not "unchanged" (all results with --json)."""
     from aerokit.parameters import read_parameter_file
 
     file_values = read_parameter_file(options.file)
@@ -217,16 +212,14 @@ async def _load(options: argparse.Namespace) -> int:
     not_set = f", {failed_count} were not set" if failed_count else ""
     print(f"{len(results)} parameters in {options.file}, {len(changed) - failed_count} of them differed{not_set}")
     if len(changed) > failed_count and metadata is None and not options.force:
-        print(metadata_source(vehicle))
+        print(ranges_unchecked_text(vehicle))
     return code
 
 
 def _check_file(file_values: ParameterFile, table: ParameterTable, vehicle: Vehicle) -> None:
-    """Check that all values of a file fit the types of the vehicle's parameters.
+    """Raise InvalidArgument if values of the file do not fit the types of the vehicle's parameters.
 
-    Raises:
-        InvalidArgument: a value does not have the type of its parameter. The text lists these values, and the names
-            that the vehicle does not have, with their lines.
+    The text lists these values, and the names that the vehicle does not have.
     """
     names_are_upper_case = vehicle.autopilot.name == "ArduPilot"
     invalid = []
@@ -260,30 +253,24 @@ async def _read(vehicle: Vehicle, name: str, options: argparse.Namespace) -> Par
 
 
 async def _names_for_hints(vehicle: Vehicle, results: Iterable[ParameterWrite]) -> Collection[str]:
-    """Return the names of the vehicle's parameters if a result needs suggestions, otherwise nothing."""
     is_needed = any(_is_unknown_name(result.error) for result in results)
     return await _known_names(vehicle) if is_needed else ()
 
 
 def _is_unknown_name(error: Exception | None) -> bool:
-    """Return True if the error says that the vehicle has no parameter of this name."""
     if not isinstance(error, ParameterRejected):
         return False
     return error.code == MavParamError.DOES_NOT_EXIST or "has no parameter" in str(error)
 
 
 async def _known_names(vehicle: Vehicle) -> Collection[str]:
-    """Return the names of the vehicle's parameters; no names if reading them takes too long."""
     with anyio.move_on_after(_NAMES_TIMEOUT_S), suppress(AerokitError):
         return await vehicle.parameters.download()
     return ()
 
 
 def _with_hint(name: str, error: Exception, known: Collection[str]) -> str:
-    """Return the text of an error, with a hint if the vehicle does not have the parameter.
-
-    The hint is similar names or, if there are none, the command that lists the names.
-    """
+    """Return the text of an error, with similar names if the vehicle does not have the parameter."""
     text = str(error)
     # A text with "replaced by" or "its name on" already contains the right name.
     if not _is_unknown_name(error) or "replaced by" in text or "its name on" in text:
@@ -309,10 +296,10 @@ def _emit_parameters(options: argparse.Namespace, parameters: Iterable[Parameter
 def _emit_results(
     options: argparse.Namespace, results: Iterable[ParameterWrite], known: Collection[str], metadata: Metadata | None
 ) -> int:
-    """Print a line for each result, and return the exit code. ``known`` are names for suggestions.
+    """Print a line for each result, and return the exit code.
 
-    If an error has an exit code other than FAILED, the first such code is returned, as for ``get``. Otherwise FAILED is
-    returned if there was an error or the vehicle clamped a value, and DONE if not.
+    ``known`` are names for suggestions. The exit code is not DONE if a parameter was not set, or if the vehicle
+    clamped its value.
     """
     code = DONE
     for result in results:
@@ -344,5 +331,4 @@ def _value_or_missing(value: float | None) -> str:
 
 
 def _text(value: float | None) -> str:
-    """Format a value: an integer exactly, and a float with the precision of 32 bits."""
     return str(value) if isinstance(value, int) else f"{value:.9g}"

@@ -28,8 +28,7 @@ _READ_TIMEOUT_S = 10.0
 _PX4_FILE = "FILE is parameters.json, which `make parameters_metadata` writes in PX4's sources"
 
 
-def metadata_source(vehicle: Vehicle) -> str:
-    """Return a note which says that ranges were not checked, and where to get a file for ``--metadata``."""
+def ranges_unchecked_text(vehicle: Vehicle) -> str:
     if vehicle.autopilot.name == "PX4":
         file = _PX4_FILE
     else:
@@ -37,8 +36,7 @@ def metadata_source(vehicle: Vehicle) -> str:
     return f"ranges were not checked: --metadata FILE checks them; {file} (docs/how-to/parameters.md)"
 
 
-def defaults_source(vehicle: Vehicle) -> str:
-    """Return a text that says why the vehicle's defaults are unknown, and what to do instead."""
+def defaults_unknown_text(vehicle: Vehicle) -> str:
     if vehicle.autopilot.name == "PX4":
         return (
             f"PX4 does not report the defaults of its parameters: --metadata FILE has them; {_PX4_FILE}. To"
@@ -51,7 +49,7 @@ def defaults_source(vehicle: Vehicle) -> str:
 
 
 def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> None:
-    """Add ``--metadata``; with ``checks`` also ``--force``, for commands that set parameters."""
+    """Add ``--metadata`` to a command. With ``checks``, also add ``--force``."""
     command.add_argument(
         "--metadata",
         metavar="FILE",
@@ -63,7 +61,6 @@ def add_metadata(command: argparse.ArgumentParser, *, checks: bool = False) -> N
 
 
 def load_metadata_option(options: argparse.Namespace) -> Metadata | None:
-    """Read the file that ``--metadata`` names; None without the option."""
     if options.metadata is None:
         return None
     from aerokit.parameters import load_metadata
@@ -74,9 +71,9 @@ def load_metadata_option(options: argparse.Namespace) -> Metadata | None:
 async def metadata_for_check(
     vehicle: Vehicle, from_file: Metadata | None, options: argparse.Namespace
 ) -> Metadata | None:
-    """Return the metadata to check values with, from the file or else from the vehicle.
+    """Return the metadata of the file or else of the vehicle.
 
-    Return None with ``--force``, or if there is no metadata.
+    The result is None with ``--force``, or if there is no metadata.
     """
     if options.force:
         return None
@@ -86,7 +83,6 @@ async def metadata_for_check(
 
 
 async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
-    """Return the vehicle's metadata. Return None if it provides none or, with a message on stderr, if reading fails."""
     from aerokit.parameters.metadata import parse_metadata
 
     problem = f"time-out after {_READ_TIMEOUT_S:g} s"  # unless reading fails before the time-out
@@ -107,12 +103,10 @@ async def _read_from_vehicle(vehicle: Vehicle) -> Metadata | None:
 
 
 def check_allowed(metadata: Metadata | None, values: Mapping[str, float]) -> None:
-    """Raise InvalidArgument if the metadata does not allow some of the values; the text lists those values."""
     check_values(metadata, values, "--force")
 
 
 def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
-    """Return a note if a new value may take effect only after a reboot; "" for other and unknown parameters."""
     if name.upper() in _SYSTEM_ID_NAMES:
         return f"the system id changes at the next reboot at the latest; then connect with --system-id {value:g}"
     if metadata is None:
@@ -122,7 +116,6 @@ def reboot_note(metadata: Metadata | None, name: str, value: float) -> str:
 
 
 def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str, object]:
-    """Return the unit, range and meaning of a parameter as fields for its record. Unknown fields are None."""
     # The parameter's other names are not tried, because their metadata may have another unit.
     entry = None if metadata is None else metadata.get(parameter.name)
     if entry is None:
@@ -133,7 +126,6 @@ def metadata_facts(metadata: Metadata | None, parameter: Parameter) -> dict[str,
 
 
 def metadata_text(facts: Mapping[str, Any]) -> str:
-    """Return the unit, range and meaning of a parameter in a few words; empty if unknown."""
     low, high = facts["minimum"], facts["maximum"]
     has_range = low is not None or high is not None
     parts = (facts["unit"], facts["meaning"], f"range {_bound(low)} to {_bound(high)}" if has_range else "")

@@ -74,7 +74,6 @@ async def _run(options: argparse.Namespace) -> int:
 
 
 async def _serve_vehicles(uvicorn: Any, serve: Any, options: argparse.Namespace, metadata: Metadata | None) -> int:
-    """Serve the vehicles of a connection until Ctrl-C. Return the exit code."""
     async with _connection(options) as connection:
         if options.record is not None:
             connection.record(options.record)
@@ -94,7 +93,6 @@ async def _serve_vehicles(uvicorn: Any, serve: Any, options: argparse.Namespace,
 
 @asynccontextmanager
 async def _connection(options: argparse.Namespace) -> AsyncIterator[Connection]:
-    """Open the connection to the vehicles or, with ``--sim``, to simulated vehicles."""
     from aerokit.connection.opening import open_connection
 
     async with AsyncExitStack() as stack:
@@ -126,7 +124,6 @@ def _is_loopback(host: str) -> bool:
 
 
 def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
-    """Return the uvicorn configuration, with limits for anonymous connections and for WebSocket messages."""
     guard = import_extra("aerokit.apps.serve.guard", "serve")
     return uvicorn.Config(
         app,
@@ -147,7 +144,6 @@ def config_of(uvicorn: Any, app: ServeApp, host: str, port: int) -> Any:
 
 
 async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> int:
-    """Run uvicorn until Ctrl-C. Return the exit code."""
     server = _server_class(uvicorn)(config_of(uvicorn, app, options.host, options.port))
     server.on_started = lambda port: _emit_serving(options, app, port)
 
@@ -169,7 +165,7 @@ async def _serve(uvicorn: Any, app: ServeApp, options: argparse.Namespace) -> in
 
 
 def _server_class(uvicorn: Any) -> Any:
-    """Return a subclass of uvicorn's server that leaves signals alone, and calls ``on_started`` with its port."""
+    """Return a uvicorn server that leaves signals alone, and calls ``on_started`` with its port."""
 
     class Server(uvicorn.Server):  # type: ignore[misc]
         @contextmanager
@@ -186,7 +182,6 @@ def _server_class(uvicorn: Any) -> Any:
 
 
 def _emit_serving(options: argparse.Namespace, app: ServeApp, port: int) -> None:
-    """Print the address of the page, with the token if the page needs it."""
     # A browser cannot open an address that stands for all interfaces.
     host = {"0.0.0.0": _LOOPBACK, "::": "::1"}.get(str(options.host), str(options.host))
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/"

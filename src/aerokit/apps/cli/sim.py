@@ -34,8 +34,8 @@ from aerokit.sim import (
     SimulatedVehicle,
     SimulatorServer,
 )
-from aerokit.sim.kinds import scale_timeouts
-from aerokit.sim.motion import HOME
+from aerokit.sim.kinds import kind_class, scale_timeouts, simulated
+from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
 from aerokit.transport import create_link
 from aerokit.transport.address import parse_address
 
@@ -60,16 +60,11 @@ _SERIAL_LINE_PLACEHOLDER = "the other end of the serial line"
 
 
 def simulated_vehicle(name: str, **options: Any) -> SimulatedVehicle:
-    """Create a vehicle of a kind of `aerokit.sim.kinds`. ``options`` are arguments of its class.
+    """Create a vehicle of a kind of `aerokit.sim.kinds`.
 
-    Kinds that do not have the option ``boot_text`` ignore it.
-
-    Raises:
-        InvalidArgument: there is no such kind, the kind does not have one of the other options, or the option
-            ``parameters`` contains a parameter that the kind does not have.
+    Kinds without the option ``boot_text`` ignore it. Raises InvalidArgument if the kind, another option or a parameter
+    is unknown.
     """
-    from aerokit.sim.kinds import kind_class, simulated
-
     accepted = _accepted_options(kind_class(name))
     if "boot_text" not in accepted:
         options.pop("boot_text", None)
@@ -92,12 +87,9 @@ def simulated_fleet(
 ) -> list[SimulatedVehicle]:
     """Create ``count`` vehicles with consecutive system ids and seeds, in a row eastwards from ``home``.
 
-    The default home is `aerokit.sim.HOME`. ``components`` makes the components of one vehicle. ``name`` is the kind of
-    vehicle, or the path of a .tlog file. A recording has one vehicle: ``count`` must be 1, and the other arguments are
-    ignored.
+    ``components`` makes the components of one vehicle. ``name`` is the kind of vehicle or the path of a recording. A
+    recording needs a ``count`` of 1, and ignores the other arguments.
     """
-    from aerokit.sim.motion import HOME, GlobalPoint, LocalFrame
-
     if name.endswith(".tlog"):
         return [_recorded(name, count)]
     last_id = system_id + count - 1
@@ -130,7 +122,7 @@ def _recorded(path: str, count: int) -> SimulatedVehicle:
 
 
 def _accepted_options(vehicle_class: type) -> set[str]:
-    """Return the names of a class's constructor arguments, including those passed to base classes by ``**kwargs``."""
+    """Return the names of a class's constructor arguments, also of those that it passes to base classes."""
     names: set[str] = set()
     for cls in vehicle_class.__mro__:
         if "__init__" not in vars(cls):
@@ -237,7 +229,6 @@ def _devices(options: argparse.Namespace) -> list[AttachableComponent]:
 
 
 async def run_sim(options: argparse.Namespace) -> int:
-    """Serve the vehicles until Ctrl-C or for ``--duration``."""
     vehicles = _fleet(options)
     scale_timeouts(vehicles, options.speedup, leave=dict(options.parameters))
     tracks = _tracks(vehicles, options.picture)
@@ -261,7 +252,6 @@ async def run_sim(options: argparse.Namespace) -> int:
 
 @asynccontextmanager
 async def injecting_faults(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> AsyncIterator[None]:
-    """Within the block, each fault of ``--fault`` begins at its time."""
     injecting = asyncio.create_task(_inject(vehicles, options))
     try:
         yield
@@ -270,7 +260,6 @@ async def injecting_faults(vehicles: Sequence[SimulatedVehicle], options: argpar
 
 
 async def _inject(vehicles: Sequence[SimulatedVehicle], options: argparse.Namespace) -> None:
-    """Begin the faults of ``--fault`` at their times."""
     loop = asyncio.get_running_loop()
     started_at = loop.time()
     for name, value, at_s in sorted(options.faults, key=_begin_of):
@@ -319,10 +308,10 @@ def _tracks(vehicles: Sequence[SimulatedVehicle], picture: str | None) -> list[T
 
 
 def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], speedup: float) -> SimulatorServer:
-    """Create the server. An address template becomes one link for each vehicle, any other address one link for all."""
     links = []
     vehicles_on = []
     for address in addresses:
+        # An address template becomes one link for each vehicle, any other address one link for all.
         groups = [[vehicle] for vehicle in vehicles] if is_address_template(address) else [list(vehicles)]
         for index, group in enumerate(groups):
             links.append(create_link(expand_address(address, index, group[0].system_id)))
@@ -331,7 +320,6 @@ def _server(vehicles: Sequence[SimulatedVehicle], addresses: Sequence[str], spee
 
 
 def _emit_addresses(server: SimulatorServer, options: argparse.Namespace) -> None:
-    """Print the addresses of the vehicles, and commands to try."""
     for address, vehicles in zip(server.addresses, server.vehicles_on, strict=True):
         record = {
             "system_ids": [vehicle.system_id for vehicle in vehicles],
@@ -362,10 +350,10 @@ def _systems(vehicles: Sequence[SimulatedVehicle]) -> str:
 
 
 def _client_address(address: str, argument: str) -> str:
-    """Return the address with which a client on this machine connects; for a serial line, a placeholder.
+    """Return the address with which a client on this machine connects to a simulator.
 
-    ``address`` is the address of the open link. ``argument`` is the address in the command line, with its placeholders
-    filled in.
+    ``address`` is the address of the open link, and ``argument`` that of the command line. A serial line has no such
+    address, so the result is a placeholder.
     """
     scheme, _, location = address.partition(":")
     if scheme == "zenohin":
@@ -378,7 +366,7 @@ def _client_address(address: str, argument: str) -> str:
 
 
 def _zenoh_options(address: str) -> str:
-    """Return the query part of the zenoh address with which a client connects to the simulator."""
+    """Return the query part of a client's zenoh address."""
     parsed = parse_address(address)
     endpoints = parsed.option("listen") or parsed.option("connect")
     config = parsed.option("config")

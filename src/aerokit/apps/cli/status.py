@@ -45,7 +45,6 @@ _MESSAGE_TIMEOUT_S = 0.3
 
 
 def _vehicle_record(vehicle: Vehicle, checks: Readiness) -> dict[str, Any]:
-    """Return the state of a vehicle as fields of a JSON record."""
     version = vehicle.version.latest
     return {
         **overview(vehicle),
@@ -61,7 +60,6 @@ def _vehicle_record(vehicle: Vehicle, checks: Readiness) -> dict[str, Any]:
 
 
 def _vehicle_lines(vehicle: Vehicle, checks: Readiness) -> list[str]:
-    """Return the state of a vehicle as lines of text."""
     version = vehicle.version.latest
     heartbeat = vehicle.connection.heartbeats.get((vehicle.system_id, vehicle.component_id))
     frame = _frame_fields(heartbeat)
@@ -109,7 +107,6 @@ def _component_record_and_text(heartbeat: Heartbeat, system_id: int, component_i
 
 
 def _link_line(record: Mapping[str, Any]) -> str:
-    """Return the numbers of a record of type "link" as one line of text."""
     total = record["frames"] + record["frames_lost"]
     is_recording = record["address"].startswith("replay:")
     parts = [
@@ -178,7 +175,6 @@ def _battery(battery: Battery) -> str:
 
 
 def _aligned(label: str, texts: Sequence[str]) -> list[str]:
-    """Return one line for each text. The label is before the first text, and spaces are before the others."""
     return [f"  {label if index == 0 else '':8} {text}" for index, text in enumerate(texts)]
 
 
@@ -211,7 +207,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 async def run_status(options: argparse.Namespace) -> int:
-    """Listen, request missing data, and print the status of all systems. Return 1 if a disarmed vehicle cannot arm."""
     from aerokit.vehicle.connect import vehicles_on
 
     async with opened(options) as connection, vehicles_on(connection, rates={}) as vehicles:
@@ -238,7 +233,7 @@ async def run_status(options: argparse.Namespace) -> int:
 
 
 async def _readiness_of(vehicle: Vehicle) -> Readiness:
-    """Request the states that the vehicle does not stream, then return what it lacks for arming and for flight."""
+    """Return what a vehicle lacks for arming and for flight, after requesting missing states."""
     # `why_not_armable` requests the estimator's messages, which depend on the firmware, from disarmed vehicles only.
     needed = vehicle.telemetry.required_messages("estimator") if vehicle.is_armed else ()
     estimator_messages = [("estimator", message) for message in needed]
@@ -264,7 +259,6 @@ async def _request(vehicle: Vehicle, message: Any, cell: Any) -> None:
 
 
 def _emit_link(connection: Connection, options: argparse.Namespace, seconds: float) -> None:
-    """Print what was received from all senders together. ``seconds`` is the time since the link was opened."""
     statistics = list(connection.statistics())
     record = {
         "address": connection.link.address,
@@ -280,7 +274,6 @@ def _emit_link(connection: Connection, options: argparse.Namespace, seconds: flo
 
 
 def _emit_components(connection: Connection, options: argparse.Namespace, vehicles: dict[int, Vehicle]) -> None:
-    """Print the other components of the vehicles, and the ground stations."""
     for source, heartbeat in sorted(connection.heartbeats.items()):
         system_id, component_id = source
         if system_id in vehicles and vehicles[system_id].component_id == component_id:

@@ -84,9 +84,9 @@ class SupervisedFlight(ABC):
         self._has_left_mode = False  # True once the armed vehicle was in a mode other than those it was armed in
 
     async def fly(self) -> int:
-        """Perform the flight and return the exit code.
+        """Perform the flight, and return the exit code.
 
-        Once an arm command was sent, an error is raised only after `_after_failure`. Ctrl-C runs `_after_interrupt`.
+        After an error or Ctrl-C, the vehicle is made safe. Errors are then raised again.
         """
         try:
             code = await self._interrupts.run(self._fly)
@@ -109,12 +109,11 @@ class SupervisedFlight(ABC):
         return code
 
     @abstractmethod
-    async def _fly(self) -> int:
-        """Perform the flight, and return the exit code."""
+    async def _fly(self) -> int: ...
 
     @abstractmethod
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        """Return purposes, such as "mission". In their flight modes, this program has control of the vehicle."""
+        """Return purposes, such as "mission". In their flight modes, this program has control."""
 
     def _check_disarmed(self) -> None:
         now = self._vehicle.describe_now()
@@ -124,8 +123,8 @@ class SupervisedFlight(ABC):
             raise OperationRejected(f"the vehicle was armed by another party ({now}); nothing was started")
 
     async def _arm(self) -> None:
-        """Arm the vehicle, and record this before the command is sent, because its result may remain unknown."""
         self._check_disarmed()
+        # Recorded before the command is sent, because the result of the command may remain unknown.
         self.has_sent_arm_command = True
         self._may_arm_late = True
         self._modes_armed_in.add(self._vehicle.mode_name)  # `arm` may change the mode, so both modes are recorded
@@ -147,7 +146,10 @@ class SupervisedFlight(ABC):
                 await self._vehicle.armed.wait_until(lambda armed: not armed, timeout=_AUTO_DISARM_TIMEOUT_S)
 
     async def _make_safe(self, action: Callable[[], Awaitable[int]]) -> None:
-        """Run an action that makes the vehicle safe. Another Ctrl-C or an error ends it without further commands."""
+        """Run an action that makes the vehicle safe.
+
+        An error or another Ctrl-C ends it. No further commands are sent then.
+        """
         try:
             if await self._interrupts.run(action) is None:
                 self._print(f"interrupted again; no further commands: vehicle {self._vehicle.describe_now()}")
@@ -157,24 +159,21 @@ class SupervisedFlight(ABC):
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}{advice}")
 
     async def _after_failure(self, error: Exception) -> int:  # subclasses use the error
-        """Make the vehicle safe after an error, which `fly` then raises again. `fly` ignores the exit code.
-
-        If the vehicle is disarmed, wait for a late arming. If it is armed on the ground and this program has control,
-        disarm it. Otherwise send nothing: in the air, the pilot or a failsafe decides.
-        """
+        """Make the vehicle safe after an error. `fly` ignores the exit code."""
         vehicle = self._vehicle
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
         elif self._is_armed_on_ground and self._is_in_our_mode:
             await self._disarm()
         else:
+            # In the air, the pilot or a failsafe decides.
             self._print(f"no command is sent: vehicle {vehicle.describe_now()}")
         return DONE
 
     async def _after_interrupt(self) -> int:
         """Disarm a vehicle on the ground. In the air, perform the action of ``--on-interrupt``.
 
-        No command is sent if that action is "nothing", or if this program no longer has control.
+        No command is sent if this program no longer has control.
         """
         vehicle = self._vehicle
         action = self._on_interrupt
@@ -215,8 +214,7 @@ class SupervisedFlight(ABC):
     async def _watch_late_arming(self) -> None:
         """Stay connected while an arm command may still take effect.
 
-        If the vehicle arms, `Vehicle.arm` disarms it again in the background. This method waits until it is disarmed,
-        at most 30 s, and prints the vehicle's state.
+        If the vehicle arms, wait up to 30 s until it is disarmed again.
         """
         if not self._may_arm_late:
             return
@@ -226,6 +224,7 @@ class SupervisedFlight(ABC):
         )
         armed = self._vehicle.armed
         with suppress(OperationTimeout):
+            # If the vehicle arms, `Vehicle.arm` disarms it again in the background.
             await armed.wait_until(bool, timeout=ARM_WATCH_S)
             await armed.wait_until(lambda is_armed: not is_armed, timeout=_AUTO_DISARM_TIMEOUT_S)
         self._print(self._vehicle.describe_now())
@@ -285,7 +284,6 @@ class FlightReport:
         """True if status lines are printed when there is no other output. Set it to False during questions."""
 
     def print_line(self, text: str) -> None:
-        """Print time, altitude and ``text``. `_emit` catches the errors of a closed pipe, so the flight continues."""
         here = self._vehicle.position
         position = None if max(self._vehicle.heartbeat_age, here.age) > SILENT_AFTER_S else here.latest
         altitude = None if position is None else position.altitude_relative_m
@@ -297,7 +295,6 @@ class FlightReport:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Within the block, print the vehicle's status texts, mode changes and status lines."""
         detachments = [
             self._vehicle.position.observe(self._on_position),
             self._vehicle.armed.observe(self._on_armed),
@@ -318,14 +315,12 @@ class FlightReport:
                 await asyncio.wait(tasks)  # asyncio itself logs the error of a task that has failed
 
     def record_impact(self) -> None:
-        """Record an impact on the ground for the summary: the seconds for which the vehicle had been armed by then."""
         if self._impact_s is None and self._armed_at is not None:
             # The impact is detected only later, because the vehicle must first lie still for some time.
             impact_at = self._vehicle.connection.now() if self._fast_sink_at is None else self._fast_sink_at
             self._impact_s = self._armed_s + impact_at - self._armed_at
 
     def print_summary(self, recorded_in: str | None = None) -> None:
-        """Print the statistics of the flight, the link and the batteries."""
         vehicle = self._vehicle
         received, lost = vehicle.connection.counts(vehicle.system_id)
         # The clock of a vehicle reveals a simulation that this program has not started itself.
@@ -374,9 +369,9 @@ class FlightReport:
         self._emit("flight_summary", record, "\n".join(lines), waits=True)  # the flight is over, so this may block
 
     def _describe_armed(self, speed: float) -> str:
-        """Return "armed for 47 s", followed in brackets by the time until an impact and the speed of a simulation.
+        """Return "armed for 47 s", with notes on an impact and on the speed of a simulation.
 
-        ``speed`` is the vehicle's seconds per real second: `speedup`, or as measured if another program simulates.
+        ``speed`` is the vehicle's seconds per real second.
         """
         notes = []
         if self._impact_s is not None:
@@ -412,13 +407,13 @@ class FlightReport:
                     self.print_line(f"  {'! ' if is_warning else ''}{event.text}")
 
     def _is_about_mode(self, text: str) -> bool:
-        """Return True for a text like "Arm: AUTO mode not armable". `Vehicle.arm` then changes the mode by itself."""
+        """Return True for a text like "Arm: AUTO mode not armable"."""
+        # `Vehicle.arm` changes such a mode by itself.
         autopilot = self._vehicle.autopilot
         mode = self._vehicle.mode_name
         return mode in autopilot.armable_by_option and autopilot.arming_reason(text) == f"{mode} mode not armable"
 
     async def _print_status(self) -> None:
-        """Print a status line whenever nothing else was printed for some seconds."""
         vehicle = self._vehicle
         while vehicle.connection.is_open:
             await anyio.sleep(_STATUS_INTERVAL_S / 5)
@@ -448,13 +443,10 @@ class FlightReport:
             self._fast_sink_at = self._vehicle.velocity.updated_at
 
     def _on_position(self, _: Position | None, position: Position) -> None:
-        """While the vehicle is armed, update the flown distance, the greatest height and the greatest speed.
-
-        The distance is measured between positions at least a metre apart, as in reports.
-        """
         if not self._vehicle.is_armed:
             self._previous_position = None
             return
+        # As in reports, the distance is measured between positions at least a metre apart.
         step_m = 0.0 if self._previous_position is None else position.distance_to(self._previous_position)
         if self._previous_position is None or step_m >= _MIN_STEP_M:
             self._flown_m += step_m

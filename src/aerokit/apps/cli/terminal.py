@@ -27,12 +27,11 @@ CLEAR_LINE = "\r\x1b[K"
 
 
 def is_interactive() -> bool:
-    """Return True if stdin is a terminal."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
 async def confirm(question: str) -> bool:
-    """Ask a yes/no question. Return True for "y" or "yes", and False for other input or at the end of the input."""
+    """Ask a yes/no question. At the end of the input, the answer is no."""
     _discard_typed_input()
     print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
     try:
@@ -51,7 +50,7 @@ async def press_enter() -> bool:
 
 
 def _discard_typed_input() -> None:
-    """Discard input that was typed earlier, because it cannot be the answer to a question that is asked only now."""
+    """Discard earlier input, because it cannot answer a question that is asked only now."""
     try:
         import termios
     except ImportError:  # on Windows
@@ -61,7 +60,7 @@ def _discard_typed_input() -> None:
 
 
 async def _read_line() -> str:
-    """Read a line from stdin while the event loop runs; return an empty string at the end of the input."""
+    """Read a line from stdin without blocking the loop. At the end of the input, it is empty."""
     loop = asyncio.get_running_loop()
     line: asyncio.Future[str] = loop.create_future()
 
@@ -100,10 +99,7 @@ def on_interrupt(
 ) -> Iterator[None]:
     """Within the block, SIGINT, SIGTERM and SIGHUP only call ``callback`` on the running loop.
 
-    The signal handler itself first calls ``at_once(number)``, so this call is made even while the loop is blocked.
-
-    When a terminal or an SSH session ends, both the shell and the kernel send a SIGHUP, a moment apart. The second one
-    is ignored. As a second signal, like a second Ctrl-C, it would cancel the action that makes the vehicle safe.
+    The signal handler itself calls ``at_once(number)``, even while the loop is blocked.
     """
     loop = asyncio.get_running_loop()
     signals = _signals()
@@ -112,6 +108,9 @@ def on_interrupt(
 
     def handle(number: int, _: object) -> None:
         nonlocal has_hung_up
+        # When a terminal or an SSH session ends, both the shell and the kernel send a SIGHUP, a moment apart. The
+        # second one is ignored. As a second signal, like a second Ctrl-C, it would cancel the action that makes the
+        # vehicle safe.
         if number not in (signal.SIGINT, signal.SIGTERM):
             if has_hung_up:
                 return
@@ -139,7 +138,6 @@ class InterruptStack:
         self._scopes: list[anyio.CancelScope] = []
 
     def interrupt(self) -> None:
-        """Cancel the innermost running function."""
         if self._scopes:
             self._scopes[-1].cancel()
 
@@ -159,7 +157,10 @@ class InterruptStack:
 async def waiting(
     options: argparse.Namespace, address: str, seconds: float, what: str = "a heartbeat"
 ) -> AsyncIterator[None]:
-    """Show a countdown of ``seconds`` on stderr within the block, but only on a terminal and without ``--json``."""
+    """Show a countdown on stderr within the block.
+
+    Nothing is shown with ``--json`` or without a terminal.
+    """
     if options.json or not sys.stderr.isatty():
         yield
         return
@@ -191,7 +192,7 @@ class _Bar(tqdm):  # type: ignore[misc]  # tqdm has no annotations
 def progress_bar(what: str, unit: str | None) -> Iterator[OnProgress]:
     """Show a progress bar within the block, and yield the ``on_progress`` callback.
 
-    ``unit`` is ``"B"`` for bytes, the singular noun for an item, or None to show a percentage only.
+    ``unit`` is ``"B"`` for bytes or a singular noun. With None, the bar shows only a percentage.
     """
     is_bytes = unit == "B"
     with _Bar(

@@ -134,14 +134,12 @@ class Panel(Widget):
         self._height = 0
 
     def show(self, content: Text | Table) -> None:
-        """Replace the content."""
         height = content.plain.count("\n") if isinstance(content, Text) else content.row_count
         self._content = content
         self.refresh(layout=height != self._height)
         self._height = height
 
     def render(self) -> Text | Table:
-        """Return the content."""
         return self._content
 
 
@@ -242,7 +240,7 @@ class Monitor(App[None]):
                 self._commands.start(partial(run_arming_checks, vehicle))
 
     def _has_changed(self, name: str, content: object) -> bool:
-        """Return True if the content differs from that of the last call. Drawing only then saves CPU time."""
+        # Drawing only what has changed saves CPU time.
         if self._shown.get(name) == content:
             return False
         self._shown[name] = content
@@ -291,7 +289,6 @@ class Monitor(App[None]):
             add_line(f"{command}: {done}", "bold green")
 
     def _update_list(self, options: OptionList) -> None:
-        """Add new vehicles to the list, select the first one if none is selected, and redraw changed rows."""
         vehicles = self._model.vehicles
         for system_id in vehicles:
             if system_id not in self._listed_ids:
@@ -301,7 +298,7 @@ class Monitor(App[None]):
             options.highlighted = 0
         for index, system_id in enumerate(self._listed_ids):
             is_selected = index == options.highlighted
-            row = VehicleText(vehicles[system_id]).row(is_selected=is_selected, more=self._is_wide)
+            row = VehicleText(vehicles[system_id]).list_row(is_selected=is_selected, more=self._is_wide)
             if self._has_changed(f"row {index}", row):
                 options.replace_option_prompt_at_index(index, row)
 
@@ -313,7 +310,6 @@ class Monitor(App[None]):
         return text.append(f"  {count} vehicle{'s' if count != 1 else ''}")
 
     def _state_content(self) -> list[tuple[str, Text]] | Text:
-        """Return the rows of the table of the selected vehicle, or a text while there is no vehicle."""
         vehicle = self.selected
         if vehicle is not None:
             return VehicleText(vehicle).rows(more=self._is_wide, size=self._state_size())
@@ -328,7 +324,6 @@ class Monitor(App[None]):
         return size.width, size.height
 
     def _show_map(self, widget: Panel) -> None:
-        """Draw the map again if its size, a marker or a track has changed."""
         model = self._model
         size = widget.content_size
         homes = []
@@ -381,7 +376,7 @@ class Monitor(App[None]):
 
 
 def _rate_text(hz: float) -> str:
-    """Format a rate in Hz. Spaces replace missing decimals, so that the decimal points are aligned."""
+    # Spaces replace missing decimals, so that the decimal points are aligned.
     return f"{number(hz, 0)}  " if hz >= 3 else number(hz, 1)
 
 

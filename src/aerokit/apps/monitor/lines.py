@@ -39,7 +39,10 @@ _LABEL_PADDING = 2
 
 
 def number(value: float | None, digits: int = 1, unit: str = "", sign: str = "-") -> str:
-    """Format a number. ``sign`` is as in Python's format specification; a number that rounds to 0 has no sign."""
+    """Format a number, or None as unknown.
+
+    ``sign`` is as in Python's format specification. A number that rounds to 0 has no sign.
+    """
     if value is None:
         return UNKNOWN
     rounded = round(value, digits) + 0.0  # converts -0.0 to 0.0
@@ -71,9 +74,10 @@ class VehicleText:
         return Text(text, "dim" if self._silent_s else style)
 
     def rows(self, *, more: bool = False, size: tuple[int, int] = (0, 0)) -> list[tuple[str, Text]]:
-        """Return the lines of the state panel as labels and values. With ``more``, less important values are included.
+        """Return the lines of the state panel as labels and values.
 
-        ``size`` is the number of columns and lines of the panel. Free lines list further reasons that prevent a flight.
+        With ``more``, less important values are included. ``size`` is the number of columns and lines of the panel.
+        Free lines show more reasons that prevent a flight.
         """
         rows = self._main_rows() + (self._more_rows() if more else [])
         if not self._silent_s:
@@ -86,7 +90,6 @@ class VehicleText:
         return rows
 
     def _main_rows(self) -> list[tuple[str, Text]]:
-        """Return the labels and values of the rows that are always shown. For a silent vehicle, "link" is second."""
         vehicle = self._vehicle
         cell = self.cell
         second_row = ("link", self.silence()) if self._silent_s else ("missing", self._missing())
@@ -117,8 +120,7 @@ class VehicleText:
             ("version", cell_of_constant(vehicle.version)),
         ]
 
-    def row(self, *, is_selected: bool, more: bool) -> Text:
-        """Return this vehicle's line in the list of vehicles."""
+    def list_row(self, *, is_selected: bool, more: bool) -> Text:
         vehicle = self._vehicle
         cell = self.cell
         text = Text("▸" if is_selected else " ", no_wrap=True, overflow="ellipsis")
@@ -145,7 +147,7 @@ class VehicleText:
         return text.append_text(self.silence(is_short=True))
 
     def silence(self, *, is_short: bool = False) -> Text:
-        """Return the state of the link and how long the vehicle has been silent; empty if it is not silent."""
+        """Say how long the vehicle has been silent; empty if it is not silent."""
         if self._link_state is None or not self._silent_s:
             return Text()
         note = "" if is_short else "; values are from before"
@@ -182,19 +184,13 @@ class VehicleText:
         return text.append_text(self.cell(quality, lambda report: _milliseconds(report.round_trip_s)))
 
     def all_missing(self) -> str:
-        """Return one line for each reason that prevents a flight, or "Nothing is missing.".
-
-        For a silent vehicle, a line about the silence comes first.
-        """
+        """Return one line for each reason that prevents a flight, or "Nothing is missing."."""
         reasons = "\n".join(map(printable, self._reasons())) or "Nothing is missing."
         silence = self.silence().plain
         return f"{silence}\n{reasons}" if silence else reasons
 
     def _reasons(self) -> list[str]:
-        """Return the reasons that prevent a flight: those against arming, then the others.
-
-        While the vehicle is disarmed, each group has a prefix. While it is armed, an active failsafe comes first.
-        """
+        """Return the reasons that prevent a flight, first those that prevent arming."""
         checks = readiness(self._vehicle)
         if self._vehicle.armed.latest:
             failsafe = [f"failsafe: {text}" for text in self._failsafe or ()]
@@ -204,9 +200,9 @@ class VehicleText:
         return against_arming + _with_prefix(flight_prefix, checks.against_flight)
 
     def _missing(self, max_lines: int = 1, width: int = 0) -> Text:
-        """Return the first reason that prevents a flight, and the following ones that fit into ``max_lines`` lines.
+        """Return the first reason that prevents a flight, and the next ones that fit into ``max_lines`` lines.
 
-        ``width`` is the number of columns of a line. It has no effect if ``max_lines`` is 1: one reason is returned.
+        ``width`` is the number of columns of a line.
         """
         missing = self._reasons()
         if not missing:
@@ -221,12 +217,11 @@ class VehicleText:
 
 
 def _with_prefix(prefix: str, reasons: Sequence[str]) -> list[str]:
-    """Return the reasons, the first of them with a prefix."""
     return [f"{prefix}: {reason}" if index == 0 else reason for index, reason in enumerate(reasons)]
 
 
 def _with_count(reasons: Sequence[str], shown: int) -> list[str]:
-    """Return the first reasons. The last one says how many more there are."""
+    """Return the first ``shown`` reasons. The last one says how many more there are."""
     more = len(reasons) - shown
     texts = [printable(reason) for reason in reasons[:shown]]
     return [*texts[:-1], f"{texts[-1]} (and {more} more)"] if more else texts
@@ -316,7 +311,6 @@ class Canvas:
         self._marks: dict[tuple[int, int], tuple[str, str]] = {}
 
     def line(self, points: Sequence[tuple[float, float]], style: str) -> None:
-        """Draw a line through the points."""
         dots = [self._dot_at(point) for point in points]
         ends = dots[1:] or dots  # a single point is a line to itself
         for (x, y), (end_x, end_y) in zip(dots, ends, strict=False):
@@ -329,13 +323,12 @@ class Canvas:
                 self._styles[cell] = style
 
     def mark(self, point: tuple[float, float], text: str, style: str) -> None:
-        """Write characters at a point. They replace dots and earlier marks."""
         dot_x, dot_y = self._dot_at(point)
         for offset, character in enumerate(text):
             self._marks[dot_y // 4, dot_x // 2 + offset] = character, style
 
     def _scale(self) -> str:
-        """Return the scale bar. Its length is 1, 2 or 5 times a power of ten metres, and at most a third of the map."""
+        """Return a scale bar of 1, 2 or 5 times a power of ten metres."""
         column_m = 2 * self._metres_per_dot
         max_m = max(self._columns / 3, 3) * column_m
         power = 10.0 ** math.floor(math.log10(max_m))

@@ -69,7 +69,6 @@ class MonitorModel:
             detach()
 
     def update(self) -> None:
-        """Store samples of the vehicles' positions and, once a second, of the message counts."""
         now = self.connection.now()
         if now - self._count_samples[-1].at >= 1.0:
             self._count_samples.append(_CountSample(now, self._counts.copy()))
@@ -85,7 +84,7 @@ class MonitorModel:
                     track.append(point)
 
     def rates(self, system_id: int) -> list[tuple[str, float]]:
-        """Return names and rates in Hz of a system's messages in the last five seconds, in any order."""
+        """Return the names of a system's messages, and their rates in Hz in the last five seconds."""
         first = self._count_samples[0]
         last = self._count_samples[-1]
         duration_s = last.at - first.at
@@ -102,13 +101,13 @@ class MonitorModel:
         return rates
 
     def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-        """Convert a position to metres north and east of ``reference``. The first position becomes the reference."""
+        """Convert a position to metres north and east of the first position."""
         if self.reference is None:
             self.reference = latitude_deg, longitude_deg
         return geo.north_east_m(*self.reference, latitude_deg, longitude_deg)
 
     def add_line(self, system_id: int, text: str, style: str = "") -> None:
-        """Add a line that begins with the current time."""
+        """Add a line that begins with the current time. System id 0 stands for the link."""
         line = Text(f"{self._time()} ", "dim")
         line.append(f"{system_id} " if system_id else "link ", "bold")
         line.append(printable(text).replace("\n", " "), style)

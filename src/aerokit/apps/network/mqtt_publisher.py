@@ -60,10 +60,10 @@ class BrokerAddress(Snapshot):
 
 
 def parse_broker(text: str, *schemes: str) -> BrokerAddress:
-    """Parse an address with one of these schemes, by default ``mqtt`` or ``mqtts``.
+    """Parse the address of a broker.
 
-    Raises:
-        InvalidArgument: the address is invalid. The text omits the address if it may contain a password.
+    The allowed schemes are by default ``mqtt`` and ``mqtts``. Raises InvalidArgument if the address is invalid. Its
+    text never shows a password.
     """
     allowed = schemes or tuple(PORTS)
     scheme = text.partition("://")[0].strip().lower() if "://" in text else "…"
@@ -120,7 +120,10 @@ class MqttLink(BaseLink):
         self._alive_topic = broker.key_space.root + "/alive"
 
     def write(self, data: bytes, peer: Peer = None) -> None:
-        """Send a value, or buffer it until the broker accepts data. A closed link or a full buffer drops it."""
+        """Send a value, or buffer it until the broker accepts data.
+
+        A value is dropped if the link is closed or the buffer is full.
+        """
         name = str(peer)
         if self._receiver is None or (name not in self._unsent and len(self._unsent) >= MAX_WAITING):
             self._drop(1)
@@ -136,7 +139,6 @@ class MqttLink(BaseLink):
         return link_open_error(self.address, error, hint)
 
     async def _connect(self) -> None:
-        """Open the socket in a thread, then wait until the broker accepts or refuses the connection."""
         mqtt = import_optional(self.address, "paho.mqtt.client", "paho-mqtt", "mqtt")
         broker = self._broker
         loop = asyncio.get_running_loop()
@@ -179,7 +181,6 @@ class MqttLink(BaseLink):
         client.publish(self._alive_topic, b"online", retain=True)
 
     def _send_unsent(self) -> None:
-        """Publish the buffered values while the socket accepts data; publish the rest when it accepts data again."""
         client = self._client
         # publish() may detect that the connection is lost, and call _on_disconnect(), which resets self._client.
         while self._client is not None and self._unsent and not client.want_write():
@@ -205,7 +206,7 @@ class MqttLink(BaseLink):
             self._on_connection_end(f"malformed MQTT packet: {error}")
 
     def _poll(self, client: Any) -> None:
-        """Let paho send pings and detect missing answers, now and at intervals."""
+        # paho sends pings and detects missing answers here.
         client.loop_misc()
         if client is self._client:
             self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll, client)
@@ -230,12 +231,11 @@ class MqttLink(BaseLink):
             discard_on_close(sock)
 
     def _finish_connecting(self, refusal: str) -> None:
-        """End the wait of `_connect`. ``refusal`` is the reason of a failure; "" for success."""
+        """End the wait of `_connect`. ``refusal`` is "" for success."""
         if self._connect_result is not None and not self._connect_result.done():
             self._connect_result.set_result(refusal)
 
     def _release(self) -> None:
-        """Publish "offline" if the client can send it at once, then close the connection."""
         client, self._client = self._client, None
         self._unsent.clear()
         if self._timer is not None:
@@ -251,7 +251,7 @@ class MqttLink(BaseLink):
 
 
 def _close_socket(client: Any) -> None:
-    """Close the socket if it is open, without sending DISCONNECT."""
+    # Without DISCONNECT, the broker publishes "offline" itself (will_set).
     sock = client.socket()
     if sock is not None:
         if client.on_socket_close is not None:

@@ -43,11 +43,6 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False, allow_nan=Fa
 
 
 def publisher_for(address: str) -> AbstractAsyncContextManager[Publisher]:
-    """Return a context manager that opens the publisher for an address.
-
-    Raises:
-        InvalidArgument: no publisher has the scheme of the address.
-    """
     scheme = address.partition(":")[0].strip().lower()  # The error omits the rest, which may contain a password.
     if scheme not in PUBLISHERS:
         raise InvalidArgument(f"to: {scheme!r} is not a scheme of a publisher; they are {', '.join(PUBLISHERS)}")
@@ -95,7 +90,6 @@ class Publishing:
         return now - sent_at >= REPEAT_INTERVAL_S
 
     def _publish(self, name: str, value: object, age_s: float, now: float) -> None:
-        """Publish a state, unless its value is unchanged and a repetition is not due."""
         _, sent_value = self._sent.get(name, (-math.inf, None))
         if value == sent_value and not self._is_repeat_due(name, now):
             return

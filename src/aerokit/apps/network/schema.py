@@ -49,7 +49,7 @@ ENUMS: dict[str, type[Enum]] = {
 
 
 def document() -> dict[str, Any]:
-    """Return the JSON schema (draft 2020-12): a ``oneOf`` with one message for each ``state``."""
+    """Return the JSON schema (draft 2020-12) of the messages."""
     definitions: dict[str, dict[str, Any]] = {"Message": _MESSAGE}
     cell_types = typing.get_type_hints(States)
     states = {}
@@ -103,10 +103,7 @@ def _message(name: str, text: str, value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return the schema of a value of this type, as :func:`aerokit._internal.formatting.to_jsonable` converts it.
-
-    Adds the types that the schema refers to by name to ``definitions``.
-    """
+    """Return the schema of a value of this type, and add the types that it names to ``definitions``."""
     origin = typing.get_origin(value_type)
     arguments = typing.get_args(value_type)
     if origin in (typing.Union, types.UnionType):
@@ -127,20 +124,20 @@ def _schema_of(value_type: Any, definitions: dict[str, dict[str, Any]]) -> dict[
 
 
 def _enum_schema(name: str) -> dict[str, Any] | None:
-    """Return the schema of an enum value: a name, for flags also a list of names, or an integer that has no name.
+    """Return the schema of a state or of a field ``Class.field`` with an enum value.
 
-    ``name`` is a state or ``Class.field``. Return None if it is not in ``ENUMS``.
+    The result is None if ``ENUMS`` does not have the name.
     """
     enum = ENUMS.get(name)
     if enum is None:
         return None
     names = {"enum": [member.name for member in enum]}
     name_lists = [{"type": "array", "items": names}] if issubclass(enum, Flag) else []
+    # A value without a name is an integer.
     return {"description": f"of {enum.__name__}", "anyOf": [names, *name_lists, {"type": "integer"}]}
 
 
 def _snapshot_schema(value_type: type[Snapshot], definitions: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return the schema of a class of values, including its inherited fields."""
     annotations: dict[str, Any] = {}
     for base in reversed(value_type.__mro__):
         if issubclass(base, Snapshot) and base is not Snapshot:
@@ -158,7 +155,7 @@ def _snapshot_schema(value_type: type[Snapshot], definitions: dict[str, dict[str
 
 
 def rendered() -> str:
-    """Return the content of docs/state.schema.json, with one line for each state and type."""
+    """Return the content of docs/state.schema.json."""
     schema = document()
     lines = [f" {json.dumps(key)}: {_json(value)}," for key, value in schema.items() if key not in ("oneOf", "$defs")]
     states = ",\n".join(f"  {_json(state)}" for state in schema["oneOf"])

@@ -34,7 +34,6 @@ class _ZenohPublisher(Publisher):
         self._session: Any = None
 
     def use_session(self, zenoh: Any, session: Any) -> None:
-        """Publish to this session of the module ``zenoh`` from now on."""
         self._drop = zenoh.CongestionControl.DROP
         self._session = session
 
@@ -77,7 +76,6 @@ async def zenoh_publisher(address: str) -> AsyncIterator[Publisher]:
 
 
 async def _close(session: Any) -> None:
-    """Close a session, and wait for its end, but not longer than `_CLOSE_SESSION_TIMEOUT_S`."""
     closed = asyncio.Event()
     close_session(session, closed.set)
     with anyio.move_on_after(_CLOSE_SESSION_TIMEOUT_S):

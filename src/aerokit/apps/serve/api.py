@@ -155,7 +155,6 @@ def document(operations: Iterable[Operation], root_path: str = "") -> dict[str, 
 
 
 def _operation(operation: Operation) -> dict[str, Any]:
-    """Return the OpenAPI description of an operation."""
     is_order = operation.order is not None
     answer = {"$ref": "#/components/schemas/Order"} if is_order else {"type": "object"}
     description: dict[str, Any] = {
@@ -182,7 +181,6 @@ def _operation(operation: Operation) -> dict[str, Any]:
 
 
 def _parameters(operation: Operation) -> Iterable[dict[str, Any]]:
-    """Yield the OpenAPI parameters of an operation: in the path, in the query and, for orders, in the headers."""
     for name in re.findall(r"{(\w+)}", operation.path):
         schema = {"type": "integer", "minimum": 1, "maximum": 255} if name == "system_id" else {"type": "string"}
         yield {"name": name, "in": "path", "required": True, "schema": schema}
@@ -325,8 +323,6 @@ class HttpApi:
         )
 
     def endpoint(self, operation: Operation) -> Handler:
-        """Return a Starlette endpoint that checks the token and then performs an operation."""
-
         async def answer(request: Request) -> Response:
             try:
                 if not operation.is_open:
@@ -451,7 +447,6 @@ class HttpApi:
         return json_response(self._orders.get(request.path_params["key"]).to_dict())
 
     async def _run_order(self, order_type: OrderType, request: Request) -> Response:
-        """Start an order and answer when it has ended or, with ``wait=false``, after a short time."""
         vehicle = self._vehicle_of(request)
         waits = query_flag(request, "wait", default=True)
         arguments = await read_body(request, order_type.max_body_size)
@@ -479,7 +474,6 @@ class HttpApi:
         return vehicle.parameters.metadata or self._metadata
 
     def _is_refresh(self, request: Request) -> bool:
-        """Return the query flag ``refresh``, which requires the token, because a refresh uses the vehicle's link."""
         is_refresh = query_flag(request, "refresh", default=False)
         if is_refresh:
             self._access.check(request.headers, needs_token=True)

@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 def ground_station_failsafe(vehicle: Vehicle) -> dict[str, Any]:
-    """Return what the vehicle does after the loss of the ground station, according to its parameters.
+    """Return what the vehicle does after the loss of the ground station. Requests nothing.
 
     ``action`` is a part of a sentence, such as ``lands``, or None if it is unknown. ``because`` is the parameter that
-    decides, with its value. ``unread`` has the parameter that must be read to know the action. Requests nothing.
+    decides, with its value. ``unread`` has the parameter that must be read to know the action.
     """
 
     def value_of(name: str) -> float | None:

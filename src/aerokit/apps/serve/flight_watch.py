@@ -88,7 +88,6 @@ class FlightWatch:
         )
 
     def close(self) -> None:
-        """Stop following the vehicle."""
         for detach in self._detachments:
             detach()
 
@@ -96,7 +95,7 @@ class FlightWatch:
     def crash(self) -> dict[str, Any] | None:
         """The crash: ``text``, such as "hit the ground at 11.6 m/s", and ``at_unix_s``, the time of the impact.
 
-        It is None if there was no crash. It becomes None again when the vehicle flies or is armed again.
+        It is None without a crash. It becomes None again when the vehicle flies or is armed again.
         """
         return self._crash
 
@@ -104,9 +103,8 @@ class FlightWatch:
     def disarming(self) -> dict[str, Any] | None:
         """The last disarming, if it was before take-off and without an order of this server; otherwise None.
 
-        ``age_s`` is the time since the disarming. ``armed_for_s`` is the time from arming to disarming. ``parameter``
-        is the autopilot's parameter for automatic disarming, and ``delay_s`` its value. ``is_automatic`` is true if
-        ``armed_for_s`` is about ``delay_s``.
+        ``age_s`` is the time since then. ``armed_for_s`` is the time from arming to disarming. ``parameter`` is the
+        autopilot's parameter for automatic disarming, and ``delay_s`` its value.
         """
         if self._disarming is None:
             return None
@@ -125,7 +123,6 @@ class FlightWatch:
 
     @property
     def disarm_parameter(self) -> str | None:
-        """Name of the parameter with the delay of the automatic disarming; None if the firmware has none."""
         return self._vehicle.autopilot.auto_disarm_parameter
 
     @property
@@ -135,12 +132,11 @@ class FlightWatch:
         return None if known is None else float(known.value)
 
     def on_order(self, order: str) -> None:
-        """Record the time of the order ``disarm``: it counts as the cause of a disarming shortly afterwards."""
+        # This order counts as the cause of a disarming shortly afterwards.
         if order == "disarm":
             self._disarm_ordered_at = self._now()
 
     def _on_armed(self, before: bool | None, is_armed: bool) -> None:
-        """Record the time of arming or disarming, and a disarming before take-off that this server did not order."""
         now = self._now()
         if is_armed:
             # If the vehicle was armed before this program started, the time of arming is unknown.
@@ -165,11 +161,6 @@ class FlightWatch:
                 self._dismiss_impact()
 
     def _on_velocity(self, before: Velocity | None, velocity: Velocity) -> None:
-        """Detect when an impact begins or is over, and evaluate it with each new velocity.
-
-        An impact begins when a fast descent ends suddenly. A vehicle that falls again, for example out of a tree, has a
-        second impact. After a crash, no further impact is detected.
-        """
         if self._vehicle.autopilot.vehicle_type in SURFACE_TYPES:
             return
         at = self._vehicle.velocity.updated_at
@@ -180,6 +171,8 @@ class FlightWatch:
             self._last_sink_m_s = down_m_s
         elif not self._detector.describe():
             self._forget_impact()
+        # An impact begins when a fast descent ends suddenly. A vehicle that falls again, for example out of a tree, has
+        # a second impact. After a crash, no further impact is detected.
         elif self._crash is None and (self._impact_at is None or self._impact_at < self._last_sink_at):
             self._start_impact(at, down_m_s)
         if self._impact_at is not None:
@@ -194,7 +187,6 @@ class FlightWatch:
         self._is_impact_dismissed = not armed and at - self._armed_until > CRASH_ARMED_WITHIN_S
 
     def _evaluate_impact(self, at: float, ground_speed_m_s: float, vertical_speed_m_s: float) -> None:
-        """Decide whether the vehicle has crashed or, after a crash, whether it flies again."""
         if self._is_impact_dismissed or self._impact_at is None:
             return
         is_still = ground_speed_m_s < STILL_M_S and vertical_speed_m_s < CRASH_STILL_CLIMB_M_S
@@ -227,7 +219,6 @@ class FlightWatch:
 
     @property
     def _has_climbed(self) -> bool:
-        """True if the crashed vehicle has reported a take-off, and has climbed by CLIMBED_M since that report."""
         height_m = height_above_home(self._vehicle.telemetry)
         if height_m is None or self._take_off_height_m is None:
             return False

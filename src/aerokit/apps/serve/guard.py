@@ -36,11 +36,8 @@ REQUEST_TIMEOUT_S = 10.0
 
 
 def check_token(token: str) -> str:
-    """Return the token; raise InvalidArgument if its length or one of its characters is not allowed.
-
-    The error text does not contain the token.
-    """
     if not (MIN_TOKEN_LENGTH <= len(token) <= 256 and set(token) <= _TOKEN_CHARACTERS):
+        # The text does not contain the token.
         raise InvalidArgument(
             f"a token must have {MIN_TOKEN_LENGTH} to 256 characters of A-Z, a-z, 0-9 and - . _ ~; this token has"
             f" {len(token)}{'' if set(token) <= _TOKEN_CHARACTERS else ', some of which are not allowed'}"
@@ -63,7 +60,7 @@ class AccessControl:
     def check(self, headers: Headers, *, is_order: bool = False, needs_token: bool = False) -> None:
         """Raise HttpProblem 401 or 403 if the request is not allowed.
 
-        Orders, and requests with ``needs_token``, need the token even if reading does not.
+        With ``needs_token``, a request needs the token even if reading does not. Orders always need it.
         """
         if is_order and self.read_only:
             raise HttpProblem(403, "ReadOnly", "this server is read-only and accepts no orders; nothing was sent")
@@ -87,7 +84,10 @@ def _token_of(headers: Headers) -> str | None:
 
 
 def content_policy(tiles: str | None) -> str:
-    """Return the Content-Security-Policy of all responses, which allows images from the tile server."""
+    """Return the Content-Security-Policy. It allows images from the tile server.
+
+    Raises InvalidArgument if ``tiles`` is not a tile URL.
+    """
     image_sources = "'self'"
     if tiles is not None:
         url = urlsplit(tiles)
@@ -129,7 +129,6 @@ class SecurityMiddleware:
         }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one ASGI request: refuse it if `_check` fails, and add the headers to every HTTP response."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -179,8 +178,8 @@ RawHeaders = list[tuple[bytes, bytes]]
 def http_protocol(has_token: Callable[[RawHeaders], bool]) -> type[H11Protocol]:
     """Return a class that limits anonymous connections, for the argument ``http`` of `uvicorn.Config`.
 
-    A connection is anonymous until one of its requests has the token. If there are too many anonymous connections, one
-    of them is closed, never a connection with the token.
+    A connection is anonymous until one of its requests has the token. If there are too many, one of the anonymous
+    connections is closed.
     """
     anonymous: dict[_HttpConnection, None] = {}
 

@@ -82,12 +82,9 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Check that no argument is unknown or missing. A boolean argument must be a bool, and no other may be one.
+        """Raise InvalidArgument for unknown and missing arguments, and for wrong uses of booleans.
 
-        Ranges and all other types are checked later, by the method that the order calls.
-
-        Raises:
-            InvalidArgument: a check failed.
+        Ranges and all other types are checked by the method that the order calls.
         """
         for name in values:
             if name not in self.arguments:
@@ -147,12 +144,14 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Met
 
 
 def parameter_order(metadata: Metadata | None) -> OrderType:
-    """Return the order type that sets a parameter. Its result has a note if the value's range was not checked."""
+    """Return the order type that sets a parameter.
+
+    Its result has a note if the value's range was not checked.
+    """
     return replace(SET_PARAMETER, run=partial(_set_parameter, metadata=metadata))
 
 
 def check_parameter(metadata: Metadata | None, values: Mapping[str, Any]) -> None:
-    """Raise InvalidArgument if the metadata does not allow the value, unless ``force`` is set."""
     value = values["value"]
     # The library itself rejects values of other types, and values that MAVLink cannot represent.
     if isinstance(value, (int, float)) and abs(value) <= sys.float_info.max and not values.get("force"):
@@ -170,11 +169,9 @@ async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
 
 
 def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
-    """Return the name, text and plan of a request body. Its ``plan`` is a .plan as JSON object, or the text of a file.
+    """Return the name, the text and the plan of a request body.
 
-    Raises:
-        FileFormatError: ``plan`` is neither a .plan nor QGC WPL 110; the text names the position of the error.
-        InvalidArgument: an item of the plan cannot be sent to a vehicle.
+    Its ``plan`` is a .plan as JSON object, or the text of a file. Raises the errors of `parse_plan_text`.
     """
     name = values.get("name")
     name = name[:100] if isinstance(name, str) else "plan"
@@ -312,11 +309,9 @@ class OrderRecord:
         return self.problem
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields of the order that the API shows."""
         return {name: getattr(self, name) for name in _RECORD_FIELDS}
 
     def is_same(self, system_id: int, order: str, arguments: Mapping[str, Any]) -> bool:
-        """Return True if a request with these values repeats this order."""
         return (self.system_id, self.order, self.arguments) == (system_id, order, arguments)
 
 
@@ -332,15 +327,12 @@ class OrderRunner:
     def submit(
         self, vehicle: Vehicle, order_type: OrderType, arguments: dict[str, Any], key: str, seen_at_s: float | None
     ) -> OrderRecord:
-        """Start an order, or return the earlier order with this key. ``order_type.check`` has checked the arguments.
+        """Start an order, or return the earlier order with this key.
 
-        Raises:
-            HttpProblem: there is no key; the key was used for a different order, or its order is no longer stored; the
-                client's state of the vehicle is too old; ``force`` is not allowed; or the server has ended.
-            FileFormatError, InvalidArgument: the arguments cannot be parsed.
-            BusyError: too many orders are running.
-            HeartbeatTimeout: the vehicle is silent.
-            ConnectionClosed, LinkLost: the connection has ended.
+        ``order_type.check`` must have accepted the arguments. Raises HttpProblem for a missing or used key, an
+        outdated ``seen_at_s``, or a ``force`` that is not allowed. Raises InvalidArgument or FileFormatError if the
+        arguments cannot be parsed, BusyError if too many orders are running, HeartbeatTimeout if the vehicle is
+        silent, and ConnectionClosed or LinkLost if the connection has ended.
         """
         if not _KEY.fullmatch(key):
             raise HttpProblem(
@@ -391,7 +383,6 @@ class OrderRunner:
     def _check(
         self, vehicle: Vehicle, order_type: OrderType, arguments: Mapping[str, Any], seen_at_s: float | None
     ) -> None:
-        """Raise the error that applies if the order must not be sent now."""
         vehicle.connection.raise_if_ended()
         now = asyncio.get_running_loop().time()
         # The clock of the loop stands still while the computer sleeps, so the sleep is added to the age of the state.
@@ -425,13 +416,13 @@ class OrderRunner:
             )
 
     def _store(self, record: OrderRecord) -> None:
-        """Store an order. If there are too many, drop the oldest ended ones, but remember their keys as used."""
         self._records[record.key] = record
         ended_keys = [key for key, stored in self._records.items() if stored.state != "running"]
         for key in ended_keys:
             if len(self._records) <= MAX_RESULTS:
                 break
             del self._records[key]
+            # The key stays used: a retry must not execute the order again.
             self._used_keys[key] = None
         while len(self._used_keys) > MAX_USED_KEYS:
             self._used_keys.popitem(last=False)
@@ -439,7 +430,6 @@ class OrderRunner:
     async def _run(
         self, vehicle: Vehicle, order_type: OrderType, record: OrderRecord, arguments: dict[str, Any]
     ) -> None:
-        """Run an order, and store and publish its result or error."""
         try:
             record.result = to_jsonable(await order_type.run(vehicle, arguments))
             record.state = "done"
@@ -462,13 +452,15 @@ class OrderRunner:
             self._end(vehicle, record)
 
     def _end(self, vehicle: Vehicle, record: OrderRecord) -> None:
-        """Record the time of the order's end, and publish the order."""
         record.ended_unix_s = vehicle.connection.unix_time()
         record.ended.set()
         self._publish(record)
 
     def _replaced_by(self, record: OrderRecord, error: Exception) -> str | None:
-        """If ``error`` says that newer motion orders replaced this one, return the key of the newest; else None."""
+        """Return the key of the newest motion order that replaced this one, or None.
+
+        ``error`` is the error with which this order ended.
+        """
         if not isinstance(error, OperationRejected) or SUPERSEDED not in str(error):
             return None
         newest_key = None

@@ -56,10 +56,7 @@ class HttpProblem(Exception):
 
 
 def problem_of(error: Exception) -> dict[str, Any]:
-    """Return the problem object (RFC 9457) of an error.
-
-    Besides the standard members, it has ``error`` and, if the vehicle has given reasons, ``reasons``.
-    """
+    """Return the problem object (RFC 9457) of an error."""
     if isinstance(error, HttpProblem):
         status, kind = error.status, error.kind
     else:
@@ -98,9 +95,8 @@ def json_response(
 async def read_body(request: Request, max_size: int = MAX_BODY_SIZE) -> dict[str, Any]:
     """Read the JSON object in the request body. An empty body counts as an empty object.
 
-    Raises:
-        HttpProblem: the body is not a JSON object (400), did not arrive in time (408), is too large (413) or is not
-            declared as JSON (415).
+    Raises HttpProblem if the body is not a JSON object (400), did not arrive in time (408), is too large (413) or is
+    not declared as JSON (415).
     """
     try:
         data = await asyncio.wait_for(_read_bytes(request, max_size), BODY_TIMEOUT_S)
@@ -151,7 +147,7 @@ def query_flag(request: Request, name: str, *, default: bool) -> bool:
 
 
 def seen_at(request: Request) -> float | None:
-    """Return the header Aerokit-Seen-At: ``at_s`` of the client's newest state message. None without the header."""
+    """Return the header Aerokit-Seen-At, the time of the client's newest state message."""
     text = request.headers.get("aerokit-seen-at")
     if text is None:
         return None

@@ -103,10 +103,8 @@ class ServedVehicles:
         return vehicle
 
     def crash(self, vehicle: Vehicle) -> dict[str, Any] | None:
-        """Return the impact after which a vehicle has not moved; None if there was none, or if it may have moved since.
-
-        A vehicle may have moved if it is silent, or reports no velocity.
-        """
+        """Return the impact after which the vehicle has not moved; None if it may have moved."""
+        # A vehicle may have moved if it is silent, or reports no velocity.
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
         is_observed = is_connected and vehicle.velocity.age <= VELOCITY_MAX_AGE_S
         return self._watch(vehicle).crash if is_observed else None
@@ -115,12 +113,12 @@ class ServedVehicles:
         return list(self._texts.get(system_id, ()))
 
     def track(self, system_id: int) -> list[tuple[float, float, bool]]:
-        """Return a vehicle's track, the oldest position first: latitude, longitude, and True after a gap."""
+        """Return a vehicle's track as (latitude, longitude, is after a gap), the oldest position first."""
         points = self._tracks.get(system_id, ())
         return [(position.latitude_deg, position.longitude_deg, is_after_gap) for position, is_after_gap in points]
 
     def snapshot(self) -> str:
-        """Return the stream's message ``state`` with all vehicles as JSON. It is at most `SNAPSHOT_MAX_AGE_S` old."""
+        """Return the stream's message ``state`` as JSON. It is at most `SNAPSHOT_MAX_AGE_S` old."""
         now = asyncio.get_running_loop().time()
         if now - self._snapshot_at > SNAPSHOT_MAX_AGE_S:
             vehicles = [self._state_of(vehicle) for vehicle in self.vehicles.values()]
@@ -135,7 +133,6 @@ class ServedVehicles:
         return lambda: self._listeners.remove(listener)
 
     def publish(self, message: dict[str, Any]) -> None:
-        """Add a number to a message, and pass it to all listeners."""
         self._message_count += 1
         numbered = {**message, "number": self._message_count}
         if message["type"] == "event":
@@ -189,7 +186,6 @@ class ServedVehicles:
         self.publish({"type": "event", "event": type(event).__name__, "time_unix_s": unix_s, **to_jsonable(event)})
 
     async def _record_tracks(self) -> None:
-        """Add the positions of all vehicles to their tracks until cancelled. Thin out a track that is full."""
         silent: set[int] = set()  # system ids of vehicles whose next position is the first after a gap
         while True:
             for system_id, vehicle in tuple(self._vehicles.items()):
@@ -217,11 +213,6 @@ class ServedVehicles:
             await anyio.sleep(TRACK_INTERVAL_S)
 
     def _state_of(self, vehicle: Vehicle) -> dict[str, Any]:
-        """Return the overview of a vehicle, and further values that the page shows (docs/serve.md).
-
-        ``mission_item`` is an index in the plan, which does not contain home. The state ``mission_current`` is the item
-        number in MAVLink, where ArduPilot's item 0 is home.
-        """
         watch = self._watch(vehicle)
         missing = vehicle.missing_for_flight()
         is_connected = vehicle.link_state.latest is LinkState.CONNECTED
@@ -242,6 +233,8 @@ class ServedVehicles:
             "return_altitude_m": known_return_altitude(vehicle.parameters, vehicle.autopilot, is_vtol=vehicle.is_vtol),
             "failsafe": ground_station_failsafe(vehicle),
             "active_failsafe": active_failsafe(vehicle),
+            # An index in the plan, which does not contain home. The state `mission_current` is the item number in
+            # MAVLink, where ArduPilot's item 0 is home.
             "mission_item": vehicle.mission.current.latest,
             "mission_items": vehicle.mission.count.latest,
             "mission_version": list(vehicle.mission._version),
@@ -251,17 +244,15 @@ class ServedVehicles:
 
 
 def _log_unexpected(error: Exception) -> None:
-    """Log an error of a background task, unless it is about the vehicle or the link, whose states show it."""
+    # An AerokitError is about the vehicle or the link, whose states show it.
     if not isinstance(error, AerokitError):
         logger.error("a task of aerokit serve has failed", exc_info=error)
 
 
 def _thin_out(track: list[tuple[Position, bool]]) -> None:
-    """Remove the third point of a full track, the fifth, and so on. The mark of a gap moves to the next point.
-
-    A full track has an even number of points, so the first and the last one stay.
-    """
+    """Remove every second point of a full track. The first and the last point stay."""
     pairs = zip(track[2::2], track[3::2], strict=False)
+    # The mark of a gap moves to the next point.
     track[2:] = [(position, is_after_gap or removed[1]) for removed, (position, is_after_gap) in pairs]
 
 
@@ -271,6 +262,7 @@ async def _read_return_altitude(vehicle: Vehicle) -> None:
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:
-    """Return True if the vehicle is in its mission mode, which ``mission.pause`` requires, and may be armed."""
+    """Return True if the vehicle is in its mission mode, and may be armed."""
+    # `mission.pause` requires the mission mode.
     mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
     return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed

@@ -49,7 +49,6 @@ class StateStream:
         self._anonymous: set[WebSocket] = set()
 
     async def endpoint(self, socket: WebSocket) -> None:
-        """Handle one WebSocket, from its request until its end."""
         try:
             rate_hz = self._admit(socket)
         except HttpProblem as problem:
@@ -111,7 +110,6 @@ class StateStream:
             await asyncio.wait_for(socket.close(code), 1.0)
 
     async def _send_messages(self, socket: WebSocket, period_s: float) -> None:
-        """Send the message ``hello``, then the state once per period, and each other message when it is published."""
         loop = asyncio.get_running_loop()
         queue: deque[dict[str, Any]] = deque()
         changed = asyncio.Event()
