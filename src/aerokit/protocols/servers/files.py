@@ -84,18 +84,14 @@ class UploadedFile(FileHandle):
 
 
 class Mount(ABC):
-    """Generated files whose paths begin with a common prefix such as ``@PARAM``."""
+    """Generated files whose paths begin with a common prefix such as ``@PARAM``. Methods raise FileFault on failure."""
 
     is_listed = False
     """True if the mount appears in the root folder and its files can be listed."""
 
     @abstractmethod
     def size(self, path: str) -> int:
-        """Return the size to report when a file is opened, which may be an estimate.
-
-        Raises:
-            FileFault: there is no such file.
-        """
+        """Return the size to report when a file is opened. It may be an estimate."""
 
     @abstractmethod
     def open(self, path: str, *, writing: bool) -> FileHandle: ...

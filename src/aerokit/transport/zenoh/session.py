@@ -41,7 +41,7 @@ class LoopQueue(Generic[ItemT]):
         self._lock = threading.Lock()  # protects all of these attributes
 
     def post(self, item: ItemT) -> None:
-        """Add an item. Never blocks or raises; ignored after :meth:`close`."""
+        """Add an item. Never blocks or raises. Does nothing after :meth:`close`."""
         with self._lock:
             if self._process is None:
                 return
@@ -61,7 +61,6 @@ class LoopQueue(Generic[ItemT]):
             self._waiting.clear()
 
     def _drain(self) -> None:
-        """Process waiting items on the loop. After `_MAX_PER_ITERATION` items, continue in the next iteration."""
         for _ in range(_MAX_PER_ITERATION):
             with self._lock:
                 process = self._process
@@ -78,7 +77,7 @@ class LoopQueue(Generic[ItemT]):
 
 
 async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object]) -> ItemT:
-    """Run ``work()`` in a thread of the loop's executor and return what it opens.
+    """Run ``work()`` in a thread and return what it opens.
 
     A thread cannot be stopped. After a cancellation, the result is passed to ``close`` as soon as it is available.
     """
@@ -146,7 +145,7 @@ class NetworkLink(BaseLink):
         self._timer: asyncio.TimerHandle | None = None
 
     def _on_release(self, session: Any) -> None:
-        """Release the session's objects; a vehicle side also tells its clients. ``session`` is None if none is open."""
+        """Release the session's objects. ``session`` is None if none is open."""
         raise NotImplementedError
 
     def _release(self) -> None:
@@ -163,7 +162,6 @@ class NetworkLink(BaseLink):
 
 
 def zenoh_module(address: str) -> Any:
-    """Import ``zenoh``; raise LinkOpenError with the package to install if it is missing."""
     return import_optional(address, "zenoh", "eclipse-zenoh", "zenoh")
 
 
@@ -192,7 +190,7 @@ async def open_session(address: str, options: NetworkOptions, declare: Callable[
 
 @contextlib.contextmanager
 def zenoh_errors(address: str, zenoh: Any) -> Iterator[None]:
-    """Convert the errors that zenoh raises while a link is being opened to LinkOpenError."""
+    """Convert zenoh's errors to LinkOpenError."""
     try:
         yield
     except zenoh.ZError as error:
@@ -200,13 +198,13 @@ def zenoh_errors(address: str, zenoh: Any) -> Iterator[None]:
 
 
 def close_session(session: Any, closed: Callable[[], object]) -> None:
-    """Close a session on a thread, because closing may block, and then call ``closed()``."""
+    """Close a session on a thread, and then call ``closed()``."""
 
     def work() -> None:
         with contextlib.suppress(Exception):  # If close() raises, the session is closed all the same.
             session.close()
 
-    try:
+    try:  # Closing may block.
         future = asyncio.get_running_loop().run_in_executor(None, work)
     except RuntimeError:  # The loop is closed or closing.
         work()
@@ -216,7 +214,7 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
 
 
 def call(function: Callable[[], object]) -> object:
-    """Call a function. Used as the argument ``process`` of a `LoopQueue` whose items are functions."""
+    """Call a function. Used as ``process`` of a `LoopQueue` whose items are functions."""
     return function()
 
 
@@ -230,7 +228,6 @@ def attachment_of(sample: Any) -> bytes:
 
 
 def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
-    """Build zenoh's configuration from the options. A file, ``options.config``, replaces aerokit's default settings."""
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
     except zenoh.ZError as error:
@@ -248,7 +245,6 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
 
 
 def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
-    """Yield the keys and values of zenoh's configuration that the options determine."""
     if options.mode or not options.config:  # Without `mode`, a configuration file determines the mode.
         is_client = bool(options.connect) and not options.listen
         yield "mode", options.mode or ("client" if is_client else "peer")
@@ -264,7 +260,8 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
 
 
 def _reason(error: Exception) -> str:
-    """Return the error text for the user, without zenoh's source location. A failed connection gets a clearer text."""
+    """Return the error text for the user."""
+    # The text ends with the location in zenoh's source.
     text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
     if text.startswith(_CONNECT_FAILED):
         endpoints = ", ".join(_ENDPOINTS.findall(text)) or text
