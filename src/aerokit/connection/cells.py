@@ -375,11 +375,9 @@ class _Sink(Generic[T]):
     def receive(self, value: T) -> None:
         raise NotImplementedError
 
-    def forget(self) -> None:
-        """Called when the value became unknown."""
+    def forget(self) -> None: ...
 
-    def fail(self, error: BaseException) -> None:
-        """Called when the cell was closed."""
+    def fail(self, error: BaseException) -> None: ...
 
 
 class _Waiter(_Sink[T]):

@@ -205,7 +205,6 @@ class FrameObservers:
         return self.recording is not None or bool(self.receive_callbacks)
 
     def add(self, callback: FrameObserver) -> Detach:
-        """Call ``callback`` with each received frame. Returns a function that removes it."""
         self.receive_callbacks = (*self.receive_callbacks, callback)
         self._on_change()
 
@@ -216,7 +215,6 @@ class FrameObservers:
         return once(detach)
 
     def add_sent(self, callback: SentFrameObserver) -> Detach:
-        """Call ``callback`` with each sent frame. Returns a function that removes it."""
         self._send_callbacks = (*self._send_callbacks, callback)
 
         def detach() -> None:

@@ -62,7 +62,6 @@ def is_autopilot(heartbeat: Heartbeat) -> bool:
 def discovery_event(
     heartbeat: Heartbeat, at: float, system_id: int, component_id: int
 ) -> VehicleFound | ComponentFound:
-    """Return the event for the first heartbeat of a component."""
     if is_autopilot(heartbeat):
         return VehicleFound(at, system_id, component_id, heartbeat.type, heartbeat.autopilot)
     return ComponentFound(at, system_id, component_id, heartbeat.type)

@@ -44,7 +44,6 @@ def suspended_s() -> float:
 
 
 def loop_clock() -> Callable[[], float]:
-    """Return the clock of the running event loop."""
     loop = asyncio.get_running_loop()
     # asyncio's own loops have a wrapper around this clock.
     return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time

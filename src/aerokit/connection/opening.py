@@ -153,7 +153,6 @@ def _create_link(
 
 
 def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
-    """Create one link from a list of addresses and links."""
     if not isinstance(addresses, (list, tuple)) or not all(isinstance(address, (str, Link)) for address in addresses):
         raise InvalidArgument(
             f"address = {short_repr(addresses)} is not allowed: it must be an address, a link, or a list of them"
@@ -232,7 +231,6 @@ MAX_LISTED_IDS = 5
 
 
 def explain_no_vehicle(connection: Connection, wanted_system: int | None) -> str:
-    """Return the reason why no vehicle was found on a link, derived from the received data."""
     return _Diagnosis(connection, wanted_system).text()
 
 

@@ -103,7 +103,6 @@ class RouteClaim:
 
 
 def boot_time_ms(frame: Frame) -> int | None:
-    """Return the sender's time since boot in milliseconds. None if the frame does not contain it."""
     offset = _BOOT_TIME_OFFSETS.get(frame.message_id)
     return None if offset is None else int.from_bytes(frame.body[offset : offset + 4], "little")
 

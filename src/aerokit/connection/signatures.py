@@ -129,7 +129,6 @@ class SignatureGate:
         self._publish(FrameRefused(frame.received_at, *source, refusal.value))
 
     def log_storage_errors(self) -> None:
-        """Log once when the file of ``Signing(keep=…)`` cannot be written."""
         signing = self._encoder.signing
         error = None if signing is None else signing.keep_error
         if error is not None and self._logged_keep_error is None:

@@ -107,7 +107,6 @@ class Cancellation:
         self._is_cancelled = False
 
     def cancel(self) -> None:
-        """Cancel the code inside the scope, except for shielded parts. Idempotent."""
         self._is_cancelled = True
         if self._scope is not None:
             self._scope.cancel()

@@ -205,7 +205,6 @@ class BlockRequests:
         self._in_flight[offset] = block
 
     def _requeue_overtaken(self, number: int) -> None:
-        """Requeue the requests that were sent at least `OVERTAKEN` transmissions before ``number``."""
         overtaken = []
         for offset, block in self._in_flight.items():
             if block.transmission_number > number - OVERTAKEN:

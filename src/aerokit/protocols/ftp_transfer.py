@@ -297,7 +297,6 @@ class FtpDownload(FtpExchange[int]):
         return not was_sent_completely and len(self._reassembly.gaps) < MAX_GAPS
 
     def _request_ahead(self) -> None:
-        """Request the next blocks from a server without bursts."""
         if self._reassembly.end is None:
             for number in range(self._requests.window.size):
                 self._requests.request(self._reassembly.tail + number * DATA_SIZE)

@@ -178,7 +178,6 @@ class LogDownload(Transfer[int]):
             self._request(offset, LOG_BLOCK)
 
     def _first_long_gap(self) -> tuple[int, int] | None:
-        """Return start and end of the first gap of at least `LONG_GAP` blocks."""
         min_length = LONG_GAP * LOG_BLOCK
         start, end = 0, 0  # the gap that is being measured: consecutive offsets in `gaps`, which has one for each block
         for offset in self._reassembly.gaps:

@@ -100,7 +100,6 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             self._report_progress(now, min(len(self._received), count), count)
 
     def _step(self, now: float) -> None:
-        """Finish, or send the requests that are due."""
         self._conclude()
         if self.done:
             return
@@ -192,13 +191,11 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
     def _after_sending(self, now: float) -> None: ...
 
     def _settle(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
-        """Record the final answer for a name."""
         self._window.discard(name)
         self._results[name] = answer
         self._report_progress(now, len(self._results), len(self._names))
 
     def _step(self, now: float) -> None:
-        """Finish, or send the requests that are due."""
         if len(self._results) < len(self._names):
             self._before_sending(now)  # This call may settle the last names.
         if len(self._results) == len(self._names):
@@ -254,7 +251,6 @@ class NamedReads(NamedRequests[ValueT]):
                 self._settle(name, ParameterRejected(text, name=name), now)
 
     def _loss_probability(self, attempts: int) -> float:
-        """Estimate the probability that the answers to ``attempts`` requests were all lost."""
         if not self._probes_answered:
             return 1.0
         lost = self._probes_sent - self._probes_answered

@@ -103,7 +103,6 @@ class RtcmReader:
         self.skipped_bytes: int = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Process bytes, and return the complete messages."""
         messages: list[bytes] = []
         buffer = self._buffer + data
         begin = 0

@@ -84,7 +84,6 @@ def parse_address(text: str) -> LinkAddress:
 
 
 def host_and_port(host: str, port: int) -> str:
-    """Return ``host:port``, with brackets around an IPv6 address."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -277,7 +276,6 @@ class _Parser:
         return port
 
     def parse_serial(self, text: str, options: dict[str, str], *, has_scheme: bool) -> LinkAddress:
-        """Parse a serial port and its baud rate."""
         # In an address without a scheme, only the name of a COM port may be followed by a colon and the baud rate.
         # Other names may contain colons themselves.
         colon_baud = _COLON_BAUD if has_scheme else _COM_COLON_BAUD
@@ -303,7 +301,6 @@ class _Parser:
         return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
 
     def parse_options(self, kind: LinkKind, query: str) -> dict[str, str]:
-        """Parse and check the options after the ``?``."""
         options: dict[str, str] = {}
         allowed = _OPTIONS.get(kind, ())
         if kind not in _NEVER_COSTLY:
@@ -326,7 +323,6 @@ class _Parser:
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 
     def checked_option(self, key: str, value: str) -> str:
-        """Check the value of an option, and return its canonical form."""
         if key == "baud":  # `parse_serial` checks the number.
             return value
         if key in _CHOICES:

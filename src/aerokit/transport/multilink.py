@@ -223,7 +223,6 @@ class MultiLink(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _retry_opening(self, index: int) -> None:
-        """Try to open a link, with increasing delays, until it is open."""
         backoff = Backoff()
         is_reported = False
         while not self._is_closed:

@@ -151,7 +151,6 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _close_when_sent(self, transport: Any, deadline: float) -> None:
-        """Close the port when all data is sent or the deadline has passed."""
         assert self._loop is not None
         if self._waiting_to_be_sent(transport) and self._loop.time() < deadline:
             self._loop.call_later(_LINGER_STEP_S, self._close_when_sent, transport, deadline)
@@ -244,7 +243,6 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
 
 
 def _open_error(address: str, error: Exception) -> OSError:
-    """Return the LinkOpenError for an error of pyserial."""
     number = error.errno if isinstance(error, OSError) else None
     # pyserial puts an error of termios into its text: "Could not configure port: (25, 'Inappropriate ioctl …')".
     if number is None and f"({errno.ENOTTY}, " in str(error):

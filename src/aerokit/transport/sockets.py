@@ -58,7 +58,6 @@ async def is_port_free(host: str, port: int) -> bool:
 
 
 def bind_to(address: SocketAddress, kind: socket.SocketKind) -> socket.socket:
-    """Return a new non-blocking socket that is bound to this address. Raises OSError."""
     sock = socket.socket(address.family, kind)
     try:
         sock.setblocking(False)

@@ -67,7 +67,6 @@ class Candidate:
         self._last_counts = (0, 0)  # numbers of frames received and lost at the last call of `record_counts`
 
     def record_counts(self, received: int, lost: int, now: float) -> None:
-        """Update :attr:`loss` from the total numbers of received and lost frames."""
         received_before, lost_before = self._last_counts
         self._last_counts = received, lost
         if received > received_before:
@@ -156,7 +155,6 @@ class Candidate:
         self.is_proven, self.is_doubted = False, True
 
     def is_alive(self, now: float) -> bool:
-        """Return True if frames arrive over the link, and written data leaves this machine."""
         is_answering = now - self.answered_at <= 2 * UNPROBED_TIMEOUT_S
         timeout_s = PROBED_TIMEOUT_S if is_answering and not self.is_costly else UNPROBED_TIMEOUT_S
         return self.is_available and not self.is_stalled and now - self.received_at <= timeout_s
@@ -276,7 +274,6 @@ class LinkChoice:
                 compared.record_hardware(is_other=self.hardware.contradicts(compared.hardware))
 
     def may_be_used(self, candidate: Candidate) -> bool:
-        """Return True if frames and commands may use the link."""
         if candidate.is_other_hardware:
             return False
         return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof

@@ -54,7 +54,6 @@ class LinkStates:
         self.cell: StateCell[tuple[LinkStatus, ...]] = StateCell("links", clock, "frame")
 
     def update(self, now: float) -> None:
-        """Update the state of each open link, and refresh the cell once a second."""
         for link in range(len(self._states)):
             candidates = [choice.candidates[link] for choice in self._choices.values() if link in choice.candidates]
             if candidates and self._link.is_available(link):

@@ -129,7 +129,6 @@ class HardwareId(NamedTuple):
         return bool(self.uid or any(self.uid2))
 
     def contradicts(self, other: HardwareId) -> bool:
-        """Return True if both have the same field with different values."""
         if any(self.uid2) and any(other.uid2):
             return self.uid2 != other.uid2
         return bool(self.uid and other.uid) and self.uid != other.uid

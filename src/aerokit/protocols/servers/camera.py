@@ -20,7 +20,6 @@ _TO_THE_END = -1
 
 
 def camera_builders(camera: CameraDevice) -> dict[int, Builder]:
-    """Return a builder for each message id of the camera protocol."""
     return {
         m.CameraInformation.ID: lambda _: [_information(camera)],
         m.CameraSettings.ID: lambda _: [camera_settings(camera)],

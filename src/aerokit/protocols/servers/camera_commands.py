@@ -43,7 +43,6 @@ def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
 
 
 def legacy_requests(streams: MessageStreams) -> dict[int, CommandHandler]:
-    """Return handlers of the older requests that REQUEST_MESSAGE supersedes."""
     message_ids: dict[int, int] = {
         MavCmd.REQUEST_CAMERA_INFORMATION: m.CameraInformation.ID,
         MavCmd.REQUEST_CAMERA_SETTINGS: m.CameraSettings.ID,

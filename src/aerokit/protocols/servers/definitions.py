@@ -48,8 +48,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         """Return False to answer a request for this setting with FAILED."""
         return True
 
-    def on_set(self, name: str, value: SettingValue) -> None:
-        """Called when the value of a setting has changed."""
+    def on_set(self, name: str, value: SettingValue) -> None: ...
 
     def limited(self, name: str, value: SettingValue) -> SettingValue:
         """Return the value to check and store instead of the received value, e.g. a clamped one."""

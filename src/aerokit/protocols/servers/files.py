@@ -201,7 +201,6 @@ class FileTree:
         self._file(path).content.extend(data)
 
     def get(self, path: str) -> bytes:
-        """Return the content of a file. Raises FileFault if it does not exist."""
         return bytes(self._file(path).content)
 
     def __contains__(self, path: str) -> bool:

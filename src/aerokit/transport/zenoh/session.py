@@ -214,7 +214,6 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
 
 
 def call(function: Callable[[], object]) -> object:
-    """Call a function. Used as ``process`` of a `LoopQueue` whose items are functions."""
     return function()
 
 
@@ -260,7 +259,6 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
 
 
 def _reason(error: Exception) -> str:
-    """Return the error text for the user."""
     # The text ends with the location in zenoh's source.
     text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
     if text.startswith(_CONNECT_FAILED):
