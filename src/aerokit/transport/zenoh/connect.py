@@ -31,7 +31,6 @@ from aerokit.transport.zenoh.session import (
     NetworkLink,
     NetworkOptions,
     attachment_of,
-    call,
     open_session,
     payload_of,
 )
@@ -110,7 +109,7 @@ class ZenohConnect(NetworkLink):
 
     async def _connect(self) -> None:
         self._first_beacon.clear()
-        self._queue = LoopQueue(call)
+        self._queue = LoopQueue()
         with anyio.move_on_after(self._open_timeout_s):
             self._session = await open_session(self.address, self._options, partial(self._declare, self._queue))
             self._released.clear()
@@ -123,7 +122,7 @@ class ZenohConnect(NetworkLink):
             raise LinkOpenError(f"cannot open {self.address}: {reason}")
         raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
-    def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
+    def _declare(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
         """Declare the subscribers, the token and the publisher. Runs on a thread of the executor."""
 
         # The callbacks run on threads of zenoh, so each of them posts its sample to the event loop.

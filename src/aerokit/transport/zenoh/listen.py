@@ -27,7 +27,6 @@ from aerokit.transport.zenoh.session import (
     NetworkLink,
     NetworkOptions,
     attachment_of,
-    call,
     open_in_thread,
     open_session,
     payload_of,
@@ -116,7 +115,7 @@ class ZenohListen(NetworkLink):
 
     async def _connect(self) -> None:
         self._rival_found.clear()
-        self._queue = queue = LoopQueue(call)
+        self._queue = queue = LoopQueue()
         self._session = session = await open_session(self.address, self._options, partial(self._find_rivals, queue))
         self._released.clear()
         if self._may_have_rival:
@@ -129,7 +128,7 @@ class ZenohListen(NetworkLink):
         self._is_serving = True
         self._send_beacon()
 
-    def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
+    def _find_rivals(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
         """Find out whether the name may be in use, and subscribe to beacons.
 
         Runs on a thread of the executor.
@@ -149,7 +148,7 @@ class ZenohListen(NetworkLink):
         if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
             self._declared, self._may_have_rival = declared, may_have_rival
 
-    def _serve(self, queue: LoopQueue[Callable[[], object]], session: Any) -> None:
+    def _serve(self, queue: LoopQueue, session: Any) -> None:
         """Declare the subscribers, the publisher and the token. Runs on a thread of the executor."""
         zenoh, keys = self._zenoh, self._keys
 

@@ -9,7 +9,7 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, LinkOpenError
@@ -18,37 +18,37 @@ from aerokit.transport.link import BaseLink, import_optional
 ItemT = TypeVar("ItemT")
 
 MAX_QUEUED = 2048
-"""Maximum number of items that wait for a blocked event loop. A further item replaces the oldest."""
+"""Maximum number of calls that wait for a blocked event loop. A further call replaces the oldest."""
 
-_MAX_PER_ITERATION = 256  # maximum number of items processed in one loop iteration, so that other tasks can run
+_MAX_PER_ITERATION = 256  # maximum number of calls in one loop iteration, so that other tasks can run
 
 
-class LoopQueue(Generic[ItemT]):
-    """Queue from other threads to the event loop: ``post(item)`` in any thread calls ``process(item)`` on the loop.
+class LoopQueue:
+    """Queue from other threads to the event loop: ``post(call)`` in any thread runs ``call()`` on the loop.
 
-    At most ``limit`` items wait. A further item replaces the oldest, which is counted as dropped. The loop is woken
-    once for all waiting items.
+    At most ``limit`` calls wait. A further call replaces the oldest, which is counted as dropped. The loop is woken
+    once for all waiting calls.
     """
 
-    def __init__(self, process: Callable[[ItemT], object], limit: int = MAX_QUEUED) -> None:
+    def __init__(self, limit: int = MAX_QUEUED) -> None:
         self.dropped: int = 0
-        """Number of dropped items."""
+        """Number of dropped calls."""
         self._loop = asyncio.get_running_loop()
-        self._process: Callable[[ItemT], object] | None = process  # None after close()
         self._limit = limit
-        self._waiting: deque[ItemT] = deque()
+        self._waiting: deque[Callable[[], object]] = deque()
+        self._is_closed = False
         self._is_scheduled = False  # True while a call of `_drain` is pending
         self._lock = threading.Lock()  # protects all of these attributes
 
-    def post(self, item: ItemT) -> None:
-        """Add an item. Never blocks or raises. Does nothing after :meth:`close`."""
+    def post(self, call: Callable[[], object]) -> None:
+        """Add a call. Never blocks or raises. Does nothing after :meth:`close`."""
         with self._lock:
-            if self._process is None:
+            if self._is_closed:
                 return
             if len(self._waiting) >= self._limit:
                 self._waiting.popleft()
                 self.dropped += 1
-            self._waiting.append(item)
+            self._waiting.append(call)
             if self._is_scheduled:
                 return
             self._is_scheduled = True
@@ -57,21 +57,20 @@ class LoopQueue(Generic[ItemT]):
 
     def close(self) -> None:
         with self._lock:
-            self._process = None
+            self._is_closed = True
             self._waiting.clear()
 
     def _drain(self) -> None:
         for _ in range(_MAX_PER_ITERATION):
             with self._lock:
-                process = self._process
-                if process is None or not self._waiting:
+                if not self._waiting:
                     self._is_scheduled = False
                     return
-                item = self._waiting.popleft()
+                call = self._waiting.popleft()
             try:
-                process(item)
+                call()
             except BaseException:
-                self._loop.call_soon(self._drain)  # The other items must be processed although this one failed.
+                self._loop.call_soon(self._drain)  # The other calls must run although this one failed.
                 raise
         self._loop.call_soon(self._drain)
 
@@ -141,7 +140,7 @@ class NetworkLink(BaseLink):
         super().__init__(address)
         self._session: Any = None  # None while the link is not open
         self._declared: list[Any] = []  # references to all declarations, which would end when garbage-collected
-        self._queue: LoopQueue[Callable[[], object]] | None = None  # passes calls of zenoh's threads to the loop
+        self._queue: LoopQueue | None = None  # passes calls of zenoh's threads to the loop
         self._timer: asyncio.TimerHandle | None = None
 
     def _on_release(self, session: Any) -> None:
@@ -161,10 +160,6 @@ class NetworkLink(BaseLink):
             close_session(session, self._released.set)
 
 
-def zenoh_module(address: str) -> Any:
-    return import_optional(address, "zenoh", "eclipse-zenoh", "zenoh")
-
-
 async def open_session(address: str, options: NetworkOptions, declare: Callable[[Any, Any], object]) -> Any:
     """Open a session, and call ``declare(zenoh, session)`` in the same thread, where declarations may block.
 
@@ -172,7 +167,7 @@ async def open_session(address: str, options: NetworkOptions, declare: Callable[
         LinkOpenError: zenoh is not installed, or the session could not be opened.
         InvalidArgument: the configuration is wrong.
     """
-    zenoh = zenoh_module(address)
+    zenoh = import_optional(address, "zenoh", "eclipse-zenoh", "zenoh")
     config = _config(zenoh, address, options)
 
     def work() -> Any:
@@ -211,10 +206,6 @@ def close_session(session: Any, closed: Callable[[], object]) -> None:
         closed()
     else:
         future.add_done_callback(lambda _: closed())
-
-
-def call(function: Callable[[], object]) -> object:
-    return function()
 
 
 def payload_of(sample: Any) -> bytes:
