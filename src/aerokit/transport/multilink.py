@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.transport.link import Link, OrderRefusalListener, Peer, Receiver, keeps_peers
-from aerokit.transport.reconnecting import Backoff, InterruptionListener
+from aerokit.transport.reconnecting import Backoff, InterruptionListener, ReconnectingLink
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -293,8 +293,6 @@ class MultiLink(Link):
 
     @property
     def _may_come_back(self) -> bool:
-        from aerokit.transport.reconnecting import ReconnectingLink
-
         return bool(self._openings) or any(isinstance(link, ReconnectingLink) for link in self._links)
 
     def _write_to(self, index: int, data: bytes, peer: Peer) -> None:

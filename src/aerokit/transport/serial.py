@@ -26,6 +26,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.transport.address import LinkAddress
 from aerokit.transport.link import LINGER_S, BaseLink, Peer, link_open_error
 from aerokit.transport.outbox import Outbox
+from aerokit.transport.sockets import serial_ports
 
 if sys.platform == "win32":
     _TermiosError = OSError
@@ -253,8 +254,7 @@ def _open_error(address: str, error: Exception) -> OSError:
 
 
 def _available_ports() -> str:
-    comports = importlib.import_module("serial.tools.list_ports").comports
-    names = ", ".join(sorted(port.device for port in comports()))
+    names = ", ".join(port.device for port in serial_ports())
     return f"available serial ports: {names}" if names else "no serial port was found; is the device plugged in?"
 
 

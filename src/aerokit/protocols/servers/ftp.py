@@ -304,9 +304,8 @@ class SessionFtpServer(Generic[FilesT]):
             if session.next_block is None:
                 return
             self._send_block(peer, session, session.next_block, may_end=number == self.burst - 1)
-        if session.next_block is None:
-            return
-        self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
+        if session.next_block is not None:
+            self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
         """Send a block of a burst, or the NAK that ends the burst.

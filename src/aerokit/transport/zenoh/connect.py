@@ -222,9 +222,6 @@ class ZenohConnect(NetworkLink):
 
     # ---------------------------------------------------------------------------------- supervision
 
-    def _now(self) -> float:
-        return asyncio.get_running_loop().time()
-
     def _schedule_poll(self) -> None:
         self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll)
 

@@ -272,9 +272,6 @@ class ZenohListen(NetworkLink):
         except Exception:  # zenoh raises various errors after its session has ended.
             self._drop(1)
 
-    def _now(self) -> float:
-        return asyncio.get_running_loop().time()
-
 
 def _nothing(_: object) -> None:
     pass

@@ -143,6 +143,9 @@ class NetworkLink(BaseLink):
         self._queue: LoopQueue | None = None  # passes calls of zenoh's threads to the loop
         self._timer: asyncio.TimerHandle | None = None
 
+    def _now(self) -> float:
+        return asyncio.get_running_loop().time()
+
     def _on_release(self, session: Any) -> None:
         """Release the session's objects. ``session`` is None if none is open."""
         raise NotImplementedError
