@@ -5,6 +5,7 @@ import gc
 import os
 import threading
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -25,7 +26,7 @@ from aerokit.transport import link as needed
 from aerokit.transport.zenoh import listen as zenoh_listen
 from aerokit.transport.zenoh.keys import RefusalNotice, Stamp, encode_sent_at
 from aerokit.transport.zenoh.listen import CLIENT_TIMEOUT_S, MAX_CLIENTS, ZenohListen
-from aerokit.transport.zenoh.session import LoopQueue, call
+from aerokit.transport.zenoh.session import LoopQueue
 
 CongestionControl = pytest.importorskip("zenoh").CongestionControl
 pytestmark = pytest.mark.anyio
@@ -393,11 +394,11 @@ async def test_cancelled_while_opening(after_s: float) -> None:
 
 async def test_slow_loop_costs_bounded_memory() -> None:
     taken: list[int] = []
-    queue: LoopQueue[int] = LoopQueue(taken.append, limit=100)
+    queue = LoopQueue(limit=100)
 
     def post() -> None:
         for number in range(10_000):
-            queue.post(number)
+            queue.post(partial(taken.append, number))
 
     thread = threading.Thread(target=post)
     thread.start()
@@ -405,9 +406,9 @@ async def test_slow_loop_costs_bounded_memory() -> None:
     assert queue.dropped == 9_900
     await eventually(lambda: len(taken) == 100)
     assert taken == list(range(9_900, 10_000))
-    queue.post(1)
+    queue.post(partial(taken.append, 1))
     queue.close()
-    queue.post(2)
+    queue.post(partial(taken.append, 2))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert len(taken) == 100
@@ -423,9 +424,9 @@ async def test_loop_queue_continues_after_exception() -> None:
 
     mistakes: list[Any] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: mistakes.append(context))
-    queue: LoopQueue[int] = LoopQueue(take)
+    queue = LoopQueue()
     for number in range(600):
-        queue.post(number)
+        queue.post(partial(take, number))
     await eventually(lambda: len(taken) == 599)
     assert len(mistakes) == 1
 
@@ -500,11 +501,11 @@ async def test_declarations_of_abandoned_opening_are_ignored() -> None:
     vehicle = ZenohListen("north", "alpha")
     for link, declare in ((client_link, "_declare"), (vehicle, "_find_rivals")):
         present: Any = link
-        present._queue = LoopQueue(call)
-        getattr(present, declare)(LoopQueue(call), MagicMock(), MagicMock())
+        present._queue = LoopQueue()
+        getattr(present, declare)(LoopQueue(), MagicMock(), MagicMock())
         assert present._declared == []
         assert present._publisher is None
-    vehicle._serve(LoopQueue(call), MagicMock())
+    vehicle._serve(LoopQueue(), MagicMock())
     assert vehicle._publisher is None
 
 

@@ -162,7 +162,6 @@ class Bus:
         return None
 
     def _deliver_both(self, frame: Frame) -> None:
-        """Deliver a frame. Each sink is called with what it takes: the message, the frame, or both."""
         message = self.dialect.decode(frame)
         for kind, sink in self._entries(frame):
             try:
@@ -185,7 +184,7 @@ class Bus:
                     _report(sink)
 
     def _attach(self, key: tuple[int, int], entry: _Entry, *, ahead: bool = False) -> Detach:
-        """Add a sink for a (system id, message id), behind the others or, with ``ahead``, before them."""
+        """Add a sink behind the others or, with ``ahead``, before them."""
         entries = self._sinks.get(key, ())
         self._sinks[key] = (entry, *entries) if ahead else (*entries, entry)
         self._plans.clear()
@@ -194,11 +193,9 @@ class Bus:
         return once(lambda: self._detach(key, entry))
 
     def _plan(self, frame: Frame) -> _DeliveryPlan:
-        """Return the plan for frames with this system id and message id, and cache it unless it has no sinks.
-
-        A message outside the dialect has no sinks, because it cannot be decoded.
-        """
+        """Return how to deliver frames with this system id and message id."""
         entries = self._entries(frame)
+        # A message outside the dialect has no sinks, because it cannot be decoded.
         if not entries or self.dialect.get(frame.message_id) is None:
             return FRAME, ()
         kinds = {kind for kind, _ in entries}
@@ -233,7 +230,7 @@ class Bus:
 
 
 def _remove_sink(table: dict[Any, tuple[Any, ...]], key: object, sink: object) -> None:
-    """Remove one occurrence of the sink. A delivery that is in progress still uses the tuple with the sink."""
+    # A delivery that is in progress still uses the old tuple.
     remaining = list(table[key])
     remaining.remove(sink)
     table[key] = tuple(remaining)
@@ -417,7 +414,6 @@ class Subscription(Generic[ItemT]):
         self._wake()
 
     def _push(self, item: ItemT) -> None:
-        """Queue an item and wake the reader. Called with each item of the subscribed types."""
         if self._closed:  # An earlier sink of the same delivery has closed this subscription.
             return
         if len(self._queue) < self._capacity:
@@ -436,7 +432,6 @@ class Subscription(Generic[ItemT]):
             self.close(SubscriptionOverflow(f"the reader was too slow: {self._capacity} items are already queued"))
 
     async def _wait(self) -> None:
-        """Wait until an item is queued or the subscription is closed. BusyError if another reader waits."""
         if self._has_reader:
             raise BusyError("another task already reads this subscription; open a second one for another reader")
         self._has_reader, self._waiter = True, asyncio.get_running_loop().create_future()

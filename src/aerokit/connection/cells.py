@@ -230,9 +230,8 @@ class StateCell(Generic[T]):
                 sink.receive(value)
 
     def _add_age(self, seconds: float) -> None:
-        """Add ``seconds`` to the age of the value, because the clock stood still while the computer slept."""
         self._catch_up()
-        self._updated_at -= seconds
+        self._updated_at -= seconds  # The clock stood still while the computer slept.
 
     def forget(self) -> None:
         """Make the value unknown again, e.g. after a reboot. Waiters keep waiting."""
@@ -248,7 +247,6 @@ class StateCell(Generic[T]):
 
     @property
     def _is_watched(self) -> bool:
-        """True while the cell has waiters, observers or iterators, so that every value must be decoded."""
         return bool(self._followers or self._sinks)
 
     def close(self, error: BaseException) -> None:
@@ -359,7 +357,7 @@ class Changes(AsyncIterator[T]):
         return self._cell.value
 
     def _total(self) -> int:
-        """Return the number of received values so far; for `changes()`, only values that differ from the one before."""
+        """Return the number of values, or of changes, received so far."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:
@@ -377,11 +375,9 @@ class _Sink(Generic[T]):
     def receive(self, value: T) -> None:
         raise NotImplementedError
 
-    def forget(self) -> None:
-        """Called when the value became unknown."""
+    def forget(self) -> None: ...
 
-    def fail(self, error: BaseException) -> None:
-        """Called when the cell was closed."""
+    def fail(self, error: BaseException) -> None: ...
 
 
 class _Waiter(_Sink[T]):
@@ -412,7 +408,7 @@ class _Waiter(_Sink[T]):
         self._seen_count = 0  # number of values received, equal ones included
 
     async def wait(self, timeout: float | None, description: str) -> T:
-        """Return the value that met the condition. Raise OperationTimeout after ``timeout`` seconds."""
+        """Return the value that met the condition. Raises OperationTimeout."""
         timer = None if timeout is None else self._loop.call_later(timeout, self._expire, timeout, description)
         try:
             value = await self._future
@@ -426,7 +422,6 @@ class _Waiter(_Sink[T]):
         return value  # type: ignore[return-value]
 
     def receive(self, value: T) -> None:
-        """Check the predicate for a new value: end the wait, or start or stop the timer that measures ``held_for``."""
         if self._future.done():
             return
         self._record(value)
@@ -469,7 +464,6 @@ class _Waiter(_Sink[T]):
             self._seen.append(value)
 
     def _timeout_text(self, timeout: float, description: str) -> str:
-        """Return the text of the time-out error: the condition, the last values, and why no values arrive."""
         text = f"{description or self._cell.name}: not reached within {timeout:g} s; {self._cell._describe()}"
         if self._held_for > 0:
             text += f"; the condition had to be true for {self._held_for:g} s without a break"
@@ -491,7 +485,6 @@ class _Observer(_Sink[T]):
         self._previous = cell.latest  # None if no value is known
 
     def receive(self, value: T) -> None:
-        """Call the callback if the value has changed, or in any case with ``every_arrival``."""
         previous, self._previous = self._previous, value
         if self._every_arrival or previous is None or previous != value:
             try:

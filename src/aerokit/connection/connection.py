@@ -135,7 +135,6 @@ class Connection:
         self._heartbeat = None if heartbeat is None else HeartbeatWatchdog(heartbeat, self._clock, self.bus.publish)
 
     def _make_multilink(self, make_routes: Callable[[], Routes]) -> MultiLinkRoutes:
-        """Create the routes over several links, with one :class:`Routes` for each link."""
         # Imported here because few programs have several links.
         from aerokit.connection.multilink.routes import MultiLinkRoutes
         from aerokit.transport.multilink import MultiLink
@@ -207,7 +206,7 @@ class Connection:
             self._heartbeat.activity.feed()
 
     def _use_activity_monitor(self, activity: ActivityMonitor) -> None:
-        """Pause our heartbeat when the program's own threads hang, even if the event loop's thread still runs."""
+        """Pause our heartbeat when the program's own threads hang."""
         if self._heartbeat is not None:
             self._heartbeat.watch(activity, BLOCKING_MAX_IDLE_S)
 
@@ -368,10 +367,9 @@ class Connection:
         return self._clock()
 
     def _slept_since(self, at: float) -> float:
-        """Return for how many seconds since ``at`` the computer was suspended and the event loop's clock stood still.
+        """Return for how many seconds since ``at`` the computer was suspended.
 
-        If this call is the first to notice a suspension, :class:`ComputerSlept` is published before it returns, and
-        subscribers of this event correct all ages.
+        The call may publish :class:`ComputerSlept`, whose subscribers correct all ages.
         """
         return self._receiver.slept_since(at)
 
@@ -503,7 +501,6 @@ class Connection:
     # ------------------------------------------------------------------------------- internal
 
     async def _open_link(self) -> None:
-        """Open the link. Raise BusyError if another connection has opened it; this connection then never closes it."""
         try:
             await self.link.open(self)
         except BusyError:
@@ -515,7 +512,7 @@ class Connection:
             await self.link.wait_closed()
 
     def _start(self) -> None:
-        """Start the tasks that run until the connection ends. Called once, when the link is open."""
+        """Start the tasks that run until the connection ends."""
         self._state_watch.record_activity(self._clock())
         self._receiver.start()
         self._background.start(self._send_heartbeats, "aerokit heartbeat")
@@ -523,7 +520,6 @@ class Connection:
             self._background.start(self._multilink.watch, "aerokit links")
 
     async def _send_heartbeats(self) -> None:
-        """Once a second, send our heartbeat unless it is paused, and do the other periodic work."""
         while self.is_open:
             if self._heartbeat is not None and self._heartbeat.should_send():
                 self.send(self._heartbeat.message)
@@ -533,7 +529,7 @@ class Connection:
             await anyio.sleep(HEARTBEAT_INTERVAL_S)
 
     def _end(self, error: Exception) -> None:
-        """End the connection because of ``error``, which all waiters and later calls raise. Idempotent."""
+        """End the connection. All waiters and later calls raise ``error``. Idempotent."""
         if not self.is_open:
             return
         self._end_signal.error = error  # Set first: sinks of the events below must find the connection closed.
@@ -551,7 +547,7 @@ class Connection:
         self._background.cancel()
 
     def _try_to_send(self, message: Message) -> bool:
-        """Like :meth:`send`. Return False if the message was certainly not sent, because no link accepted it."""
+        """Send a message. Return False if no link accepted it."""
         return self._encode_and_write(self._encoder, message, None)
 
     def _encode_and_write(self, encoder: FrameEncoder, message: Message, to: int | None) -> bool:
@@ -568,9 +564,8 @@ class Connection:
     def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
         """Write a frame to the peers that lead to the target of ``message``.
 
-        With ``to``, write it to the peers that lead to this system instead. The frame itself is unchanged. A frame
-        without a target goes to all peers. Return False if nothing was sent, because no peer leads to the target, or
-        because the link is lost.
+        ``to`` selects the peers of this system instead. A frame without a target goes to all peers. Returns False if
+        nothing was sent.
         """
         system_id = getattr(message, "target_system", 0) if to is None else to
         peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)
@@ -584,7 +579,6 @@ class Connection:
         return is_written
 
     def _send_to_peer(self, message: Message, peer: Peer) -> None:
-        """Encode a message with the next sequence number, and write it to one peer, e.g. to probe one of the links."""
         data = self._encode(self._encoder, message)
         self.link.write(data, peer)
         self._observers.record_sent(data, self._clock())
@@ -596,7 +590,7 @@ class Connection:
 
 
 def _filter_by_system(system_id: int, sink: Sink) -> Sink:
-    """Wrap a sink so that it gets only events of this system, and events of the whole link (system id 0)."""
+    """Return a sink for the events of this system and of the whole link (system id 0)."""
 
     def filtered(event: Event) -> None:
         if event.system_id in (0, system_id):

@@ -19,9 +19,9 @@ ResultT = TypeVar("ResultT")
 
 
 async def run_exchange(connection: Connection, system_id: int, exchange: Exchange[ResultT]) -> ResultT:
-    """Run ``exchange`` with the vehicle ``system_id`` and return its result.
+    """Run an exchange with a vehicle, and return its result.
 
-    Cancellation ends the exchange immediately. Errors of sending, and the error that ends the connection, are raised.
+    Cancellation ends the exchange at once. Errors of sending, and the error that ends the connection, are raised.
     """
     run = ExchangeRun(connection, exchange)
     with ExitStack() as attachments:
@@ -62,19 +62,16 @@ class ExchangeRun(Generic[ResultT]):
             self._after_step()
 
     def on_link_selected(self, system_id: int, event: LinkSelected) -> None:
-        """Inform the exchange if the link to its system has changed. The first choice of a link is no change."""
         is_first_choice = event.before is None
         if event.system_id == system_id and not is_first_choice:
             self._exchange.link_changed(self._connection.now())
             self._after_step()
 
     def abort(self, error: Exception) -> None:
-        """End the exchange with a copy of this error."""
         self._exchange.abort(copy_exception(error))
         self._after_step()
 
     def _expire(self) -> None:
-        """Inform the exchange that its deadline has passed. Called by the timer."""
         now = self._connection.now()
         if self._deadline is not None:
             # A timer may fire early by the clock's resolution. `expire` would then find that nothing is due yet.
@@ -87,7 +84,7 @@ class ExchangeRun(Generic[ResultT]):
         self._after_step()
 
     def _after_step(self) -> None:
-        """Send what the exchange wants to send, and set its next deadline or end it. Called after each step."""
+        """Send the messages of the exchange, and set its next deadline or end it."""
         exchange = self._exchange
         try:
             for message in exchange.take_outbox():

@@ -85,7 +85,6 @@ class Recording:
             self._waiting.append((raw, at))
 
     def _begin(self, waiting: Iterable[tuple[bytes, float]]) -> None:
-        """Create the file at the first received frame, and write the frames that were sent before."""
         try:
             self._open_new()
         except OSError as error:
@@ -94,9 +93,9 @@ class Recording:
             self._write(raw, at)
 
     def _open_new(self) -> None:
-        """Create the file. A file of this name is renamed, even if another program has just created it."""
         while True:
             try:
+                # Another program may have created the file a moment ago. Mode "x" then fails.
                 self._file = open(self._path, "xb")  # noqa: SIM115 - closed by close()
             except FileExistsError:
                 if (kept := keep_existing(self._path)) is not None:
@@ -106,7 +105,6 @@ class Recording:
                 return
 
     def _write(self, raw: bytes, at: float) -> None:
-        """Write a frame, unless it contains a signing key."""
         contains_key = raw[0] == MAGIC_V2 and raw[7:10] == SETUP_SIGNING_ID
         if self._writer is not None and not contains_key:
             try:
@@ -140,7 +138,6 @@ class Recording:
                 file.close()
 
     def _abort(self, error: OSError) -> None:
-        """End the recording because of an error, which is logged. The connection continues."""
         self._report(error)
         try:
             self._close()
@@ -156,19 +153,16 @@ def _open_without_waiting(path: str, flags: int) -> int:
 
 
 def _check_renamable(path: str | os.PathLike[str]) -> None:
-    """Raise PermissionError if the file cannot be renamed, because its folder does not allow it."""
+    """Raise PermissionError if the folder does not allow renaming the file."""
     if not os.access(os.path.dirname(os.path.abspath(path)), os.W_OK):
         raise PermissionError(errno.EACCES, "the file exists and cannot be renamed: its folder is not writable")
 
 
 def keep_existing(path: str | os.PathLike[str]) -> str | None:
-    """Rename a file to the next free numbered name in its folder: ``flight.tlog`` to ``flight.1.tlog``.
+    """Rename ``flight.tlog`` to ``flight.1.tlog``, or to the next free number. Return the new name.
 
-    Several programs can do so at the same time: none replaces a file of another program. Returns the new name, or None
-    if the file does not exist any more.
-
-    Raises:
-        OSError: the file cannot be renamed.
+    Never replaces a file, even if several programs do this at the same time. Returns None if the file does not exist
+    any more. Raises OSError if it cannot be renamed.
     """
     path = os.fspath(path)
     stem, suffix = os.path.splitext(path)
@@ -207,11 +201,10 @@ class FrameObservers:
 
     @property
     def want_all(self) -> bool:
-        """True if a `Frame` must be created for every received message, even if no subscriber wants the message."""
+        """True if a `Frame` must be created for every received message."""
         return self.recording is not None or bool(self.receive_callbacks)
 
     def add(self, callback: FrameObserver) -> Detach:
-        """Call ``callback`` with each received frame. Returns a function that removes it."""
         self.receive_callbacks = (*self.receive_callbacks, callback)
         self._on_change()
 
@@ -222,7 +215,6 @@ class FrameObservers:
         return once(detach)
 
     def add_sent(self, callback: SentFrameObserver) -> Detach:
-        """Call ``callback`` with each sent frame. Returns a function that removes it."""
         self._send_callbacks = (*self._send_callbacks, callback)
 
         def detach() -> None:

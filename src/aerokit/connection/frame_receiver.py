@@ -66,9 +66,9 @@ class PeerTable:
         yield from self._unverified.values()
 
     def receive_unverified(self, peer: Peer, data: bytes, now: float) -> tuple[Framer, list[Frame]]:
-        """Process bytes of a sender that is not in :attr:`framers`. Return its framer, and the frames to deliver.
+        """Process bytes of a sender without a valid frame so far.
 
-        With its first valid frame, the sender becomes a peer. If there is no room for it, its frames are dropped.
+        Returns its framer, and the frames to deliver.
         """
         framer = self._unverified.get(peer)
         if framer is None:
@@ -84,14 +84,13 @@ class PeerTable:
         return framer, frames
 
     def reset(self) -> None:
-        """Reset the framers after the link was reopened, and register the peers at the new link."""
         for framer in self:
             framer.reset()
         for peer in self.framers:
             self._link.keep_peer(peer)
 
     def forget(self, peer: Peer) -> Framer | None:
-        """Remove a peer here and in the link. Return its framer; None if the peer is unknown."""
+        """Remove a peer here and in the link. Return its framer, or None if the peer is unknown."""
         framer = self.framers.pop(peer, None) or self._unverified.pop(peer, None)
         if framer is not None:
             framer.close()
@@ -177,7 +176,6 @@ class FrameReceiver:
         self._peers.reset()
 
     def receive(self, data: bytes, peer: Peer) -> None:
-        """Deliver the frames in received bytes. Frames that need no checks are delivered together, on a fast path."""
         now = self._clock()
         if now > self._loop_watch.late_after:
             now = self._loop_watch.arrival(now)
@@ -192,6 +190,7 @@ class FrameReceiver:
         if self._bus.one_at_a_time or framer.late or framer.foreign:
             self._check_and_deliver(frames, framer, peer)
             return
+        # Frames that need no checks are delivered together.
         last_delivered = self._bus.deliver_all(frames, self._record_heartbeat, framer, peer)
         if last_delivered is not None:
             # The delivery stopped after this frame, because one of its sinks closed the connection, set a signing key
@@ -202,11 +201,6 @@ class FrameReceiver:
             self._check_and_deliver(remaining, framer, peer)
 
     def _check_and_deliver(self, frames: Iterable[Frame], framer: Framer, peer: Peer) -> None:
-        """Deliver the frames that pass all checks, and pass them to the observers.
-
-        If the connection has a single link, frames are recorded once they have passed the signature check, even if a
-        later check refuses them. Frames of several links are recorded only if they pass all checks.
-        """
         framers, multilink, gate, observers = self.framers, self._multilink, self._gate, self.observers
         # True if frames arrived out of order (late), or may be those of a second sender with the same ids (foreign).
         has_suspects = bool(framer.late or framer.foreign)
@@ -239,7 +233,10 @@ class FrameReceiver:
                 observers.notify_received(frame, peer)
 
     def arrived_at(self) -> float:
-        """Return the receive time of the current frame: now, or earlier if the frame may have waited in the socket."""
+        """Return the earliest possible receive time of the current frame.
+
+        It is before now if the frame may have waited in the socket.
+        """
         now, oldest = self._clock(), self._loop_watch.oldest_arrival
         return now if now < oldest else oldest
 
@@ -247,7 +244,7 @@ class FrameReceiver:
         return (framer.statistics for framer in self._peers)
 
     def counts(self, system_id: int) -> tuple[int, int]:
-        """Return how many frames of this system were received, and how many sequence numbers are missing."""
+        """Return the numbers of received frames and of missing sequence numbers of this system."""
         sources = [
             source
             for statistics in self.statistics()
@@ -257,10 +254,6 @@ class FrameReceiver:
         return sum(source.received for source in sources), sum(source.lost for source in sources)
 
     def _on_blocked(self, seconds: float) -> None:
-        """Publish that the event loop was blocked, and log a warning if it was blocked for long.
-
-        ``seconds`` is the longest time for which the loop can have been blocked, see `LoopWatch`.
-        """
         if seconds >= BLOCKED_WARNING_S:
             logger.warning(
                 "the event loop was blocked for %.1f s: no messages or heartbeats were processed; %s",
@@ -277,7 +270,6 @@ class FrameReceiver:
         self._routes.exclude_pause(self._clock(), paused_s)
 
     def _update_checks(self) -> None:
-        """Use the fast path only while no frame has to be checked or passed to an observer."""
         self._bus.one_at_a_time = (
             self._is_closed
             or self._multilink is not None
@@ -292,16 +284,12 @@ class FrameReceiver:
             self._update_framer(framer)
 
     def _update_framer(self, framer: Framer) -> None:
-        """Make the framer build all frames, including unknown messages, while there are observers."""
         framer.keep_unknown = self.observers.want_all
         framer.wanted = None if framer.keep_unknown else self._bus.wanted
 
     def _is_admitted(self, frame: Frame, is_other_peer: bool) -> bool:
-        """Return True if the signature check admits a frame, or has admitted the same frame over another link.
-
-        A frame that was admitted before is not checked again, because the check would refuse it as a replay.
-        """
-        # `copies` still refers to this frame, because `is_copy` was just called for it.
+        # If the same frame was admitted over another link, it is not checked again, because the check would refuse it
+        # as a replay. `copies` still refers to this frame, because `is_copy` was just called for it.
         if self._multilink is not None and self._multilink.copies.was_admitted:
             return True
         is_admitted = self._gate.admits(frame, may_hand_over=not is_other_peer)
@@ -313,12 +301,7 @@ class FrameReceiver:
         return self._routes.claims_route(frame, peer, framer.counters_of(frame), self._gate.has_verified(frame))
 
     def _must_be_dropped(self, framer: Framer, frame: Frame) -> bool:
-        """Return True for the frames of a second sender with the same ids, and for outdated heartbeats.
-
-        If a frame's sequence number does not continue the earlier ones, a second sender may have sent the frame. A
-        heartbeat is dropped on this suspicion. Other frames are dropped only after the sequence numbers of several
-        frames have proved that there are two senders. The proof is reported.
-        """
+        """Return True for frames of a second sender with the same ids, and for outdated heartbeats."""
         is_foreign = frame in framer.foreign
         if not is_foreign and frame not in framer.late:
             return False
@@ -328,10 +311,10 @@ class FrameReceiver:
             self._routes.record_duplicate_sender(frame)
             if is_foreign:
                 return True
+        # A heartbeat is dropped on mere suspicion, other frames only if two senders are proved.
         return frame.message_id == Heartbeat.ID and (is_foreign or self._routes.is_outdated(frame))
 
     def _record_heartbeat(self, frame: Frame, framer: Framer, peer: Peer) -> None:
-        """Record the route and the content of a heartbeat. Publish the discovery of a new component."""
         heartbeat = self._bus.dialect.decode(frame)
         is_valid_sender = frame.system_id != 0  # 0 is the broadcast address
         if not is_valid_sender or not isinstance(heartbeat, Heartbeat):

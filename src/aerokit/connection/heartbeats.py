@@ -55,17 +55,13 @@ NON_AUTOPILOT_TYPES = frozenset(
 
 
 def is_autopilot(heartbeat: Heartbeat) -> bool:
-    """Return True if the sender is an autopilot, not a ground station, gimbal, camera or other component.
-
-    Some components set autopilot GENERIC instead of INVALID, so their type counts too.
-    """
+    # Some components set autopilot GENERIC instead of INVALID, so their type counts, too.
     return heartbeat.autopilot != MavAutopilot.INVALID and heartbeat.type not in NON_AUTOPILOT_TYPES
 
 
 def discovery_event(
     heartbeat: Heartbeat, at: float, system_id: int, component_id: int
 ) -> VehicleFound | ComponentFound:
-    """Return the event for the first heartbeat of a component."""
     if is_autopilot(heartbeat):
         return VehicleFound(at, system_id, component_id, heartbeat.type, heartbeat.autopilot)
     return ComponentFound(at, system_id, component_id, heartbeat.type)
@@ -112,7 +108,7 @@ class ActivityMonitor:
 
     @property
     def idle_s(self) -> float:
-        """Seconds since the last activity; 0 while a call is pending."""
+        """Seconds since the last activity. 0 while a call is pending."""
         return 0.0 if self.pending_calls else self._clock() - self._fed_at
 
 
@@ -134,13 +130,15 @@ class HeartbeatWatchdog:
         self._paused_at: float | None = None  # None while heartbeats are sent
 
     def watch(self, activity: ActivityMonitor, fed_within_s: float) -> None:
-        """Pause heartbeats while the program is idle longer than the settings allow (default: ``fed_within_s``)."""
+        """Pause heartbeats while the program is idle for too long.
+
+        ``fed_within_s`` is the limit if the settings have none.
+        """
         self.activity = activity
         if self._limit_s is None:
             self._limit_s = fed_within_s
 
     def should_send(self) -> bool:
-        """Return True if the heartbeat may be sent now. Publish an event when heartbeats pause or continue."""
         idle_s = self.activity.idle_s
         limit_s = math.inf if self._limit_s is None else self._limit_s
         now = self._clock()
@@ -177,13 +175,13 @@ class LinkStateTracker:
         return self._cell.latest
 
     def record_activity(self, at: float) -> None:
-        """Record that something was received at this time, which makes the state CONNECTED."""
+        """Record that something was received, which makes the state CONNECTED."""
         self._active_at = at
         if self._cell.latest is not LinkState.CONNECTED:
             self._set(LinkState.CONNECTED, at)
 
     def update(self, now: float, frames: int) -> None:
-        """Record activity if ``frames``, the total number of frames received, has increased; otherwise `check`."""
+        """Update the state. ``frames`` is the total number of frames received."""
         if frames != self._frames:
             self._frames = frames
             self.record_activity(now)
@@ -196,13 +194,12 @@ class LinkStateTracker:
             self._set(LinkState.SILENT, now)
 
     def mark_lost(self, now: float, *, publish: bool = True) -> None:
-        """Set LOST. ``publish=False`` is for a link that the program closed itself: it needs no event."""
+        """Set LOST. Use ``publish=False`` if the program itself closed the link."""
         self._set(LinkState.LOST, now, publish=publish)
 
     def _set(self, state: LinkState, now: float, *, publish: bool = True) -> None:
-        """Set the state, and publish a change. The first state is no change."""
         before = self._cell.latest
         if before is not state:
             self._cell.set(state, self._source)
-            if before is not None and publish:
+            if before is not None and publish:  # The first state is no change.
                 self._bus.publish(LinkStateChanged(now, self._source.system_id, before, state))

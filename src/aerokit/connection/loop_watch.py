@@ -36,7 +36,7 @@ _CLOCKS = tuple(getattr(time, clock) for clock in CLOCKS[sys.platform]) if sys.p
 
 
 def suspended_s() -> float:
-    """Return for how many seconds in total, since boot, the computer was suspended and the loop's clock stood still."""
+    """Return for how many seconds since boot the computer was suspended and the loop's clock stood still."""
     if _CLOCKS is None:
         return 0.0
     total, awake = _CLOCKS
@@ -44,8 +44,8 @@ def suspended_s() -> float:
 
 
 def loop_clock() -> Callable[[], float]:
-    """Return the clock of the running event loop, without the wrapper that asyncio's own loops have around it."""
     loop = asyncio.get_running_loop()
+    # asyncio's own loops have a wrapper around this clock.
     return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time
 
 
@@ -98,7 +98,10 @@ class LoopWatch:
             self._timer = None
 
     def arrival(self, now: float) -> float:
-        """Return the receive time of data that is read now: ``now``, or earlier if data may have waited."""
+        """Return the receive time of data that is read now.
+
+        It is before ``now`` if the data may have waited.
+        """
         if now < self._check_sleep_at and self.oldest_arrival < math.inf:
             # The clocks were checked a moment ago, and data that arrived during the last pause may still be unread.
             self._has_read = True
@@ -116,16 +119,13 @@ class LoopWatch:
         return self._assume_waiting_data()
 
     def slept_since(self, at: float) -> float:
-        """Return how many seconds the computer was suspended since this loop time.
-
-        The timer may notice a suspension 0.2 s late; this method notices it at once.
-        """
+        """Return how many seconds the computer was suspended since this loop time."""
+        # The timer may notice a suspension 0.2 s late.
         if self._timer is not None and self._detect_sleep():
             self._assume_waiting_data()
         return sum(seconds for woke_at, seconds in self._sleeps if woke_at > at)
 
     def _tick(self) -> None:
-        """Report the pause if the timer fired late, and set the timer again."""
         now = self._loop.time()
         late_s = now - self._due
         has_slept = self._detect_sleep()
@@ -139,16 +139,13 @@ class LoopWatch:
             self._on_blocked(late_s + CHECK_INTERVAL_S)
 
     def _detect_sleep(self) -> bool:
-        """Record and report a suspension of the computer since the last call. Return True if there was one.
-
-        Two clocks are compared, one of which stands still in a suspension. On macOS, NTP may adjust only one of them,
-        so they also drift apart slowly. A difference of up to `LATE_THRESHOLD_S` since the last call is thus ignored.
-        """
+        """Report a suspension of the computer since the last call. Return True if there was one."""
         # `_suspended` subtracts two clock readings. Its result is too small if the process was preempted between the
         # readings. The true value never decreases, so the largest result so far is used.
         before = self._suspended_before
         self._suspended_before = max(before, self._suspended())
         slept_s = self._suspended_before - before
+        # On macOS, NTP may adjust only one of the two clocks, so they drift apart slowly.
         if slept_s <= LATE_THRESHOLD_S:
             return False
         self._ran_at -= slept_s  # The loop's clock stood still during the sleep, in which data may have arrived.
@@ -157,14 +154,13 @@ class LoopWatch:
         return True
 
     def _set_timer(self, now: float) -> None:
-        """Record that the loop runs at time ``now``, and set the timer for the next check."""
         self._ran_at, self._due = now, now + CHECK_INTERVAL_S
         if self.oldest_arrival == math.inf:
             self.late_after = now + CHECK_INTERVAL_S / 2
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _assume_waiting_data(self) -> float:
-        """Set the receive time of data that is read from now on to the time when the loop last ran, and return it."""
+        """Assume that data has waited since the loop last ran. Return that time."""
         if self.oldest_arrival == math.inf:
             self.oldest_arrival = self._ran_at
             self.late_after = -math.inf
@@ -173,7 +169,6 @@ class LoopWatch:
         return self.oldest_arrival
 
     def _end_assumption_when_idle(self) -> None:
-        """Stop assuming that data has waited, once nothing was read for `MIN_IDLE_ITERATIONS` loop iterations."""
         self._idle_iterations = 0 if self._has_read else self._idle_iterations + 1
         self._has_read = False
         if self._timer is None:  # The connection is closed.
@@ -195,7 +190,7 @@ IPYTHON_HINT = (
 
 
 def is_unintegrated_ipython() -> bool:
-    """Return True in terminal IPython without ``%gui asyncio``, where the event loop stands still at the prompt."""
+    """Return True in terminal IPython without ``%gui asyncio``."""
     # `%gui asyncio` sets `active_eventloop`. Without it, IPython has an event loop of its own, which runs only while
     # entered code runs.
     module = sys.modules.get("IPython.terminal.interactiveshell")

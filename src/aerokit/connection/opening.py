@@ -128,10 +128,8 @@ async def open_connection(
 
 
 def _import_messages() -> None:
-    """Import the messages that vehicles send, before the link opens.
-
-    An import at the first frames would block the event loop: 20 ms of CPU time, 200 ms without cached bytecode.
-    """
+    # Messages that vehicles send are imported before the link opens. An import at the first frames would block the
+    # event loop: 20 ms of CPU time, 200 ms without cached bytecode.
     for name in ("ardupilotmega", "common_more"):
         import_module(f"aerokit.mavlink.messages.{name}")
 
@@ -139,7 +137,6 @@ def _import_messages() -> None:
 def _create_link(
     address: str | Link | Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None
 ) -> Link:
-    """Create the link for the ``address`` argument of `open_connection`, or return the link object given there."""
     if isinstance(address, str):
         make_link = partial(create_link, address, baud=baud, peers=peers)
         return ReconnectingLink(make_link) if reconnect else make_link()
@@ -156,7 +153,6 @@ def _create_link(
 
 
 def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: bool, peers: PeerFilter | None) -> Link:
-    """Create one link from a list of addresses and links. A list of one item gives that item's link."""
     if not isinstance(addresses, (list, tuple)) or not all(isinstance(address, (str, Link)) for address in addresses):
         raise InvalidArgument(
             f"address = {short_repr(addresses)} is not allowed: it must be an address, a link, or a list of them"
@@ -191,7 +187,6 @@ def _create_multilink(addresses: Sequence[str | Link], baud: int, reconnect: boo
 
 
 def _check_that_peers_apply(targets: Sequence[Link | LinkAddress]) -> None:
-    """Raise InvalidArgument if a target is a Link object, or if ``peers`` would apply to none of the addresses."""
     if any(isinstance(target, Link) for target in targets):
         raise InvalidArgument(PEERS_WITH_LINK_OBJECT)
     if not any(getattr(target, "kind", None) in FILTERING_KINDS for target in targets):
@@ -199,14 +194,10 @@ def _check_that_peers_apply(targets: Sequence[Link | LinkAddress]) -> None:
 
 
 def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | LinkAddress]) -> None:
-    """Raise InvalidArgument if an address is listed twice.
-
-    Without this check, its second link would fail to open, and the error would look like a broken link.
-    """
     seen: set[object] = set()
     for address, target in zip(addresses, targets):  # noqa: B905 - equal lengths
         key = _target_key(target)
-        if key in seen:
+        if key in seen:  # The second link would fail to open, and the error would look like a broken link.
             raise InvalidArgument(
                 f"address = {short_repr(addresses)} is not allowed: {short_repr(address)} is listed twice"
             )
@@ -215,10 +206,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return the key of an address. Only one address with the same key can be open at a time.
-
-    The key is None if the system chooses the port or pty.
-    """
+    """Return a key that only one open link can have. None if the system chooses the port or pty."""
     if isinstance(target, Link):
         return id(target)
     gets_new_endpoint = (target.kind in ("udpin", "tcpin") and not target.port) or (
@@ -243,7 +231,6 @@ MAX_LISTED_IDS = 5
 
 
 def explain_no_vehicle(connection: Connection, wanted_system: int | None) -> str:
-    """Return the reason why no vehicle was found on a link, derived from the received data."""
     return _Diagnosis(connection, wanted_system).text()
 
 
@@ -264,7 +251,6 @@ class _Diagnosis:
         self._systems = {system for counters in statistics for system, _ in counters.sources}
 
     def text(self) -> str:
-        """Return the most likely reason why the wanted vehicle was not found."""
         if not self._bytes:
             return "no bytes were received: is the vehicle on, and is it sending to this address?"
         if not self._frames:
@@ -274,7 +260,6 @@ class _Diagnosis:
         return self._without_vehicle()
 
     def _without_frames(self) -> str:
-        """Return the most likely reason why no valid frame was found in the received bytes."""
         # Noise contains a few patterns that look like frames of an unknown dialect. An unknown dialect is therefore
         # only diagnosed if most bytes belong to frames.
         received = f"{self._bytes} bytes were received"
@@ -292,7 +277,6 @@ class _Diagnosis:
         return f"{received}, but no MAVLink frame: wrong baud rate, or another protocol?"
 
     def _without_heartbeats(self) -> str:
-        """Return why there is no accepted heartbeat among the received frames."""
         received = f"{self._frames} frames were received"
         if self._signature_problems:
             return f"{received}; {self._signature_problems}"
@@ -301,7 +285,6 @@ class _Diagnosis:
         return f"{received}, but no HEARTBEAT among them"
 
     def _without_vehicle(self) -> str:
-        """Return whose heartbeats were received instead of those of the wanted vehicle."""
         autopilots = sorted({system for (system, _), heartbeat in self._heartbeats.items() if is_autopilot(heartbeat)})
         if autopilots:
             names = ", ".join(map(str, autopilots))

@@ -64,7 +64,6 @@ class RouteClaim:
         self.is_refusal_reported: bool = False
 
     def add(self, frame: Frame, evidence: Evidence) -> None:
-        """Add a frame of the peer, and what it proves."""
         expected, sequence_matches, clock_matches = evidence
         if expected != self._expected:  # The owner has sent frames since the last call, so the claim starts again.
             self._expected = expected
@@ -88,10 +87,9 @@ class RouteClaim:
     def has_replaced(self, now: float, rate: float) -> bool:
         """Return True if the claim proves that the new peer has replaced the owner.
 
-        The peer must have sent at least three frames, which must continue the owner's stream. The claim must also have
-        lasted as long as the owner needs for three frames at its ``rate`` (frames per second). A frame of the owner
-        ends the claim.
+        ``rate`` is the owner's number of frames per second.
         """
+        # The claim must last as long as the owner needs for three frames. A frame of the owner ends it.
         return (
             self.continues_owner
             and self._frames >= CLAIM_MIN_FRAMES
@@ -100,12 +98,11 @@ class RouteClaim:
 
     @property
     def may_continue_owner(self) -> bool:
-        """True unless the evidence proves that the new peer is not the owner itself."""
+        """False if the evidence proves that the new peer is not the owner itself."""
         return self._sequence_matches is not False and self._clock_matches is not False
 
 
 def boot_time_ms(frame: Frame) -> int | None:
-    """Return the sender's time since boot in milliseconds; None if the frame contains no such time."""
     offset = _BOOT_TIME_OFFSETS.get(frame.message_id)
     return None if offset is None else int.from_bytes(frame.body[offset : offset + 4], "little")
 
@@ -212,9 +209,8 @@ class Routes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers to which a message for a component is sent.
 
-        It is sent to the peer of the component; if the component is 0 or unknown, to all peers of the system; if the
-        system is 0 or unknown, to every peer. A peer of the system is left out if it belongs to a second vehicle with
-        the same system id, which would also execute the message.
+        If the component is 0 or unknown, these are all peers of the system. If the system is 0 or unknown, it is every
+        peer.
         """
         if system_id == 0:
             return EVERY_PEER
@@ -223,6 +219,7 @@ class Routes:
         if route is not None:
             return (route.peer,)
         peers = {route.peer for (system, _), route in self._routes.items() if system == system_id}
+        # A second vehicle with the same system id would also execute the message.
         if len(peers) > 1:
             peers -= self._peers_of_duplicate_autopilots(system_id)
         return peers or EVERY_PEER
@@ -233,9 +230,9 @@ class Routes:
         return route is not None and route.peer != peer
 
     def claims_route(self, frame: Frame, peer: Peer, counters: SourceStatistics | None, is_signed: bool) -> bool:
-        """Record the claim of ``peer`` to the route of this frame's sender; return True if the route was moved to it.
+        """Record the claim of ``peer`` to the sender's route. Return True if the route was moved to it.
 
-        See the class for the rules. A claim that is refused, and a move, are published.
+        Refused claims and moves are published.
         """
         source, now = (frame.system_id, frame.component_id), frame.received_at
         route = self._routes[source]
@@ -252,25 +249,20 @@ class Routes:
         return False
 
     def exclude_pause(self, now: float, paused_s: float) -> None:
-        """Do not count the last ``paused_s`` seconds as silence, because the event loop was blocked and read nothing.
-
-        Otherwise a vehicle with the same ids could take over a route before the owner's next heartbeat.
-        """
+        """Do not count the last ``paused_s`` seconds as silence, because the event loop read nothing."""
+        # Otherwise a vehicle with the same ids could take over a route before the owner's next heartbeat.
         for route in self._routes.values():
             route.silent_since = min(now, route.silent_since + paused_s)
 
     def record_duplicate_sender(self, frame: Frame) -> None:
-        """Record that two senders behind one peer, the owner of the route, both use the ids of this frame."""
+        """Record that two senders behind one peer use the ids of this frame."""
         claim = self._claim((frame.system_id, frame.component_id), _SAME_PEER)
         if not claim.is_duplicate_reported:
             claim.is_duplicate_reported = True
             self._publish(DuplicateSender(frame.received_at, frame.system_id, frame.component_id))
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Drop the claims of the first peer without a live component, and return the peer; None if there is none.
-
-        A component is live if its system has a vehicle object, or if it sent a heartbeat in the last 30 s.
-        """
+        """Drop the claims of an idle peer, and return the peer. None if no peer is idle."""
         live = {
             route.peer
             for (system_id, _), route in self._routes.items()
@@ -281,7 +273,7 @@ class Routes:
         return evicted
 
     def _peers_of_duplicate_autopilots(self, system_id: int) -> set[Peer]:
-        """Return the peers reported as duplicates: they send as the autopilot, but another peer owns its route."""
+        """Return the peers that send as the autopilot although another peer owns its route."""
         autopilot = system_id, MavComponent.AUTOPILOT1
         return {
             peer
@@ -290,7 +282,6 @@ class Routes:
         }
 
     def _claim(self, source: ComponentId, peer: Peer) -> RouteClaim:
-        """Return the claim of this peer to the component's route; make one if there is none."""
         key = source, peer
         claim = self._claims.get(key)
         if claim is None:
@@ -300,7 +291,6 @@ class Routes:
         return claim
 
     def _evidence(self, route: _Route, frame: Frame) -> Evidence:
-        """Return whether a frame's sequence number and time since boot continue those of the route's owner."""
         sequence_matches: bool | None = None
         silent_s = max(frame.received_at - route.heartbeat_at, 0.0)
         expected = 0
@@ -325,22 +315,18 @@ class Routes:
         return Evidence(expected, sequence_matches, clock_matches)
 
     def _move_route(self, route: _Route, frame: Frame, peer: Peer) -> None:
-        """Send to ``peer`` from now on. Drop the claims of all peers to the route: they refer to its old owner."""
         before, route.peer = route.peer, peer
         # The frame counts as a heartbeat, so that the new peer has time for its first one.
         route.heartbeat_at = route.silent_since = frame.received_at
         route.counters, route.rate = None, 0.0
         source = frame.system_id, frame.component_id
+        # All claims to the route refer to its old owner.
         self._claims = {
             (claimed, claimer): claim for (claimed, claimer), claim in self._claims.items() if claimed != source
         }
         self._publish(RouteChanged(frame.received_at, *source, _peer_name(before), _peer_name(peer)))
 
     def _report(self, claim: RouteClaim, frame: Frame, peer: Peer, *, is_silent: bool, is_same_host: bool) -> None:
-        """Publish DuplicateSender for a second sender, and RouteChangeRefused if it claims the route of a silent owner.
-
-        For each peer, DuplicateSender is published once, RouteChangeRefused once during each silence of the owner.
-        """
         source = frame.system_id, frame.component_id
         may_be_owner = is_same_host and claim.may_continue_owner  # The owner may just have changed its port.
         if not claim.is_duplicate_reported and not may_be_owner:
@@ -357,7 +343,7 @@ class Routes:
             self._publish(RouteChangeRefused(frame.received_at, *source, _peer_name(peer)))
 
     def _sweep(self, now: float) -> bool:
-        """Remove expired routes, at most once a second. Return True if there is room for another route."""
+        """Remove expired routes. Return True if there is room for another route."""
         if now - self._swept_at >= SWEEP_INTERVAL_S:
             self._swept_at = now
             self._routes = {
@@ -372,7 +358,6 @@ _SAME_PEER = object()  # stands for the peer in claims of a second sender that s
 
 
 def _peer_name(peer: Peer) -> str:
-    """Return the address of a peer for logs and events."""
     peer = getattr(peer, "peer", peer)  # A peer of a MultiLink contains the peer of one of its links.
     if isinstance(peer, tuple) and len(peer) >= 2:
         host, port = peer[:2]

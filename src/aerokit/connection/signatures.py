@@ -55,22 +55,17 @@ class SignatureGate:
         self._update()
 
     def check_version(self, mavlink_version: int) -> None:
-        """Raise InvalidArgument if the key, or the new key of a handover, cannot be used with this MAVLink version."""
+        """Raise InvalidArgument if a key is set and this MAVLink version has no signatures."""
         check_signing(self._encoder.signing, mavlink_version)
         if self._handover is not None:
             check_signing(self._handover.signing, mavlink_version)
 
     @contextmanager
     def key_handover(self, signing: Signing | None, system_id: int, component_id: int) -> Iterator[asyncio.Event]:
-        """Switch to ``signing`` when frames received during the block show that the component uses the new key.
+        """Switch to ``signing`` when frames of the component show that it uses the new key.
 
-        The old key signs and verifies until the switch, which sets the yielded event. One frame signed with the new key
-        causes the switch. If ``signing`` is None, the component stops signing. The switch then needs at least
-        `MIN_UNSIGNED_FRAMES` unsigned frames over `MIN_UNSIGNED_S` without a signed one, because any sender could forge
-        a few.
-
-        Raises:
-            BusyError: another handover is in progress.
+        The old key signs and verifies until the switch, which sets the yielded event. None means that the component
+        stops signing. Raises BusyError if another handover is in progress.
         """
         check_signing(signing, self._encoder.version)
         if self._is_handing_over:
@@ -90,9 +85,9 @@ class SignatureGate:
         self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
-        """Return True if a frame may be delivered. Within :meth:`key_handover`, the frame may cause the switch of keys.
+        """Return True if a frame may be delivered. It may cause the switch of :meth:`key_handover`.
 
-        ``may_hand_over`` is False for a frame from another peer than its component's, which must not cause the switch.
+        ``may_hand_over`` is False for a frame from another peer than its component's.
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
@@ -118,15 +113,12 @@ class SignatureGate:
         return refusal is None
 
     def has_verified(self, frame: Frame) -> bool:
-        """Return True if an admitted frame has a signature that was verified with our key.
-
-        False for frames that need no signature: they are admitted with any, also a forged or replayed one.
-        """
+        """Return True if an admitted frame has a signature that was verified with our key."""
+        # A frame that may be unsigned is admitted with any signature, also a forged or replayed one.
         signing = self._encoder.signing
         return signing is not None and bool(frame.incompat_flags & SIGNED) and not signing.may_be_unsigned(frame)
 
     def _report(self, frame: Frame, signing: Signing, refusal: Refusal) -> None:
-        """Log a refusal and publish it as an event. Called for the first refusal of each reason."""
         source = frame.system_id, frame.component_id
         logger.warning(
             "a frame of %d/%d was refused: %s (%r); further frames refused for this reason are counted, but not logged",
@@ -137,7 +129,6 @@ class SignatureGate:
         self._publish(FrameRefused(frame.received_at, *source, refusal.value))
 
     def log_storage_errors(self) -> None:
-        """Log once when the file of ``Signing(keep=…)`` cannot be written."""
         signing = self._encoder.signing
         error = None if signing is None else signing.keep_error
         if error is not None and self._logged_keep_error is None:
@@ -145,10 +136,10 @@ class SignatureGate:
         self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Return how signatures may block communication, for error texts; "" if there is no sign of it.
+        """Return how signatures may block communication, for error texts. Empty if they do not seem to.
 
-        With a key, the text lists the frames refused so far, from all senders. Without a key, it says that a sender of
-        ``heartbeats`` signs its frames.
+        With a key, the text lists the frames refused so far. Otherwise it says that a sender of ``heartbeats`` signs
+        its frames.
         """
         signing = self._encoder.signing
         if signing is not None:
@@ -178,10 +169,7 @@ class _Handover:
         return (frame.system_id, frame.component_id) == self._source
 
     def is_completed_by(self, frame: Frame, unix_time_s: float) -> bool:
-        """Process a frame of the component. Return True if it proves that the component has changed its key.
-
-        The proof is a frame signed with the new key or, if the new key is None, a long enough run of unsigned frames.
-        """
+        """Process a frame of the component. Return True if it proves the change of the key."""
         if self.signing is not None:
             return self.signing.would_accept(frame, unix_time_s)
         if _is_signed_with_a_key(frame):
@@ -190,6 +178,7 @@ class _Handover:
         self._unsigned_count += 1
         if self._unsigned_count == 1:
             self._unsigned_since = frame.received_at
+        # Any sender could forge a few unsigned frames.
         is_long_enough = frame.received_at - self._unsigned_since >= MIN_UNSIGNED_S
         return is_long_enough and self._unsigned_count >= MIN_UNSIGNED_FRAMES
 

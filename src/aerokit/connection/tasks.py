@@ -35,7 +35,7 @@ class BackgroundTasks:
         return len(self._tasks)
 
     def start(self, function: Callable[[], Awaitable[None]], name: str | None = None) -> asyncio.Task[None] | None:
-        """Run ``function()`` in a new task, and return the task. Does nothing after :meth:`cancel`, and returns None.
+        """Run ``function()`` in a new task, and return the task. Return None after :meth:`cancel`.
 
         A task that is cancelled before its first step never calls the function.
         """
@@ -76,13 +76,14 @@ class BackgroundTasks:
 
 
 async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
-    """Await ``work`` to its end, even if the caller is cancelled (by asyncio or anyio, once or repeatedly).
+    """Await ``work`` to its end, even if the caller is cancelled.
 
-    The work must be bounded in time. When it has ended, the cancellation is raised; if the work has failed, its
-    exception is the cause. A shield of anyio alone would let ``task.cancel()`` and ``asyncio.timeout`` through.
+    The cancellation is raised afterwards. If the work has failed, its exception is the cause. The work must be bounded
+    in time.
     """
     task = asyncio.get_running_loop().create_task(work)
     cancelled: asyncio.CancelledError | None = None  # a cancellation of the caller, to be raised at the end
+    # A shield of anyio alone would let `task.cancel()` and `asyncio.timeout` through.
     with anyio.CancelScope(shield=True):
         while not task.done():
             try:
@@ -106,7 +107,6 @@ class Cancellation:
         self._is_cancelled = False
 
     def cancel(self) -> None:
-        """Cancel the code inside the scope, except for shielded parts. Idempotent."""
         self._is_cancelled = True
         if self._scope is not None:
             self._scope.cancel()
@@ -150,7 +150,6 @@ class Deadlines:
         self._schedule(at)
 
     def cancel(self, alarm: Alarm) -> None:
-        """Remove the deadline of ``alarm``, if it has one."""
         self._deadlines.pop(alarm, None)
 
     def close(self) -> None:
@@ -160,13 +159,9 @@ class Deadlines:
             self._timer = None
 
     def _fire(self, timer_at: float) -> None:
-        """Call the alarms that are due, and set the timer for the next one.
-
-        An alarm is due if the timer was set for its time or later. The clock is not read, because a loop may fire a
-        timer slightly early.
-        """
         self._timer = None
         try:
+            # The clock is not read, because a loop may fire a timer slightly early.
             for alarm in [alarm for alarm, at in self._deadlines.items() if at <= timer_at]:
                 # Another alarm of this list may have cancelled this one, or set it to a later time.
                 if self._deadlines.get(alarm, math.inf) <= timer_at:
@@ -177,7 +172,6 @@ class Deadlines:
                 self._schedule(min(self._deadlines.values()))
 
     def _schedule(self, at: float) -> None:
-        """Set the timer to ``at``, unless it fires earlier anyway."""
         if self._timer is not None and self._timer_at <= at:
             return
         if self._timer is not None:

@@ -50,18 +50,16 @@ class AdaptiveWindow:
 
     @property
     def size(self) -> int:
-        """Maximum number of requests in flight."""
         return int(self._size)
 
     def widen(self, size: float) -> None:
-        """Raise the number of requests in flight to ``size``, but at most to half of ``max_size``."""
+        """Raise the window to ``size`` requests, up to half of ``max_size``."""
         self._size = max(self._size, min(size, self._max_size / 2))
 
     def on_answer(self, seconds: float | None) -> None:
-        """Record an answer.
+        """Record an answer that arrived ``seconds`` after its request.
 
-        ``seconds`` is the time since the request. It is None if the time does not describe the link, because it is
-        unknown which transmission was answered, or because the server was busy.
+        None means that the time does not describe the link.
         """
         self._loss -= LOSS_WEIGHT * self._loss  # The average moves towards 0 with an answer, towards 1 with a loss.
         if seconds is None:
@@ -74,7 +72,6 @@ class AdaptiveWindow:
             self._size = max(self._min_size, self._size - NARROWING)
 
     def on_loss(self) -> None:
-        """Record a request without an answer."""
         self._loss += LOSS_WEIGHT * (1.0 - self._loss)
         if self._loss > MAX_LOSS:
             self._size = max(self._min_size, self._size / 2)
@@ -120,30 +117,27 @@ class BlockRequests:
 
     @property
     def deadline(self) -> float | None:
-        """Time for the next `take_due`: an answer is overdue, or a request may be sent. None: nothing is in flight."""
+        """Time at which to call `take_due` next. None means that nothing is in flight."""
         overdue_at = min((self._due_at(block) for block in self._in_flight.values()), default=None)
         if self._must_wait_to_send and overdue_at is not None:
             return min(overdue_at, self._next_send_at)
         return overdue_at
 
     def request(self, offset: int) -> None:
-        """Queue a request for this block, unless such a request is waiting or in flight."""
         if offset not in self._in_flight:
             self._waiting[offset] = None
 
     def discard(self, offset: int) -> None:
-        """Drop the request for a block, for example because the block arrived in a burst."""
         self._waiting.pop(offset, None)
         self._in_flight.pop(offset, None)
         self._sent_blocks.pop(offset, None)
 
     def discard_from(self, end: int) -> None:
-        """Drop the requests for all blocks from ``end`` on."""
         for offset in [offset for offset in (*self._waiting, *self._in_flight) if offset >= end]:
             self.discard(offset)
 
     def set_busy(self, until: float) -> None:
-        """Suspend timeouts and round-trip measurements until this time, because the server is sending a burst."""
+        """Suspend timeouts and round-trip measurements until this time, while the server sends a burst."""
         self._busy_until = until
 
     def on_answer(self, offset: int, now: float, *, sent_at: float | None = None) -> None:
@@ -166,7 +160,7 @@ class BlockRequests:
             self._requeue_overtaken(block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
-        """Return when the transmission that was answered was sent; None if several may have been answered."""
+        """Return None if it is unknown which transmission was answered."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0
@@ -174,10 +168,9 @@ class BlockRequests:
         return block.previous_sent_at if is_too_early else None
 
     def take_due(self, now: float, *, limit: int | None = None) -> list[int]:
-        """Return the offsets to request now, and count them as sent. Overdue blocks come first.
+        """Return the offsets to request now, and count them as sent.
 
-        At most ``limit`` requests are in flight, and no more than the window allows. The first ``batch_size`` of them
-        are sent without delay, further ones ``spacing_s`` seconds apart.
+        Overdue blocks come first. At most ``limit`` requests are in flight.
         """
         overdue = [offset for offset, block in self._in_flight.items() if self._due_at(block) <= now]
         self._requeue(overdue)
@@ -199,7 +192,6 @@ class BlockRequests:
         return due
 
     def _due_at(self, block: _BlockRequest) -> float:
-        """Return the time at which the answer to a request is overdue."""
         backoff_attempt = max(1, self._timeouts - TIMEOUTS_BEFORE_BACKOFF)
         return max(block.sent_at, self._busy_until) + self._round_trip.timeout_s(backoff_attempt)
 
@@ -213,7 +205,6 @@ class BlockRequests:
         self._in_flight[offset] = block
 
     def _requeue_overtaken(self, number: int) -> None:
-        """Queue those requests again that were sent long before transmission ``number``, which was answered first."""
         overtaken = []
         for offset, block in self._in_flight.items():
             if block.transmission_number > number - OVERTAKEN:
@@ -222,7 +213,6 @@ class BlockRequests:
         self._requeue(overtaken)
 
     def _requeue(self, offsets: list[int]) -> None:
-        """Record that these requests were lost, and queue them again, before all that wait."""
         for offset in offsets:
             del self._in_flight[offset]
             self.window.on_loss()
@@ -260,7 +250,7 @@ class Reassembly:
 
     @property
     def received_bytes(self) -> int:
-        """Number of bytes received, including those before offset ``start``, which an earlier download received."""
+        """Number of bytes received, including those before ``start``."""
         return self.position + self._bytes_ahead
 
     @property
@@ -268,7 +258,10 @@ class Reassembly:
         return self.end is not None and self.position >= self.end
 
     def add(self, offset: int, data: bytes) -> bool:
-        """Add a block, and return True if it was missing. A block shorter than ``block_size`` ends the file."""
+        """Add a block. Return True if it was missing.
+
+        A block shorter than ``block_size`` ends the file.
+        """
         is_aligned = (offset - self.start) % self.block_size == 0
         if not data or not is_aligned or not self._is_missing(offset):
             return False
@@ -287,7 +280,7 @@ class Reassembly:
         return True
 
     def end_at(self, end: int) -> None:
-        """Set the size of the file, unless a smaller size is known."""
+        """Set the size of the file. A size larger than the known one is ignored."""
         if self.end is not None and self.end <= end:
             return
         self.end = end
@@ -300,9 +293,10 @@ class Reassembly:
         self.tail = max(end, self.position)  # Data beyond the end may already have been written.
 
     def missing(self, size: int | None = None) -> tuple[tuple[int, int], ...]:
-        """Return the missing ranges as (offset, length); ``size`` is the expected size of the file, if known.
+        """Return the missing ranges as (offset, length).
 
-        A range of length 0 extends to the unknown end of the file.
+        ``size`` is the expected size of the file, if known. A range of length 0 extends to the unknown end of the
+        file.
         """
         ranges: list[tuple[int, int]] = []
         for offset in self.gaps:

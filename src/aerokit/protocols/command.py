@@ -310,7 +310,6 @@ class CommandExchange(Exchange[CommandAck]):
             self._time_out(now)
 
     def _expire_order(self, order_status: OrderStatus, now: float) -> None:
-        """Repeat an order after a new HEARTBEAT. Fail if the order has an ``end``, or if its time is over."""
         if order_status.end:
             self._time_out(now, f"; not sent again: {order_status.end}")
             return
@@ -327,7 +326,6 @@ class CommandExchange(Exchange[CommandAck]):
             self.deadline = min(now + POLL_INTERVAL_S, give_up_at)
 
     def _why_not_repeated(self) -> str:
-        """Return the end of the error text: why the order was not sent more often; empty after the last attempt."""
         if self._sent_count < self._attempts:
             return "; not sent again: no HEARTBEAT received since then"
         if self._attempts == 1 and allowed_attempts(self._message.command, _params_of(self._message)) == 1:
@@ -377,7 +375,6 @@ class CommandExchange(Exchange[CommandAck]):
         return self._sent_count - self._dropped_count
 
     def _time_out(self, now: float, why_not_repeated: str = "") -> None:
-        """Fail; the end of the error text says why the command was not sent again."""
         was_sent = self._transmitted_count > 0
         text = self._timeout_text(now) + (why_not_repeated if was_sent else "")
         self._fail(CommandTimeout(text, was_sent=was_sent))

@@ -95,7 +95,6 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._end_stream()
 
     def _on_value(self, setting: Setting, index: int, count: int, now: float) -> None:
-        """Store a value of the stream, or an answer to a request. Request indices that the stream has left out."""
         is_streamed = self._is_streaming and index >= self._next_index
         if is_streamed:
             for missing in range(self._next_index, index):
@@ -123,7 +122,6 @@ class SettingList(ValueList[dict[str, Setting], Setting]):
             self._window.request(index)
 
     def _conclude(self) -> None:
-        """Finish, if all values are known and none is stale. Stale values are requested again."""
         if self._is_streaming or self._count is None:
             return
         if len(self._received) >= self._count and not self._missing():
@@ -161,7 +159,6 @@ class SettingReads(NamedReads[Setting]):
         self._is_probe_wanted = bool(self._overdue(now))
 
     def _on_message(self, message: Message, now: float) -> None:
-        """Process the answer to a probe, or the value of a requested name. A message may be both."""
         if not isinstance(message, ParamExtValue):
             return
         name = message.param_id
@@ -244,7 +241,6 @@ class SettingWrite(Transfer[Setting]):
             self._read(now)
 
     def _on_ack(self, result: int, reported: Setting, now: float) -> None:
-        """Process PARAM_EXT_ACK: finish, wait for a slow write, read the value again, or fail."""
         if result == ParamAck.ACCEPTED and settings_equal(reported.value, self._value):
             self._measure(now)
             self._finish(reported)
@@ -262,7 +258,7 @@ class SettingWrite(Transfer[Setting]):
             self._fail(ParameterRejected(f"{self._name} was refused: {reason}", name=self._name, code=result))
 
     def _on_unexpected_value(self, reported: Setting, now: float) -> None:
-        """Process a value that differs from the requested one. Write or read it again, until enough answers are equal.
+        """Write or read again until enough equal answers have arrived.
 
         The result is then the reported value. If that is the value from before the write, the write has failed.
         """

@@ -396,7 +396,6 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._wait(now)
 
     def _receive_other(self, reply: FtpMessage, now: float) -> None:
-        """Process a reply to another request: ignore it, unless it shows that a burst delays TERMINATESESSION."""
         # ArduPilot answers TERMINATESESSION only after the current burst, so the blocks of the burst count as progress.
         if self._request.opcode == MavFtpOpcode.TERMINATESESSION and reply.session == self._request.session:
             self._progress_at = now
@@ -409,7 +408,6 @@ class FtpRequest(FtpExchange[FtpMessage]):
             self._fail(self._refused(reply))
 
     def _is_already_done(self, reply: FtpMessage) -> bool:
-        """Return True if this NAK only means that the operation was executed before."""
         opcode = self._request.opcode
         if opcode == MavFtpOpcode.TERMINATESESSION:
             # Any NAK means that there is no session, because ArduPilot and PX4 refuse a close for no other reason. The

@@ -73,16 +73,14 @@ class _Burst(NamedTuple):
     sent_at: float
 
     def blocks_before(self, reply: FtpMessage) -> int:
-        """Return the number of blocks sent before this reply to the burst."""
         return (reply.sequence - self.sequence - 1) % SEQUENCE_COUNT
 
     def contains(self, reply: FtpMessage) -> bool:
-        """Return True if this block may belong to the burst: its sequence number and its offset match."""
         blocks, remainder = divmod(reply.offset - self.offset, DATA_SIZE)
         return remainder == 0 and blocks >= 0 and blocks % SEQUENCE_COUNT == self.blocks_before(reply)
 
     def file_end(self, reply: FtpMessage) -> int | None:
-        """Return the end of the file according to this NAK; None if the NAK does not belong to this burst."""
+        """Return the end of the file, or None if this NAK does not belong to the burst."""
         blocks = self.blocks_before(reply)
         if blocks == 0:
             return self.offset
@@ -144,6 +142,7 @@ class FtpDownload(FtpExchange[int]):
         if self._is_idle(now):
             self._fail(self._timeout_error())
             return
+        # The burst has ended, or its request was lost.
         if self._is_bursting and now >= self._next_block_deadline:
             self._is_bursting = False
             self._failed_bursts += 1
@@ -163,7 +162,6 @@ class FtpDownload(FtpExchange[int]):
             self._proceed(now)
 
     def _receive_burst(self, reply: FtpMessage, now: float) -> None:
-        """Process a block of a burst, or the NAK that ends a burst. Replies to earlier bursts may still arrive."""
         for burst in reversed(self._bursts):
             if reply.is_ack:
                 if burst.contains(reply):
@@ -187,7 +185,6 @@ class FtpDownload(FtpExchange[int]):
         self._add(reply.offset, reply.data, now)
 
     def _record_block(self, burst: _Burst, number: int, now: float) -> None:
-        """Record that block ``number`` of a burst has arrived: as progress, and to estimate the speed of the link."""
         # Blocks that a repeated burst sends again also count as progress, because they show that the server works. The
         # number of such bursts is limited, so that the download cannot go on forever.
         is_further = number > self._highest_blocks.get(burst.sequence, -1)
@@ -211,7 +208,6 @@ class FtpDownload(FtpExchange[int]):
             self._requests.window.widen(self.round_trip.smoothed_s / self._interval.smoothed_s)
 
     def _end_burst(self, burst: _Burst, end: int, reply: FtpMessage) -> None:
-        """Handle the NAK that ends a burst. Only the latest burst can fail the download."""
         is_latest = burst is self._bursts[-1]
         if is_latest:
             self._failed_bursts = 0
@@ -242,7 +238,6 @@ class FtpDownload(FtpExchange[int]):
             self._fail(self._refused(reply))
 
     def _end_at(self, end: int) -> None:
-        """Record that the file ends at this offset."""
         self._reassembly.end_at(end)
         self._requests.discard_from(end)
 
@@ -271,7 +266,6 @@ class FtpDownload(FtpExchange[int]):
     # -------------------------------------------------------------------------------- requests
 
     def _proceed(self, now: float) -> None:
-        """Finish, or send the requests that are due."""
         reassembly = self._reassembly
         if self._size is not None and reassembly.position >= self._size:
             self._finish(reassembly.position)
@@ -290,7 +284,6 @@ class FtpDownload(FtpExchange[int]):
         self._set_deadline()
 
     def _request_gaps(self) -> None:
-        """Queue requests for the missing blocks that were noticed after the last call."""
         while self._scanned_until < self._reassembly.tail:
             if self._scanned_until in self._reassembly.gaps:
                 self._requests.request(self._scanned_until)
@@ -304,7 +297,6 @@ class FtpDownload(FtpExchange[int]):
         return not was_sent_completely and len(self._reassembly.gaps) < MAX_GAPS
 
     def _request_ahead(self) -> None:
-        """For a server without bursts: request the next blocks, each by its own request, until the end is known."""
         if self._reassembly.end is None:
             for number in range(self._requests.window.size):
                 self._requests.request(self._reassembly.tail + number * DATA_SIZE)
@@ -315,7 +307,6 @@ class FtpDownload(FtpExchange[int]):
         self._send(FtpMessage(sequence, MavFtpOpcode.READFILE, session=self._session, size=DATA_SIZE, offset=offset))
 
     def _request_burst(self, now: float) -> None:
-        """Request a burst of everything after the received block with the largest offset."""
         offset = self._reassembly.tail
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
         # The sequence numbers of the replies are reserved. A later request with one of them would look like a
@@ -333,7 +324,6 @@ class FtpDownload(FtpExchange[int]):
 
     @property
     def _next_block_deadline(self) -> float:
-        """Time by which the next block must arrive. If none does, the burst has ended, or its request was lost."""
         silence_s = self.round_trip.timeout_s(1 + self._failed_bursts)
         if self._interval.smoothed_s is None:  # The time between two blocks has not been measured yet.
             # Repeating the burst of a long file is expensive, so the burst gets more time to start.
@@ -361,10 +351,6 @@ class FtpDownload(FtpExchange[int]):
         return self._size if self._reassembly.end is None else self._reassembly.end
 
     def _finish_at_end(self) -> None:
-        """At the end of the file: finish, or fail if the file is shorter than its announced size.
-
-        A file whose size was not announced has any length.
-        """
         end = self._reassembly.position
         if self._size is None:  # The size of a virtual file is known only now.
             self._finish(end)

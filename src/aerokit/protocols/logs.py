@@ -144,7 +144,6 @@ class LogDownload(Transfer[int]):
         self._requests.on_answer(offset, now)
 
     def _on_short_block(self, end: int) -> None:
-        """Drop a block that ends before the end of the log. Fail after `MAX_EARLY_ENDS` such blocks."""
         # The vehicle could not read its own log. This may be temporary, so the data is requested again a few times.
         self._is_streaming = False
         self._early_ends += 1
@@ -154,7 +153,6 @@ class LogDownload(Transfer[int]):
             self._send_end()
 
     def _proceed(self, now: float) -> None:
-        """Finish if all data was received. Otherwise request the gaps of the last range, or the next range."""
         reassembly = self._reassembly
         if reassembly.position >= self._size:
             self._finish(reassembly.position)
@@ -167,7 +165,6 @@ class LogDownload(Transfer[int]):
         self._set_deadline()
 
     def _request_gaps(self, now: float) -> None:
-        """Request what a streamed range left out: each long gap as a range, one at a time, then single blocks."""
         if self._may_have_long_gaps:
             gap = self._first_long_gap()
             if gap is not None:
@@ -181,7 +178,6 @@ class LogDownload(Transfer[int]):
             self._request(offset, LOG_BLOCK)
 
     def _first_long_gap(self) -> tuple[int, int] | None:
-        """Return start and end of the first gap of at least `LONG_GAP` blocks; None if all gaps are shorter."""
         min_length = LONG_GAP * LOG_BLOCK
         start, end = 0, 0  # the gap that is being measured: consecutive offsets in `gaps`, which has one for each block
         for offset in self._reassembly.gaps:
@@ -194,7 +190,7 @@ class LogDownload(Transfer[int]):
         return (start, end) if end - start >= min_length else None
 
     def _stream_range(self, start: int, end: int, now: float) -> None:
-        """Request a range, or its beginning if the range is longer than a request may be."""
+        """Request this range, or its beginning if it is too long for one request."""
         self._adapt_range()
         self._range_end = min(start + self._max_range_blocks * LOG_BLOCK, end, self._size)
         self._requested_blocks = math.ceil((self._range_end - start) / LOG_BLOCK)
@@ -344,7 +340,7 @@ class LogList(Transfer[tuple[LogEntry, ...]]):
             self._request_missing(now)
 
     def _expect(self, entry: LogEntry) -> None:
-        """Determine the ids of the requested logs from the first entry, which contains the number of all logs."""
+        """Determine the ids of the missing entries from the first entry."""
         last = self._first_id + entry.num_logs - 1
         if self._to_id is not None:
             last = min(last, self._to_id)

@@ -123,7 +123,6 @@ class MissionDownload(MissionExchange[DownloadResult]):
     # --------------------------------------------------------------------------------- answers
 
     def _on_count(self, message: MissionCount, now: float) -> None:
-        """Process MISSION_COUNT: discard items of another plan, and request the missing ones."""
         opaque_id = message.opaque_id
         if self._count is None:
             # PX4, whose window is 1, repeats MISSION_COUNT by itself, so its arrival does not measure the round trip.
@@ -157,7 +156,6 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._proceed(now)
 
     def _on_ack(self, result: int, now: float) -> None:
-        """Process MISSION_ACK, by which the vehicle refuses or interrupts the download."""
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
@@ -248,7 +246,6 @@ class MissionDownload(MissionExchange[DownloadResult]):
         self._finish(DownloadResult(items, count=self._count or 0, opaque_id=self._opaque_id))
 
     def _time_out(self, now: float) -> None:
-        """Cancel the download and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
         # The caller's items have no home, so their numbers begin at 0 after it.
         missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)

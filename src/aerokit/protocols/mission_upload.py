@@ -163,7 +163,6 @@ class MissionUpload(MissionExchange[UploadResult]):
     # ------------------------------------------------------------------------------- requests
 
     def _on_request(self, seq: int, now: float) -> None:
-        """Answer the request for an item. It shows that the vehicle has all items before this one."""
         # The vehicle never skips an item, so a request beyond the next unsent item belongs to another transfer.
         if seq > self._sent_end:
             return
@@ -201,7 +200,6 @@ class MissionUpload(MissionExchange[UploadResult]):
     # ------------------------------------------------------------------------ acknowledgements
 
     def _on_ack(self, ack: MissionAck, now: float) -> None:
-        """Process MISSION_ACK: the result of the upload, or a request to repeat items or to start again."""
         result = ack.type
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
@@ -227,16 +225,9 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _is_refusal_of_partial_upload(self) -> bool:
-        """True if an ERROR would refuse a partial upload: the vehicle has not requested an item of it yet."""
         return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
-        """Process an ERROR that may be temporary.
-
-        If the vehicle has not requested an item yet, wait and announce the items again. Otherwise, repeat the first
-        unconfirmed item, or the last item if all were sent. A second ERROR fails the upload or, if all items were sent,
-        ends it without a confirmation.
-        """
         # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
         # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
         # therefore repeated. A second ERROR that arrives within a round trip may answer what was sent before the
@@ -257,7 +248,6 @@ class MissionUpload(MissionExchange[UploadResult]):
                 self._fail_as_refused(MavMissionResult.ERROR)
 
     def _wait_while_busy(self, now: float) -> None:
-        """Announce the items again after BUSY_RETRY_INTERVAL_S, for at most BUSY_TIMEOUT_S in all; then fail."""
         if self._busy_until is None:
             self._busy_until = now + BUSY_TIMEOUT_S
         if now + BUSY_RETRY_INTERVAL_S > self._busy_until:
@@ -267,7 +257,7 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._wait(now, BUSY_RETRY_INTERVAL_S)
 
     def _restart(self, result: int, now: float) -> None:
-        """Begin again, because ``result`` shows that the vehicle's transfer has expired or was cancelled."""
+        """Begin again. ``result`` is the MAV_MISSION_RESULT to fail with if that is not possible."""
         if not self._is_requesting:  # The vehicle has cancelled an older transfer, not this one.
             return
         # A partial upload does not begin again. The differences were computed from the vehicle's plan, which another
@@ -280,7 +270,6 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._announce(now)
 
     def _fail_as_refused(self, result: int) -> None:
-        """Fail with a MAV_MISSION_RESULT of the vehicle."""
         self.is_refusal_ambiguous = self._sent_end - self._confirmed_end > 1
         self._reject(result, seq=self._confirmed_end if self._is_requesting else None)
 
@@ -290,7 +279,6 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._finish(UploadResult(is_confirmed, opaque_id, item=first_unconfirmed))
 
     def _time_out(self, now: float) -> None:
-        """Cancel the upload and fail, because the vehicle has stopped answering."""
         self._outbox += self.cancellation()
         # The caller's items have no home, so their numbers begin at 0 after it.
         missing = tuple(range(max(self._confirmed_end - self.offset, 0), self._end - self.offset))
@@ -307,7 +295,6 @@ class MissionUpload(MissionExchange[UploadResult]):
     # -------------------------------------------------------------------------------- sending
 
     def _announce(self, now: float) -> None:
-        """Start the upload by MISSION_COUNT or MISSION_WRITE_PARTIAL_LIST. The vehicle then requests the first item."""
         target = (self.target_system, self.target_component)
         if self._busy_until is not None:  # The vehicle may be busy because our MISSION_ACK to a download was lost.
             self._outbox += self.cancellation()
@@ -319,11 +306,7 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._wait(now)
 
     def _send_window(self, now: float, *, ahead: int = 0) -> None:
-        """Repeat the unconfirmed items, and send up to ``ahead`` further items.
-
-        The vehicle's requests for the repeated items may have been lost. An item that was sent a moment ago is not
-        repeated, because the vehicle's answer cannot have arrived yet.
-        """
+        """Repeat the unconfirmed items, and send up to ``ahead`` further items."""
         if self._sent_end == self._end and self._sent_end - self._confirmed_end > 1:
             # Items before the last one may be repeated, too. PX4 takes any repeated item for the mission's last item,
             # and confirms the upload. This confirmation does not prove that PX4 has all items.
@@ -334,7 +317,6 @@ class MissionUpload(MissionExchange[UploadResult]):
             self._send(seq, now, unless_in_flight=True)
 
     def _send(self, seq: int, now: float, *, unless_in_flight: bool = False) -> None:
-        """Send one item; with ``unless_in_flight``, only if no earlier transmission may still be answered."""
         if unless_in_flight and self._is_in_flight(seq, now):
             return
         make_message = to_wire_float if self._as_float else to_wire
@@ -359,7 +341,6 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     @property
     def _in_flight_s(self) -> float:
-        """Seconds after its transmission for which an item counts as in flight; see `IN_FLIGHT_ROUND_TRIPS`."""
         round_trip_s = self.round_trip.smoothed_s
         if round_trip_s is None:
             round_trip_s = self.round_trip.timeout_s()

@@ -251,7 +251,7 @@ class SetCurrentItem(Transfer[None]):
             self._send(now)
 
     def _has_passed(self, seq: int) -> bool:
-        """Return True if the vehicle, whose current item is now ``seq``, went to our item and has already left it."""
+        """Return True if the vehicle has reached our item and left it for ``seq``."""
         before = self._reported
         if before is None:
             return False

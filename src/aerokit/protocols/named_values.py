@@ -72,20 +72,18 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self._step(now)
 
     @abstractmethod
-    def _list_request(self) -> Message:
-        """Return the request for the whole list."""
+    def _list_request(self) -> Message: ...
 
     @abstractmethod
-    def _read_request(self, index: int) -> Message:
-        """Return the request for one index."""
+    def _read_request(self, index: int) -> Message: ...
 
     @abstractmethod
     def _on_quiet(self, now: float) -> None:
-        """Handle a stream that has not started, or has stopped before its end."""
+        """Called when the stream has not started, or has stopped before its end."""
 
     @abstractmethod
     def _conclude(self) -> None:
-        """Finish if the list is complete; otherwise queue requests for the missing indices."""
+        """Finish if the list is complete. Otherwise queue requests for the missing indices."""
 
     def _send_list_request(self, now: float) -> None:
         self._attempts += 1
@@ -102,7 +100,6 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
             self._report_progress(now, min(len(self._received), count), count)
 
     def _step(self, now: float) -> None:
-        """Finish, or send the requests that are due. Called after each message and at each deadline."""
         self._conclude()
         if self.done:
             return
@@ -112,7 +109,10 @@ class ValueList(Transfer[ResultT], Generic[ResultT, ValueT]):
         self.deadline: float | None = min(at for at in times if at is not None)
 
     def _drop_stale(self, count: int) -> tuple[int, ...]:
-        """Drop values received with another count, and return their indices. Does so at most `MAX_REFRESHES` times."""
+        """Drop values received with another count, and return their indices.
+
+        After `MAX_REFRESHES` calls that dropped values, nothing is dropped any more.
+        """
         stale = tuple(index for index in range(count) if self._reported_counts[index] != count)
         if not stale or self._refreshes >= MAX_REFRESHES:
             return ()
@@ -178,30 +178,24 @@ class NamedRequests(Transfer[dict[str, "ValueT | ParameterRejected | ParameterTi
         self._step(now)
 
     @abstractmethod
-    def _request(self, name: str) -> list[Message]:
-        """Return the messages to send for this name now."""
+    def _request(self, name: str) -> list[Message]: ...
 
     @abstractmethod
-    def _on_message(self, message: Message, now: float) -> None:
-        """Process a message of the target."""
+    def _on_message(self, message: Message, now: float) -> None: ...
 
     def _timeout_text(self, name: str) -> str:
         return f"{name} was not answered, requested {self._window.attempts(name)} times"
 
-    def _before_sending(self, now: float) -> None:
-        """Called before due requests are sent."""
+    def _before_sending(self, now: float) -> None: ...
 
-    def _after_sending(self, now: float) -> None:
-        """Called after due requests were sent."""
+    def _after_sending(self, now: float) -> None: ...
 
     def _settle(self, name: str, answer: ValueT | ParameterRejected | ParameterTimeout, now: float) -> None:
-        """Record the final answer for a name."""
         self._window.discard(name)
         self._results[name] = answer
         self._report_progress(now, len(self._results), len(self._names))
 
     def _step(self, now: float) -> None:
-        """Finish, or send the requests that are due. Called after each message and at each deadline."""
         if len(self._results) < len(self._names):
             self._before_sending(now)  # This call may settle the last names.
         if len(self._results) == len(self._names):
@@ -228,8 +222,7 @@ class NamedReads(NamedRequests[ValueT]):
     _probes_answered = 0
 
     @abstractmethod
-    def _read_request(self, name: str, index: int) -> Message:
-        """Return the request for one value, by name or by index."""
+    def _read_request(self, name: str, index: int) -> Message: ...
 
     def _request(self, name: str) -> list[Message]:
         if name == PROBE:
@@ -251,21 +244,18 @@ class NamedReads(NamedRequests[ValueT]):
         self._probes_answered = min(self._probes_answered + 1, self._probes_sent)
 
     def _reject_if_requested_often(self, names: Iterable[str], now: float) -> None:
-        """Reject these unanswered names, except those whose answers may all have been lost."""
+        """Reject the names whose answers cannot all have been lost."""
         for name in names:
             if self._loss_probability(self._window.attempts(name)) < MAX_LOSS_PROBABILITY:
                 text = f"{self.unknown_text} {name}: it answers requests for other names, but not for this one"
                 self._settle(name, ParameterRejected(text, name=name), now)
 
     def _loss_probability(self, attempts: int) -> float:
-        """Estimate the probability that the answers to ``attempts`` requests were all lost.
-
-        The estimate is derived from the numbers of sent and answered probes, by Laplace's rule of succession.
-        """
         if not self._probes_answered:
             return 1.0
         lost = self._probes_sent - self._probes_answered
-        # Factor i is the probability of a further loss after `lost + i` losses in `sent + i` requests.
+        # Laplace's rule of succession: factor i is the probability of a further loss after `lost + i` losses in
+        # `sent + i` requests.
         return math.prod((lost + 1 + i) / (self._probes_sent + 2 + i) for i in range(attempts))
 
 
@@ -283,7 +273,6 @@ class RepeatedAnswers(Generic[ValueT]):
         return bool(self._answers) and self._is_same(self._answers[-1], answer)
 
     def add(self, answer: ValueT) -> None:
-        """Add an answer. If its value differs from the value of the previous answers, these are dropped."""
         if not self.ends_with(answer):
             self._answers.clear()
         self._answers.append(answer)

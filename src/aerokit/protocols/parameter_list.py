@@ -108,7 +108,6 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ------------------------------------------------------------------------------------ answers
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        """Process a value of the stream, an answer to a request, or a value outside the list (index 65535)."""
         index = message.param_index
         if index == UNKNOWN_INDEX or message.param_id == HASH_NAME:
             self._on_value_without_index(message, now)
@@ -155,7 +154,6 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._count = min(self._count, index)
 
     def _record_count(self, count: int, *, is_streamed: bool) -> None:
-        """Record the number of parameters that a message reports. After a change, missing indices are requested."""
         # All messages of ArduPilot's stream report the count from the start of the stream, although the number of
         # parameters may change meanwhile. A streamed count is therefore only compared with an earlier streamed count.
         if is_streamed:
@@ -168,7 +166,6 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             self._must_request_missing = True
 
     def _on_streamed_value(self, index: int, now: float) -> None:
-        """Request the indices that the stream skipped before this one, and update the length of its pauses."""
         for missing in range(self._next_index, min(index, self._count or 0)):
             self._window.request(missing)
         if self._streamed_count:
@@ -228,10 +225,6 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ------------------------------------------------------------------------------------- result
 
     def _finish_when_complete(self) -> None:
-        """Finish if all values are known and consistent. Otherwise drop values from before a change of the count.
-
-        If there are none to drop, inconsistent values are the result.
-        """
         count = self._count
         if count is None or len(self._received) < count:
             return
@@ -240,6 +233,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             return
         names = {parameter.name for parameter in parameters}
         is_consistent = len(names) == count == len(self._parameters)  # Each name has exactly one index, and vice versa.
+        # If there are no values from before a change of the count, inconsistent values are the result.
         if not is_consistent and self._drop_stale(count):
             self._must_request_missing = True
         else:
@@ -248,7 +242,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _in_order(self, parameters: list[Parameter], names: set[str]) -> list[Parameter]:
         """Return each parameter once, with its latest value and in the order of the indices.
 
-        Parameters without an index come last. They are left out if the list has changed during the download.
+        Parameters without an index come last.
         """
         indices: dict[str, int | None] = {}
         for index, parameter in enumerate(parameters):

@@ -71,8 +71,7 @@ class ParameterRequests(NamedRequests[Parameter]):
             self._on_error(message, now)
 
     @abstractmethod
-    def _on_value(self, message: ParamValue, now: float) -> None:
-        """Process a value."""
+    def _on_value(self, message: ParamValue, now: float) -> None: ...
 
     def _on_error(self, message: ParamError, now: float) -> None:
         name = message.param_id  # The index and the target ids are not used, because PX4 does not initialise them.
@@ -142,7 +141,6 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        """Process the answer to a probe, or the value of a requested name. A message may be both."""
         # An answer to another station also counts. A name is rejected only after so many probes that such a coincidence
         # has no effect, see `_loss_probability`.
         is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
@@ -230,11 +228,6 @@ class ParameterWrites(ParameterRequests):
         self._stale_answers = StaleAnswerFilter(self.round_trip)
 
     def _request(self, name: str) -> list[Message]:
-        """Return the messages of the next request for a name.
-
-        If the name is in `_to_set`, remove it, and return PARAM_SET, followed by a request to read if an earlier
-        PARAM_SET was answered with another value. Otherwise, return only a request to read.
-        """
         read = ParamRequestRead(self.target_system, self.target_component, name, BY_NAME)
         if name not in self._to_set:
             return [read]
@@ -251,10 +244,6 @@ class ParameterWrites(ParameterRequests):
         return [write]
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        """Settle the name if the reported value is as requested, or was reported often enough; otherwise ask again.
-
-        A value that may answer an earlier request does not settle the name.
-        """
         name = message.param_id
         if not self._window.attempts(name):
             return  # No request for the name is in flight, so the message may answer another station.

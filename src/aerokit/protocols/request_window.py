@@ -79,39 +79,35 @@ class RequestWindow(Generic[KeyT]):
 
     @property
     def deadline(self) -> float | None:
-        """Time at which the next answer is overdue; None while no request is in flight."""
+        """Time at which the next answer is overdue. None while no request is in flight."""
         return min((request.due_at for request in self._in_flight.values()), default=None)
 
     def attempts(self, key: KeyT) -> int:
-        """Return how often the request was sent."""
+        """Return how often an unanswered request was sent."""
         request = self._requests.get(key)
         return 0 if request is None else request.attempts
 
     def overdue(self, now: float) -> list[KeyT]:
-        """Return the keys of overdue requests."""
         return [key for key, request in self._in_flight.items() if request.due_at <= now]
 
     def request(self, key: KeyT) -> None:
-        """Queue a request, unless it is already waiting or in flight."""
         if key not in self:
             self._waiting[key] = None
 
     def record_sent(self, key: KeyT, now: float) -> None:
-        """Record a request that is sent now, regardless of the window."""
+        """Record a request that was sent although the window may be full."""
         self._waiting.pop(key, None)
         self._record_transmission(key, now)
 
     def discard(self, key: KeyT) -> None:
-        """Drop a request, for example because another message answered it."""
         self._waiting.pop(key, None)
         self._in_flight.pop(key, None)
         self._requests.pop(key, None)
 
     def on_answer(self, key: KeyT, now: float, *, overtaken: int = OVERTAKEN) -> list[KeyT]:
-        """Record an answer. Queue again the requests that are presumed lost, and return them.
+        """Record an answer. Requeue the requests that are presumed lost, and return them.
 
-        A request is presumed lost if it was last sent at least ``overtaken`` transmissions before the answered request.
-        If that was sent several times, its first transmission counts, because the answer may belong to it.
+        A request is presumed lost if it was last sent at least ``overtaken`` transmissions before the answered one.
         """
         request = self._requests.pop(key, None)
         self._waiting.pop(key, None)
@@ -127,6 +123,7 @@ class RequestWindow(Generic[KeyT]):
             self._ambiguous[key] = now - request.first_at
         lost = []
         for key_in_flight, request_in_flight in self._in_flight.items():
+            # The first transmission of the answered request counts, because the answer may belong to it.
             if request_in_flight.last_number > request.first_number - overtaken:
                 break  # All further requests were sent later.
             lost.append(key_in_flight)
@@ -136,7 +133,7 @@ class RequestWindow(Generic[KeyT]):
     def take_due(self, now: float) -> list[KeyT]:
         """Return the keys to request now, and count them as sent.
 
-        The last few keys may be in the result twice, because their requests are sent twice; see the class.
+        The last few keys may be in the result twice, because their requests are sent twice.
         """
         overdue = self.overdue(now)
         # If nothing was answered since an overdue request was sent, the whole link is silent.
@@ -165,12 +162,8 @@ class RequestWindow(Generic[KeyT]):
             self._next_silence_at = now + self._timeout_s(1)
 
     def _timeout_s(self, attempts: int) -> float:
-        """Return the seconds to wait for an answer, up to MAX_TIMEOUT_S.
-
-        Each silence of the whole link lengthens the wait. As long as there is none, a repeated request waits no longer
-        than a new one. If few requests are left, the wait stays short.
-        """
         round_trip = self._round_trip
+        # Each silence of the whole link lengthens the wait. Without one, a third attempt waits no longer than a second.
         seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
         if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:
             seconds = min(seconds, max(FEW_LEFT_TIMEOUT_S, 2 * round_trip.smoothed_s))
@@ -186,7 +179,6 @@ class RequestWindow(Generic[KeyT]):
             self._max_in_flight = max(self._max_in_flight - 1, self._initial_size)
 
     def _record_transmission(self, key: KeyT, now: float) -> None:
-        """Record a transmission of the request, and the time at which its answer is overdue."""
         self._sent_count += 1
         request = self._requests.get(key)
         if request is None:
@@ -199,7 +191,6 @@ class RequestWindow(Generic[KeyT]):
         self._in_flight[key] = request
 
     def _requeue(self, keys: list[KeyT]) -> None:
-        """Queue requests again, before all that wait."""
         if keys:
             for key in keys:
                 del self._in_flight[key]

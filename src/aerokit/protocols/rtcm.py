@@ -39,12 +39,15 @@ def crc24q(data: bytes) -> int:
 
 
 def message_number(frame: bytes) -> int | None:
-    """Return the RTCM message number, e.g. 1005 or 1077; None for an empty message, which RTCM allows as a filler."""
+    """Return the RTCM message number, e.g. 1005 or 1077.
+
+    The result is None for an empty message, which RTCM allows as a filler.
+    """
     return None if len(frame) < HEADER_SIZE + 2 + CRC_SIZE else frame[3] << 4 | frame[4] >> 4
 
 
 def _frame_size(data: bytes, begin: int) -> int | None:
-    """Return the size of the frame that begins at ``begin``; None if no frame begins there. Needs three bytes."""
+    """Return the size of the frame at ``begin``, or None if no frame begins there. Needs three bytes."""
     # After the preamble, six reserved bits must be zero. The length follows in ten bits.
     if data[begin] != PREAMBLE or data[begin + 1] & 0xFC:
         return None
@@ -100,7 +103,6 @@ class RtcmReader:
         self.skipped_bytes: int = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Process bytes, and return the complete messages. An incomplete message (up to 1028 bytes) is kept."""
         messages: list[bytes] = []
         buffer = self._buffer + data
         begin = 0
@@ -127,18 +129,15 @@ class RtcmReader:
 
 
 def fragments(message: bytes, sequence: int) -> list[GpsRtcmData]:
-    """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages.
-
-    Bit 0 of the flags is set if the message is split, bits 1 and 2 are the fragment number, bits 3 to 7 ``sequence``. A
-    receiver considers a split message complete after four fragments, or after a fragment that is not full. If a split
-    message has fewer than four fragments and the last one is full, an empty fragment follows.
-    """
+    """Return one RTCM message of 1 to 720 bytes as GPS_RTCM_DATA messages."""
     from aerokit.mavlink.messages import GpsRtcmData
 
     pieces = [message[begin : begin + FRAGMENT_SIZE] for begin in range(0, len(message), FRAGMENT_SIZE)]
     is_split = len(pieces) > 1
+    # A receiver considers a split message complete after four fragments, or after a fragment that is not full.
     if is_split and len(pieces) < MAX_FRAGMENTS and len(pieces[-1]) == FRAGMENT_SIZE:
         pieces.append(b"")
+    # Bit 0 is set if the message is split. Bits 1 and 2 are the number of the fragment.
     flags = (sequence & 0x1F) << 3 | is_split
     return [
         GpsRtcmData(flags=flags | number << 1, len=len(piece), data=piece.ljust(FRAGMENT_SIZE, b"\0"))

@@ -56,7 +56,6 @@ class LinkAddress(Snapshot):
         return dict(self.options).get(name)
 
     def _without_options(self) -> str:
-        """Return the canonical address without its ``?option=value`` part."""
         if self.kind == "serial":
             baud = "" if self.baud is None else f":{self.baud}"
             return f"serial://{_quote_device(self.device)}{baud}"
@@ -85,7 +84,6 @@ def parse_address(text: str) -> LinkAddress:
 
 
 def host_and_port(host: str, port: int) -> str:
-    """Return ``host:port``, with brackets around an IPv6 address."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -165,7 +163,6 @@ class _Parser:
         self.text = text
 
     def parse(self) -> LinkAddress:
-        """Parse the whole text: an address with a scheme, ``pty``, or a bare device, path, or host and port."""
         text = self.text.strip()
         if not text:
             raise self.error("it is empty")
@@ -181,7 +178,7 @@ class _Parser:
         return self.parse_bare(text)
 
     def split_scheme(self, text: str) -> tuple[str, str]:
-        """Return the scheme in lower case ("" if there is none), and the text after it."""
+        """Return the scheme in lower case, and the text after it. The scheme may be empty."""
         if match := _URL.fullmatch(text):
             return match[1].lower(), match[2]
         match = _SCHEME.fullmatch(text)
@@ -191,7 +188,6 @@ class _Parser:
         return "", text
 
     def parse_with_scheme(self, scheme: str, after_scheme: str) -> LinkAddress:
-        """Parse the part after a known scheme. `_SCHEMES` maps the scheme to the kind of link."""
         kind = _SCHEMES[scheme]
         target, _, query = after_scheme.partition("?")
         options = self.parse_options(kind, query)
@@ -206,7 +202,7 @@ class _Parser:
         return self.parse_network(kind, target.removesuffix("/"), options)
 
     def parse_bare(self, text: str) -> LinkAddress:
-        """Parse an address without a scheme: a recording, a serial port, or host:port to listen on."""
+        """Parse a recording, a serial port, or host:port to listen on."""
         if _RECORDING.fullmatch(text):
             end = text.lower().rindex(".tlog") + len(".tlog")
             return self.parse_replay(text[:end], self.parse_options("replay", text[end + 1 :]))
@@ -223,7 +219,7 @@ class _Parser:
         return self.parse_network("udpin", text, {})
 
     def parse_network(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
-        """Parse the part of a network address after its scheme: ``host:port``."""
+        """Parse ``host:port``."""
         if text.startswith("["):
             host, bracket, tail = text[1:].partition("]")
             if not bracket or not _is_ipv6(host):
@@ -248,7 +244,7 @@ class _Parser:
         return LinkAddress(kind, host=host, port=self.parse_port(kind, tail), options=tuple(sorted(options.items())))
 
     def parse_zenoh(self, kind: LinkKind, text: str, options: dict[str, str]) -> LinkAddress:
-        """Parse the part of a zenoh address after its scheme: ``fleet/name``."""
+        """Parse ``fleet/name``."""
         from aerokit.transport.zenoh.keys import check_name  # imported here because few addresses need it
 
         for key in ("connect", "listen"):
@@ -268,7 +264,7 @@ class _Parser:
         return LinkAddress(kind, path=f"{fleet}/{name}", options=tuple(sorted(options.items())))
 
     def parse_port(self, kind: LinkKind, tail: str) -> int:
-        """Parse the text after a host, which must be ``:port``."""
+        """Parse ``:port``, the text after a host."""
         if tail in ("", ":"):
             raise self.error("the port is missing")
         if not tail.startswith(":"):
@@ -280,7 +276,6 @@ class _Parser:
         return port
 
     def parse_serial(self, text: str, options: dict[str, str], *, has_scheme: bool) -> LinkAddress:
-        """Parse a serial port and its baud rate. ``has_scheme`` is True if a scheme preceded ``text``."""
         # In an address without a scheme, only the name of a COM port may be followed by a colon and the baud rate.
         # Other names may contain colons themselves.
         colon_baud = _COLON_BAUD if has_scheme else _COM_COLON_BAUD
@@ -306,7 +301,6 @@ class _Parser:
         return LinkAddress("replay", path=path, options=tuple(sorted(options.items())))
 
     def parse_options(self, kind: LinkKind, query: str) -> dict[str, str]:
-        """Parse and check the options after the ``?``. rtscts=0, costly=0 and speed=1, the defaults, are left out."""
         options: dict[str, str] = {}
         allowed = _OPTIONS.get(kind, ())
         if kind not in _NEVER_COSTLY:
@@ -329,7 +323,6 @@ class _Parser:
         return {key: value for key, value in options.items() if (key, value) not in defaults}
 
     def checked_option(self, key: str, value: str) -> str:
-        """Check the value of an option, and return its canonical form."""
         if key == "baud":  # `parse_serial` checks the number.
             return value
         if key in _CHOICES:
@@ -397,5 +390,6 @@ def _unquote(text: str) -> str:
 
 
 def _quote_device(device: str) -> str:
-    """Like `_quote`, but also encode what separates a baud rate: commas, and a colon before digits at the end."""
+    """Like `_quote`, but also encode what separates a baud rate."""
+    # A comma, or a colon before digits at the end, separates a baud rate.
     return re.sub(r":(?=[0-9]+$)", "%3A", _quote(device).replace(",", "%2C"))

@@ -59,7 +59,6 @@ def _create_tcp(parsed: LinkAddress, peers: PeerFilter | None) -> Link:
 
 
 def network_options(parsed: LinkAddress) -> NetworkOptions:
-    """Return the zenoh options of an address."""
     from aerokit.transport.zenoh.session import NetworkOptions
 
     return NetworkOptions(
@@ -75,7 +74,6 @@ def _endpoints(comma_separated: str | None) -> tuple[str, ...]:
 
 
 def _create_zenoh(parsed: LinkAddress) -> Link:
-    """Create one side of a zenoh link: the vehicle side for ``zenohin``, a client for ``zenoh``."""
     fleet, _, name = parsed.path.partition("/")
     options = network_options(parsed)
     if parsed.kind == "zenohin":

@@ -86,7 +86,7 @@ class PeerListener(Receiver, Protocol):
 
 
 def keeps_peers(receiver: Receiver) -> bool:
-    """Return True if the receiver is a `PeerKeeper` that decides which peers a link remembers."""
+    """Return True if the receiver decides which peers a link remembers."""
     return isinstance(receiver, PeerKeeper) and receiver.keeps_peers
 
 
@@ -234,7 +234,7 @@ class BaseLink(Link):
 
     @abstractmethod
     async def _connect(self) -> None:
-        """Open sockets. An OSError becomes a LinkOpenError; `_release` is called after any failure."""
+        """Open sockets. An OSError becomes a LinkOpenError. After any failure, `_release` is called."""
 
     @abstractmethod
     def _release(self) -> None:
@@ -248,7 +248,7 @@ class BaseLink(Link):
         self.dropped_writes += writes
 
     def _report_stalled(self, is_stalled: bool) -> None:
-        """Notify the receiver when one of the link's transports stalls, and when none is stalled any more."""
+        """Notify the receiver if the link has stalled or drained."""
         stalled_since = self._stalled_at  # None if the link was not stalled until now
         if is_stalled == (stalled_since is not None):
             return
@@ -280,7 +280,6 @@ class BaseLink(Link):
             raise BusyError(f"{self.address} is {self._state.value}; a link can be opened only once")
 
     def _abort_opening(self) -> None:
-        """Release the link after a failed opening, so that it can be opened again."""
         self._receiver = None
         self._release()
         if self._state is not _State.CLOSED:
@@ -288,7 +287,6 @@ class BaseLink(Link):
 
 
 def link_open_error(address: str, cause: OSError, hint: str = "") -> LinkOpenError:
-    """Return a LinkOpenError with the address, the system's reason and a hint."""
     hint = hint or _hint(address, cause)
     reason = cause.strerror or str(cause) or type(cause).__name__
     error = LinkOpenError(f"cannot open {address}: {reason}" + (f" ({hint})" if hint else ""))
@@ -297,7 +295,7 @@ def link_open_error(address: str, cause: OSError, hint: str = "") -> LinkOpenErr
 
 
 def _hint(address: str, cause: OSError) -> str:
-    """Return what the user can do about an error of opening a link; "" if unknown."""
+    """Return what the user can do about an error of opening a link. Empty if unknown."""
     if isinstance(cause, socket.gaierror):
         return "unknown host name; check the spelling or use the IP address"
     if cause.errno == errno.EADDRNOTAVAIL and address.startswith(("udpin", "tcpin")):
@@ -320,7 +318,7 @@ _HINTS = {
 
 
 def import_optional(address: str, module: str, package: str, extra: str) -> Any:
-    """Import an optional module. If it is missing, raise a LinkOpenError that names the package to install."""
+    """Import a module. Raises LinkOpenError with the package to install if it is missing."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
@@ -362,7 +360,6 @@ class MemoryLink(BaseLink):
         self._loop = asyncio.get_running_loop()
 
     def _release(self) -> None:
-        """See `BaseLink._release`. Drops received data that was not delivered yet."""
         if self._wake_up is not None:
             self._wake_up.cancel()
         self._wake_up = None
@@ -374,7 +371,7 @@ class MemoryLink(BaseLink):
             self._far._post(None, self)
 
     def _post(self, data: bytes | None, sender: MemoryLink) -> None:
-        """Schedule the arrival of data from ``sender``; None means that ``sender`` was closed."""
+        """Schedule the arrival of data. None means that ``sender`` was closed."""
         if self._loop is None or self._receiver is None:
             if data is not None:
                 sender.dropped_writes += 1
@@ -389,7 +386,6 @@ class MemoryLink(BaseLink):
             self._wake_up = loop.call_at(due, self._arrive) if self._latency_s else loop.call_soon(self._arrive)
 
     def _arrive(self) -> None:
-        """Deliver the data that is due, and schedule the delivery of the rest."""
         self._wake_up = None
         if self._loop is None or not self._inbox:
             return

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 from aerokit.errors import BusyError, ConnectionClosed, InvalidArgument, LinkLost, LinkOpenError
 from aerokit.transport.link import Link, OrderRefusalListener, Peer, Receiver, keeps_peers
-from aerokit.transport.reconnecting import Backoff, InterruptionListener
+from aerokit.transport.reconnecting import Backoff, InterruptionListener, ReconnectingLink
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
@@ -183,13 +183,12 @@ class MultiLink(Link):
 
     @property
     def _own_links(self) -> list[Link]:
-        """The links that this object opens and closes."""
         return [link for index, link in enumerate(self._links) if index not in self._foreign]
 
     # ------------------------------------------------------------------------------- opening
 
     async def _open_one(self, index: int) -> LinkOpenError | None:
-        """Open one link. Return the error if it cannot be opened; another attempt may succeed."""
+        """Open one link. Return the error if another attempt may succeed."""
         receiver = _MemberReceiver(self, index)
         try:
             await self._links[index].open(receiver)
@@ -203,7 +202,6 @@ class MultiLink(Link):
         return None
 
     async def _abort_opening(self, openings: Collection[asyncio.Future[LinkOpenError | None]]) -> None:
-        """After a failed open(), cancel all attempts and make new links, so that open() can be called again."""
         self._receiver = None
         for opening in openings:
             opening.cancel()
@@ -225,10 +223,6 @@ class MultiLink(Link):
         task.add_done_callback(self._openings.discard)
 
     async def _retry_opening(self, index: int) -> None:
-        """Try to open a link, with increasing delays, until it is open or the `MultiLink` is closed.
-
-        Give up after any error but LinkOpenError.
-        """
         backoff = Backoff()
         is_reported = False
         while not self._is_closed:
@@ -260,7 +254,7 @@ class MultiLink(Link):
         self._check_all_lost()
 
     def _check_all_lost(self) -> None:
-        """If no link is available, report an interruption or a loss. Does nothing while `open` is running."""
+        """If no link is available, report an interruption or a loss."""
         receiver, error = self._receiver, self._last_loss
         if error is None or receiver is None or self._is_opening:
             return
@@ -279,7 +273,6 @@ class MultiLink(Link):
         receiver.link_lost(lost)
 
     def _on_restored(self, index: int) -> None:
-        """Continue with a link that was opened or reopened. It may end an interruption of all links."""
         self._is_available[index] = True
         for peer in self._kept[index]:
             self._links[index].keep_peer(peer)
@@ -300,8 +293,6 @@ class MultiLink(Link):
 
     @property
     def _may_come_back(self) -> bool:
-        from aerokit.transport.reconnecting import ReconnectingLink
-
         return bool(self._openings) or any(isinstance(link, ReconnectingLink) for link in self._links)
 
     def _write_to(self, index: int, data: bytes, peer: Peer) -> None:

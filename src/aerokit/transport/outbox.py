@@ -62,7 +62,7 @@ class Outbox:
         return self._waiting_bytes + self._pending()
 
     def write(self, data: bytes) -> None:
-        """Forward data to the transport, buffer it, or drop it if there is no room. Never blocks."""
+        """Forward, buffer or drop data. Never blocks."""
         if self._is_closed:
             self._on_dropped(1)
             return
@@ -75,11 +75,11 @@ class Outbox:
             self._schedule_poll()
 
     def pause(self) -> None:
-        """Buffer writes from now on, because the transport's own write buffer is full."""
+        """Buffer writes from now on. Called when the transport's own buffer is full."""
         self._is_full = True
 
     def resume(self) -> None:
-        """Forward the buffered data, because the transport accepts data again."""
+        """Forward the buffered data. Called when the transport accepts data again."""
         self._is_full = False
         if self._is_closed:
             return
@@ -88,7 +88,7 @@ class Outbox:
         self._flush()
 
     def discard(self) -> None:
-        """Drop the data in this buffer, but not data that was already forwarded to the transport."""
+        """Drop the data in this buffer. Data in the transport is kept."""
         self._on_dropped(len(self._waiting))
         self._waiting.clear()
         self._waiting_bytes = 0
@@ -98,7 +98,7 @@ class Outbox:
         self._forwarded_bytes -= count
 
     def close(self) -> None:
-        """Forward waiting data; if the transport is stalled, drop it. Afterwards, ``stalled`` is not called."""
+        """Forward waiting data, or drop it if the transport is stalled. Afterwards, ``stalled`` is not called."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -110,7 +110,6 @@ class Outbox:
             self._forward(self._take_joined())
 
     def _buffer(self, data: bytes) -> None:
-        """Add data to the buffer, or drop it if the buffer is full."""
         # An empty buffer accepts even a frame that is larger than the limit.
         if self._waiting and self._waiting_bytes + len(data) > self._limit:
             self._on_dropped(1)
@@ -128,7 +127,7 @@ class Outbox:
             self._forward(self._take_joined())
 
     def _take_joined(self) -> bytes:
-        """Remove the next write and return it, joined with following writes up to `_MAX_JOINED_BYTES`."""
+        """Remove the next write and return it, joined with the writes that follow."""
         joined = self._pop_oldest()
         while self._waiting:
             _, next_write = self._waiting[0]
@@ -143,7 +142,6 @@ class Outbox:
         return data
 
     def _drop_outdated(self) -> None:
-        """Drop the buffered writes that have waited longer than `WRITE_TIMEOUT_S`."""
         now = self._loop.time()
         outdated = sum(deadline <= now for deadline, _ in self._waiting)  # The deadlines are in order.
         for _ in range(outdated):
@@ -162,7 +160,7 @@ class Outbox:
             self._timer = None
 
     def _poll(self) -> None:
-        """Check whether data has left since the last poll. Polling ends when there is no unsent data."""
+        """Check whether data has left since the last poll."""
         self._timer = None
         self._drop_outdated()
         pending_bytes, now = self._pending(), self._loop.time()
@@ -177,7 +175,6 @@ class Outbox:
             self._schedule_poll()
 
     def _set_stalled(self, is_stalled: bool) -> None:
-        """Report when a stall begins or ends. When it ends, forward the buffered data first."""
         if is_stalled == self._is_stalled:
             return
         self._is_stalled = is_stalled
@@ -187,7 +184,7 @@ class Outbox:
 
 
 def kernel_unsent_bytes(fd: int) -> int:
-    """Return the number of bytes in the kernel that are unsent or unacknowledged; 0 on systems other than Linux."""
+    """Return the number of unsent or unacknowledged bytes in the kernel. 0 on systems other than Linux."""
     if sys.platform != "linux":
         return 0
     import fcntl

@@ -181,7 +181,7 @@ class ReconnectingLink(Link):
     # ------------------------------------------------------------ callbacks of the current link
 
     def _on_bytes(self, current: _CurrentReceiver, data: bytes, peer: Peer) -> None:
-        """Pass bytes on. The first bytes after a reopening show that the link is back."""
+        # The first bytes after a reopening show that the link is back.
         if current is self._current and self._lost_at is not None:
             self._is_up = True
             self._on_restored()
@@ -195,7 +195,6 @@ class ReconnectingLink(Link):
         return None
 
     def _on_lost(self, current: _CurrentReceiver, error: LinkLost) -> None:
-        """Report the loss once, and start to reopen the link. At the end of a recording, end this link instead."""
         if current is not self._current:
             return
         self._is_up = False
@@ -215,7 +214,6 @@ class ReconnectingLink(Link):
     # ----------------------------------------------------------------------- reopening
 
     async def _reopen(self) -> None:
-        """Try to open a new link until one is open. Runs as a task, from each loss on."""
         try:
             while not await self._try_to_open():
                 pass
@@ -227,7 +225,7 @@ class ReconnectingLink(Link):
             self._reopening = None
 
     async def _try_to_open(self) -> bool:
-        """Wait, then try once to open a new link. Return True if it is open, or if this link has ended."""
+        """Wait, then try once to open a new link. Return True if no further attempt is needed."""
         await self._link.wait_closed()
         await asyncio.sleep(self._backoff.next_delay())
         link = self._make_link()
@@ -249,7 +247,6 @@ class ReconnectingLink(Link):
         return True
 
     def _on_restored(self) -> None:
-        """Report that the link is back, because the reopened link has been stable or has delivered bytes."""
         self._cancel_stable_timer()
         if self._lost_at is None:
             return

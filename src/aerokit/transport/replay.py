@@ -63,7 +63,6 @@ class Replay(BaseLink):
             records.close()
 
     def _play(self) -> None:
-        """Deliver the frames that are due, then wait for the next frame, or end the link after the last one."""
         assert self._loop is not None
         now = self._loop.time()
         for _ in range(MAX_FRAMES_PER_ITERATION):
@@ -79,7 +78,6 @@ class Replay(BaseLink):
             self._wake_up = self._loop.call_at(max(now, self._due), self._play)
 
     def _advance(self, stamp: float) -> None:
-        """Read the next frame, and schedule it after the frame with this time stamp."""
         if self._receiver is None:  # The receiver has closed the link in its callback.
             return
         try:

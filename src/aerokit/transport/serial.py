@@ -26,6 +26,7 @@ from aerokit.errors import InvalidArgument
 from aerokit.transport.address import LinkAddress
 from aerokit.transport.link import LINGER_S, BaseLink, Peer, link_open_error
 from aerokit.transport.outbox import Outbox
+from aerokit.transport.sockets import serial_ports
 
 if sys.platform == "win32":
     _TermiosError = OSError
@@ -88,7 +89,7 @@ class SerialLink(BaseLink):
             self._drop(1)
 
     async def _connect(self) -> None:
-        """Open the port. This method contains no await, so that it cannot be cancelled halfway."""
+        # This method contains no await, so that it cannot be cancelled halfway.
         self._loop = asyncio.get_running_loop()
         self._port, self._transport = self._open_port()
         self._released.clear()
@@ -106,14 +107,14 @@ class SerialLink(BaseLink):
         )
 
     def _open_port(self) -> tuple[Any, Any]:
-        """Open the port with pyserial. Return the port and its transport."""
+        """Return the open port and its transport."""
         try:
             return self._open_device()
         except (OSError, ValueError, OverflowError) as error:
             raise _open_error(self.address, error) from None
 
     def _open_device(self) -> tuple[Any, Any]:
-        """See `_open_port`. Raises OSError, or ValueError for an unsupported baud rate."""
+        """Like `_open_port`. Raises OSError, or ValueError for an unsupported baud rate."""
         serial = importlib.import_module("serial")
         try:
             port = serial.Serial(
@@ -136,7 +137,6 @@ class SerialLink(BaseLink):
             self._loop.call_soon(self._lose, f"the device failed: {error.strerror or error}", error)
 
     def _release(self) -> None:
-        """See `BaseLink._release`. Closes the port when the remaining data is sent, at the latest after `LINGER_S`."""
         transport, self._transport = self._transport, None
         outbox, self._outbox = self._outbox, None
         if transport is None or self._loop is None:
@@ -152,7 +152,6 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _close_when_sent(self, transport: Any, deadline: float) -> None:
-        """Close the port when all data is sent or the deadline has passed; until then, check every `_LINGER_STEP_S`."""
         assert self._loop is not None
         if self._waiting_to_be_sent(transport) and self._loop.time() < deadline:
             self._loop.call_later(_LINGER_STEP_S, self._close_when_sent, transport, deadline)
@@ -160,7 +159,7 @@ class SerialLink(BaseLink):
             self._close_port(transport)
 
     def _waiting_to_be_sent(self, transport: Any) -> int:
-        """Return the number of unsent bytes in the transport and the driver; 0 if the device is gone."""
+        """Return the number of unsent bytes in the transport and the driver. 0 if the device is gone."""
         with contextlib.suppress(OSError):
             return int(transport.get_write_buffer_size() + self._port.out_waiting)
         return 0
@@ -207,7 +206,10 @@ class _SerialProtocol(asyncio.Protocol):
 
 
 def _replace_port_methods(port: Any, on_failure: _OnFailure) -> None:
-    """Replace methods of a port by ones that never block, and that call ``on_failure`` if the device is lost."""
+    """Replace methods of a port by ones that never block.
+
+    ``on_failure`` is called if the device is lost.
+    """
     port.flush = lambda: None
     if os.name == "posix":
         port.read = partial(_read, port.fileno(), on_failure)
@@ -217,7 +219,7 @@ def _replace_port_methods(port: Any, on_failure: _OnFailure) -> None:
 
 
 def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
-    """Read from the port without blocking: the replacement of pyserial's ``read``. Report a lost device."""
+    """Replacement of pyserial's ``read`` that never blocks."""
     try:
         data = os.read(fd, _READ_SIZE)
     except (BlockingIOError, InterruptedError):
@@ -231,7 +233,7 @@ def _read(fd: int, on_failure: _OnFailure, _size: int) -> bytes:
 
 
 def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -> int:
-    """Call ``write``, and report a lost device: the replacement of pyserial's ``write``."""
+    """Replacement of pyserial's ``write`` that reports a lost device."""
     try:
         return write(data)
     except (BlockingIOError, InterruptedError):
@@ -242,7 +244,6 @@ def _write(write: Callable[[bytes], int], on_failure: _OnFailure, data: bytes) -
 
 
 def _open_error(address: str, error: Exception) -> OSError:
-    """Return the LinkOpenError for an error of pyserial, with a hint for the user."""
     number = error.errno if isinstance(error, OSError) else None
     # pyserial puts an error of termios into its text: "Could not configure port: (25, 'Inappropriate ioctl …')".
     if number is None and f"({errno.ENOTTY}, " in str(error):
@@ -253,8 +254,7 @@ def _open_error(address: str, error: Exception) -> OSError:
 
 
 def _available_ports() -> str:
-    comports = importlib.import_module("serial.tools.list_ports").comports
-    names = ", ".join(sorted(port.device for port in comports()))
+    names = ", ".join(port.device for port in serial_ports())
     return f"available serial ports: {names}" if names else "no serial port was found; is the device plugged in?"
 
 
@@ -297,7 +297,6 @@ class PtyLink(BaseLink):
             self._drop(1)
 
     async def _connect(self) -> None:
-        """Create the pseudo-terminal and the symbolic link to its other end."""
         if sys.platform == "win32":
             raise OSError(errno.ENOSYS, "Windows has no pseudo-terminals")
         import tty
@@ -316,7 +315,7 @@ class PtyLink(BaseLink):
         self._loop.add_reader(ours, self._read)
 
     def _make_symlink(self, target: str) -> None:
-        """Make the symbolic link to ``target``. OSError if a file exists at the path of the link."""
+        """Make the symbolic link. Raises OSError if a file exists at its path."""
         # A symbolic link without a target is left over, e.g. from a killed program.
         if os.path.islink(self._path) and not os.path.exists(self._path):
             os.unlink(self._path)
@@ -324,7 +323,6 @@ class PtyLink(BaseLink):
         self._has_symlink = True
 
     def _read(self) -> None:
-        """Deliver the data that another program has written. Called when there is some."""
         our_end, _ = self._ends
         try:
             data = os.read(our_end, _READ_SIZE)
@@ -336,7 +334,6 @@ class PtyLink(BaseLink):
         self._deliver(data)
 
     def _release(self) -> None:
-        """See `BaseLink._release`. Closes both ends at once."""
         ends, self._ends = self._ends, ()
         if self._loop is not None and ends and not self._loop.is_closed():
             our_end, _ = ends

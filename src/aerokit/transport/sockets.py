@@ -27,23 +27,20 @@ class SocketAddress(NamedTuple):
 
 
 async def resolve(host: str, port: int, kind: socket.SocketKind) -> list[SocketAddress]:
-    """Resolve a host name to socket addresses, IPv4 first, because vehicles and simulators usually listen there.
-
-    A name is resolved on a thread of the loop's executor.
-    """
+    """Resolve a host name to socket addresses, IPv4 first."""
     try:
         results = socket.getaddrinfo(host, port, type=kind, flags=socket.AI_NUMERICHOST)
     except socket.gaierror:  # The host is a name, not an IP address.
         results = await asyncio.get_running_loop().getaddrinfo(host, port, type=kind)
     addresses = [SocketAddress(family, address) for family, _, _, _, address in results]
+    # Vehicles and simulators usually listen on IPv4.
     return sorted(addresses, key=lambda address: address.family != socket.AF_INET)
 
 
 async def bound_socket(host: str, port: int, kind: socket.SocketKind) -> socket.socket:
-    """Return a non-blocking socket, bound to the first address that can be bound; raise the last OSError if none can.
+    """Return a non-blocking socket, bound to the first address that can be bound.
 
-    "::" also receives IPv4. UDP ports are not shared (no SO_REUSEADDR), because a second listener would silently take
-    the datagrams of the first.
+    Raises the OSError of the last address if none can be bound. "::" also receives IPv4.
     """
     addresses = await resolve(host, port, kind)
     for address in addresses[:-1]:
@@ -61,14 +58,14 @@ async def is_port_free(host: str, port: int) -> bool:
 
 
 def bind_to(address: SocketAddress, kind: socket.SocketKind) -> socket.socket:
-    """Return a new non-blocking socket that is bound to this address. Raises OSError."""
     sock = socket.socket(address.family, kind)
     try:
         sock.setblocking(False)
         if address.family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         # With SO_REUSEADDR, a TCP port can be bound again just after it was closed. The option is not set on Windows,
-        # where another program could then bind the same port at the same time.
+        # where another program could then bind the same port at the same time. UDP ports are not shared either, because
+        # a second listener would silently take the datagrams of the first.
         if kind is socket.SOCK_STREAM and sys.platform != "win32":
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address.address)
@@ -85,9 +82,10 @@ def discard_on_close(sock: socket.socket) -> None:
 
 
 def make_readable_check(sock: socket.socket) -> Callable[[], object]:
-    """Return a function that tells whether data can be read. It takes a third of the time of a failed read."""
+    """Return a function that tells whether data can be read."""
     if sys.platform == "win32":  # Windows has no poll(), so a read is always attempted.
         return lambda: True
+    # The check takes a third of the time of a failed read.
     poll = select.poll()
     poll.register(sock, select.POLLIN)
     return partial(poll.poll, 0)
@@ -133,7 +131,6 @@ def _as_iterable(peers: PeerFilter) -> Iterable[object]:
 
 
 def _parse_network(peer: object) -> Network:
-    """Convert one value of ``peers``. A single IP address becomes a network with one address."""
     reason = "wrong type"
     if isinstance(peer, _PEER_TYPES):
         try:
@@ -152,7 +149,7 @@ def serial_ports() -> list[Any]:
 
 
 def port_bind_error(host: str, port: int, *, udp: bool) -> OSError | None:
-    """Return the error of binding an IPv4 port (errno.EADDRINUSE if it is in use), or None if it is free."""
+    """Return the error of binding an IPv4 port, or None if it is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if udp else socket.SOCK_STREAM) as sock:
         if not udp and os.name == "posix":
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # A port that was just closed counts as free.

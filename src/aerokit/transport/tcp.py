@@ -120,7 +120,7 @@ class TcpConnect(_TcpLink):
         raise OSError(errno.ETIMEDOUT, f"no answer within {self._connect_timeout_s:g} s")
 
     async def _connect_to_any(self, addresses: list[SocketAddress]) -> None:
-        """Connect to the first address that accepts. If none does, raise the error of the first one."""
+        """Connect to the first address that accepts."""
         first_error: OSError | None = None
         for address in addresses:
             try:
@@ -130,7 +130,7 @@ class TcpConnect(_TcpLink):
         raise first_error or OSError(errno.EADDRNOTAVAIL, "the host has no address")
 
     async def _connect_to(self, address: SocketAddress) -> None:
-        """Connect to one address. On success, `_on_connected` has stored the stream."""
+        """Connect to one address. `_on_connected` stores the stream."""
         loop = asyncio.get_running_loop()
         sock = socket.socket(address.family, socket.SOCK_STREAM)
         try:
@@ -239,7 +239,6 @@ class TcpListen(_TcpLink):
         await self._server.start_serving()
 
     def _on_connected(self, stream: _Stream) -> None:
-        """Accept a client, or disconnect it if it is not allowed or there are too many."""
         # The host is unknown if the client has already disconnected.
         host = stream.peer[0] if isinstance(stream.peer, tuple) else ""
         if (host and not self._allowed.allows(host)) or not self._make_room():
@@ -311,7 +310,7 @@ class _Stream(asyncio.Protocol):
             self._outbox.discard()
 
     def close(self) -> None:
-        """Send remaining data for up to `LINGER_S`, then close. Close at once if the connection is stalled."""
+        """Send remaining data for up to `LINGER_S`, then close."""
         if self._transport is None or self._outbox is None or self._transport.is_closing():
             return
         with contextlib.suppress(RuntimeError):  # The loop may be closed.
@@ -324,7 +323,6 @@ class _Stream(asyncio.Protocol):
                 self._linger_timer = self._loop.call_later(LINGER_S, self._abort)
 
     def _abort(self) -> None:
-        """Close the connection and discard unsent data."""
         assert self._transport is not None
         sock = self._transport.get_extra_info("socket")
         discard_on_close(sock)
@@ -332,7 +330,6 @@ class _Stream(asyncio.Protocol):
 
     # The type of `transport` is Any, because the transports of some loops do not inherit from asyncio.Transport.
     def connection_made(self, transport: Any) -> None:
-        """Keep the buffers of the transport and the kernel small, make the outbox, and add the stream to its link."""
         self._transport = transport
         # The address is unknown (None) if the client has already disconnected. The peer then gets a unique name.
         self.peer = transport.get_extra_info("peername") or f"client {id(self):#x}"
@@ -361,7 +358,7 @@ class _Stream(asyncio.Protocol):
         self._link._deliver(data, peer)
 
     def eof_received(self) -> None:
-        """Close the connection: asyncio alone would wait without limit until the other end reads what was written."""
+        # asyncio alone would wait without limit until the other end reads what was written.
         self.close()
 
     def pause_writing(self) -> None:
@@ -373,13 +370,11 @@ class _Stream(asyncio.Protocol):
             self._outbox.resume()
 
     def _pending(self) -> int:
-        """Return the number of unsent bytes in the transport and the kernel."""
         if self._transport is None or self._fd < 0:
             return 0
         return self._transport.get_write_buffer_size() + kernel_unsent_bytes(self._fd)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Drop unsent data, and remove the stream from its link."""
         self._fd = -1  # The system may give the same number to another file.
         if self._outbox is not None:
             self._outbox.discard()

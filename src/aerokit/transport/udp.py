@@ -85,7 +85,6 @@ class _UdpLink(BaseLink):
             await self._connect_without_reader(sock)
 
     async def _connect_without_reader(self, sock: socket.socket) -> None:
-        """Let asyncio read the socket through a protocol. asyncio then also closes the socket."""
         assert self._loop is not None
         self._transport_owns_socket = True
         self._released.clear()
@@ -106,7 +105,6 @@ class _UdpLink(BaseLink):
         self._lose(f"the socket failed: {error}" if error else "the socket was closed", error)
 
     def _release(self) -> None:
-        """See `BaseLink._release`. On loops without ``add_reader``, asyncio closes the socket a moment later."""
         sock, self._socket = self._socket, None
         transport, self._transport = self._transport, None
         loop = None if self._loop is None or self._loop.is_closed() else self._loop
@@ -127,7 +125,6 @@ class _UdpLink(BaseLink):
             self._burst_listener.burst_ended()
 
     def _read_burst(self) -> None:
-        """Read the waiting datagrams, at most `MAX_BURST_DATAGRAMS`."""
         for _ in range(MAX_BURST_DATAGRAMS):
             if self._socket is None:  # The receiver has closed the link in its callback.
                 return
@@ -202,7 +199,6 @@ class UdpListen(_UdpLink):
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
-        """Deliver a datagram, unless its sender is not allowed."""
         if source != self._last_source:  # Consecutive datagrams of one sender are checked once, to save time.
             host, *_ = source
             if source not in self._peers and not self._allowed.allows(host):
@@ -280,7 +276,6 @@ class UdpBroadcast(_UdpLink):
         return sock
 
     def _datagram_received(self, data: bytes, source: Any) -> None:
-        """Deliver a datagram of the present peer, or of a sender that is accepted as the new peer."""
         if source == self._remote:
             self._received_at = self._now()
         elif not self._is_accepted(source):
@@ -292,12 +287,10 @@ class UdpBroadcast(_UdpLink):
         self._deliver(data, source if self._keeps_peers else None)
 
     def _is_accepted(self, source: Any) -> bool:
-        """Return True if datagrams of a sender other than the present peer may be delivered.
-
-        The sender's host must be allowed. The present peer must be silent, unless the sender is another port of its
-        host, and the receiver keeps peers: such a receiver checks the frames before it calls `keep_peer`.
-        """
+        """Return True if datagrams of a sender other than the present peer may be delivered."""
         host, *_ = source
+        # A receiver that keeps peers checks the frames before it calls `keep_peer`, so another port of the same host is
+        # accepted at once.
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 
@@ -325,10 +318,8 @@ class _DatagramProtocol(asyncio.DatagramProtocol):
 
 
 def _source_address(remote: SocketAddress) -> Any:
-    """Return the address from which ``remote`` sends datagrams; raise OSError if there is no route to it.
-
-    It differs from the given address for 0.0.0.0, which means this host.
-    """
+    """Return the address from which ``remote`` sends datagrams. Raises OSError if there is no route."""
+    # 0.0.0.0 means this host, which sends from another address.
     with socket.socket(remote.family, socket.SOCK_DGRAM) as probe:
         probe.connect(remote.address)
         return probe.getpeername()

@@ -58,11 +58,10 @@ class Copies:
         """True if the last checked frame may be a copy of one that was accepted over another link some seconds ago."""
 
     def is_copy(self, frame: Frame, link: int, *, may_prove: bool = True) -> bool:
-        """Remember a frame. Return True if it is a copy: an equal frame arrived recently, but only over other links.
+        """Remember a frame. Return True if an equal frame arrived recently, but only over other links.
 
-        Recently means within `COPY_WINDOW_S` and `COPY_WINDOW_FRAMES`. With ``may_prove=False``, `arrived_over` does
-        not count this arrival, because a second sender with the same ids has sent the frame. The other methods, and
-        :attr:`is_late`, refer to the last frame for which this method was called.
+        The other members refer to the frame of the latest call. ``may_prove`` is False if a second sender with the
+        same ids sent the frame.
         """
         sender = frame.component_id << 8 | frame.system_id
         key = frame.body, frame.checksum, frame.signature
@@ -97,23 +96,20 @@ class Copies:
 
     @property
     def was_admitted(self) -> bool:
-        """True if the last checked frame, or another copy of it, has passed the signature check (see `admit`)."""
+        """True if the last checked frame, or a copy of it, has passed the signature check."""
         return self._current is not None and self._current.is_admitted
 
     def arrived_over(self, link: int) -> bool:
-        """Return True if the last checked frame or a copy of it arrived over this link.
-
-        A copy from a second sender with the same ids does not count.
-        """
+        """Return True if the last checked frame, or a copy of it, arrived over this link."""
         return self._current is not None and bool(self._current.proving_bits & 1 << link)
 
     def admit(self) -> None:
-        """Record that the last checked frame passed the signature check. Its copies are then not taken for replays."""
+        """Record that the last checked frame passed the signature check."""
         if self._current is not None:
             self._current.is_admitted = True
 
     def accept(self) -> None:
-        """Record that the last checked frame is delivered. Its copies are then dropped."""
+        """Record that the last checked frame is delivered."""
         if self._current is not None:
             self._current.is_accepted = True
 
@@ -156,7 +152,7 @@ class _Stream:
         return self.newest_sequence >= 0 and (frame.sequence - self.newest_sequence) & 0xFF >= 128
 
     def is_repeated(self, payload: bytes, link: int) -> bool:
-        """Count an acknowledgement that arrived over this link; True if another link delivered it at least as often."""
+        """Count an acknowledgement. Return True if another link delivered it at least as often."""
         counts = self.acknowledgements.setdefault(payload, [0] * len(self.received_at))
         counts[link] += 1
         return counts[link] <= max(count for index, count in enumerate(counts) if index != link)
@@ -181,9 +177,8 @@ class MergedStreams:
     def was_accepted(self, frame: Frame, link: int, *, may_prove: bool) -> bool:
         """Return True if this frame is a copy of a frame that was accepted over another link.
 
-        If so, the call records that the frame's link works. A copy that has passed the signature check, and contains
-        the time since boot, also counts as evidence that its links lead to one vehicle. It does not count if
-        ``may_prove`` is False, because a second sender with the same ids has then sent it.
+        The call then records that the frame's link works. ``may_prove`` is False if a second sender with the same ids
+        sent the frame.
         """
         if not self.copies.is_copy(frame, link, may_prove=may_prove):
             return False
@@ -199,12 +194,9 @@ class MergedStreams:
         return True
 
     def _record_copy(self, choice: LinkChoice, link: int, now: float) -> None:
-        """Count the copies of a frame as evidence that the links that delivered them lead to one vehicle.
-
-        ``link`` delivered the last copy. If the link in use delivered none, nothing is counted, because the frame may
-        come from another vehicle.
-        """
+        """Count the copies of a frame as evidence that their links lead to one vehicle."""
         used = choice.used
+        # If the link in use did not deliver the frame, it may come from another vehicle.
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
             return
         for candidate in choice.candidates.values():
@@ -214,7 +206,7 @@ class MergedStreams:
                 candidate.record_copy(now)
 
     def accepts(self, frame: Frame, link: int) -> bool:
-        """Decide whether to deliver a frame that is no copy of an accepted one. If True, it is recorded as accepted."""
+        """Decide whether to deliver a frame that is no copy, and record it if so."""
         stream = self._stream(frame)
         stream.received_at[link] = frame.received_at
         choice = self._choices.get(frame.system_id)
@@ -245,7 +237,6 @@ class MergedStreams:
         return True
 
     def _stream(self, frame: Frame) -> _Stream:
-        """Return the stream of the frame's sender. If there are too many streams, a new one replaces the oldest."""
         key = frame.component_id << 8 | frame.system_id
         stream = self._streams.get(key)
         if stream is None:
@@ -256,7 +247,6 @@ class MergedStreams:
 
 
 def _accepts_over_unused_link(frame: Frame, candidate: Candidate | None, choice: LinkChoice, stream: _Stream) -> bool:
-    """Return True if a frame that arrived over ``candidate``, a link that is not in use, is to be accepted."""
     if candidate is None or choice.used is None:
         return False
     is_answer = frame.message_id in ANSWERS
@@ -272,12 +262,10 @@ def _accepts_over_unused_link(frame: Frame, candidate: Candidate | None, choice:
 
 
 def _may_be_different_frame(frame: Frame, link: int, choice: LinkChoice) -> bool:
-    """Return True if a frame may be new, although it equals a frame that was accepted earlier.
-
-    Only a heartbeat over the link in use may be new. If another link carries the same frames as this link, the
-    heartbeat is a copy. If not, each link has its own stream of heartbeats, and two of them can be equal by chance.
-    """
+    """Return True if a frame may be new, although it equals a frame that was accepted earlier."""
     used = choice.used
     if used is None or used.link != link or frame.message_id != m.Heartbeat.ID:
         return False
+    # If no other link carries the same frames, each link has its own stream of heartbeats, and two of them can be equal
+    # by chance.
     return not choice.is_shared(used, frame.received_at)

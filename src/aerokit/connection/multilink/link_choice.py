@@ -67,7 +67,6 @@ class Candidate:
         self._last_counts = (0, 0)  # numbers of frames received and lost at the last call of `record_counts`
 
     def record_counts(self, received: int, lost: int, now: float) -> None:
-        """Update :attr:`loss` from the total numbers of frames that were received and lost over this link."""
         received_before, lost_before = self._last_counts
         self._last_counts = received, lost
         if received > received_before:
@@ -88,22 +87,22 @@ class Candidate:
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        `MIN_CLOCK_MATCHES` matches in a row prove the link; the same number of mismatches in a row makes it doubted.
-        ``may_prove`` is False while the hardware id, which is stronger evidence, may still be received.
+        ``may_prove`` is False while the hardware id may still be received.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
         else:
             self._clock_matches, self._clock_mismatches = 0, self._clock_mismatches + 1
+        # The hardware id is stronger evidence than the clock.
         if self._clock_matches >= MIN_CLOCK_MATCHES and may_prove and not self.is_other_hardware:
             self.is_proven, self.is_doubted = True, False
         elif self._clock_mismatches >= MIN_CLOCK_MATCHES:
             self._doubt()
 
     def record_copy(self, now: float) -> None:
-        """Count a frame that arrived over this link and the link in use; this link is proven after MIN_COPIES frames.
+        """Count a frame that arrived over this link and the link in use.
 
-        Call this only for frames with a time since boot: others may be equal although they come from two vehicles.
+        Call this only for frames with a time since boot. Other frames of two vehicles may be equal.
         """
         self.shared_at = now
         self._copies += 1
@@ -111,7 +110,7 @@ class Candidate:
             self.is_proven, self.is_doubted = True, False
 
     def reset_proof(self) -> None:
-        """Discard the proof and all evidence for it after the vehicle rebooted. `was_proven` keeps an earlier proof."""
+        """Discard the proof and its evidence after the vehicle rebooted."""
         self.was_proven = self.was_proven or self.is_proven
         self.is_proven = self.is_other_hardware = False
         self.hardware = None
@@ -131,11 +130,11 @@ class Candidate:
 
     @property
     def is_hardware_pending(self) -> bool:
-        """True while an answer to a request for the hardware id can still be expected."""
+        """True while an answer to a request for the hardware id can be expected."""
         return self._hardware_requests > 0 and self._answers_since_request < MAX_ANSWERS_WITHOUT_HARDWARE
 
     def record_hardware(self, *, is_other: bool) -> None:
-        """Record whether the hardware id received over the link contradicts that of the vehicle."""
+        """Record whether the link's hardware id contradicts that of the vehicle."""
         if is_other:
             self._doubt()
             self.was_proven = False  # The link now leads to another vehicle, so an earlier proof is void.
@@ -156,7 +155,6 @@ class Candidate:
         self.is_proven, self.is_doubted = False, True
 
     def is_alive(self, now: float) -> bool:
-        """Return True if frames arrive over the link, and written data leaves this machine."""
         is_answering = now - self.answered_at <= 2 * UNPROBED_TIMEOUT_S
         timeout_s = PROBED_TIMEOUT_S if is_answering and not self.is_costly else UNPROBED_TIMEOUT_S
         return self.is_available and not self.is_stalled and now - self.received_at <= timeout_s
@@ -230,17 +228,14 @@ class LinkChoice:
         return candidate
 
     def start_with(self, candidate: Candidate) -> None:
-        """Record that the autopilot's first heartbeat arrived over this link. Other links must be proven from now on.
-
-        If this link is not in use, forget all other links, so that `choose` selects this one.
-        """
+        """Record that the autopilot's first heartbeat arrived over this link."""
         self.needs_proof = True
         if candidate is not self.used:
             self.used = None  # The link used so far leads to another component only, e.g. a camera.
-            self.candidates = {candidate.link: candidate}
+            self.candidates = {candidate.link: candidate}  # `choose` then selects this link.
 
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
-        """Record an answer: the vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
+        """Record a probe's answer. The vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
         candidate = self.candidates[link]
         # True if the link in use has not answered since the previous answer over this link. Recording the new answer
         # would change the result, so it follows below.
@@ -269,11 +264,6 @@ class LinkChoice:
                 candidate.record_clock(matches, may_prove=not self._awaits_hardware(candidate))
 
     def record_hardware(self, link: int, hardware: HardwareId) -> None:
-        """Record a hardware id received over a link.
-
-        An id received over the link in use becomes the vehicle's id, unless the vehicle already has a contradicting id
-        that was received over another link. The link in use then counts as a link to another vehicle.
-        """
         candidate = self.candidates[link]
         if hardware.has_value or candidate.hardware is None:  # An empty id does not replace a known one.
             candidate.hardware = hardware
@@ -284,10 +274,6 @@ class LinkChoice:
                 compared.record_hardware(is_other=self.hardware.contradicts(compared.hardware))
 
     def may_be_used(self, candidate: Candidate) -> bool:
-        """Return True if frames and commands may use the link.
-
-        It must not lead to other hardware. If another link is in use, this one must be proven or need no proof.
-        """
         if candidate.is_other_hardware:
             return False
         return self.used in (None, candidate) or candidate.is_proven or not self.needs_proof
@@ -322,17 +308,14 @@ class LinkChoice:
         self._command_at = now
 
     def should_request_hardware(self, candidate: Candidate, *, is_attached: bool) -> bool:
-        """Return True if the hardware id is to be requested over this link, and count the request.
-
-        Over the link in use, an attached vehicle object (``is_attached``) requests the id itself.
-        """
+        """Return True if the hardware id is to be requested over this link, and count the request."""
         if candidate is not self.used:
             return not candidate.is_proven and candidate.should_request_hardware()
+        # Over the link in use, an attached vehicle object requests the id itself.
         has_other_links = len(self.candidates) > 1  # With a single link, there is no other id to compare with.
         return has_other_links and not is_attached and candidate.should_request_hardware()
 
     def _is_same_by_hardware(self, candidate: Candidate, now: float) -> bool:
-        """Return True if the link was proven before, its hardware id matches, and it is the only link that is alive."""
         is_same = (
             self.hardware is not None and candidate.hardware is not None and self.hardware.confirms(candidate.hardware)
         )
@@ -344,25 +327,22 @@ class LinkChoice:
         return candidate.is_hardware_pending and not can_compare_ids
 
     def _adopt_hardware(self, used: Candidate) -> None:
-        """Make the hardware id of the link in use the vehicle's id, unless it contradicts an id from another link."""
+        """Make the hardware id of the link in use the vehicle's id."""
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return
+        # If the id contradicts one from another link, the link in use counts as a link to another vehicle.
         is_from_same_link = self._hardware_link == used.link
         if self.hardware is None or is_from_same_link or not self.hardware.contradicts(hardware):
             self.hardware, self._hardware_link = hardware, used.link
 
     def _must_delay_switch(self, used: Candidate, now: float) -> bool:
-        """Return True while the last command, sent over ``used``, could be overtaken by one over the better link.
-
-        The switch is delayed by at most MAX_SWITCH_DELAY_S.
-        """
+        """Return True while a command over the better link could overtake the last command."""
         transit_s = (used.round_trip_s or 0.0) + JITTER_S
         waited_s = now - self._better_since - MIN_BETTER_S
         return now - self._command_at <= transit_s and waited_s <= MAX_SWITCH_DELAY_S
 
     def _change(self, chosen: Candidate, reason: str, now: float) -> str:
-        """Use this link from now on; return ``reason``."""
         previous = self.used
         if previous is not None:
             # Before `fresh_after`, telemetry over the new link may be older than the last one over the previous link.

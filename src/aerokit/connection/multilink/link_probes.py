@@ -69,7 +69,7 @@ class LinkProbes:
         *,
         is_attached: bool,
     ) -> None:
-        """If a probe is due, send it; while the hardware id of the vehicle is unknown, also request the id.
+        """Send a probe, and a request for the hardware id, if they are due.
 
         ``is_attached`` is True if the system has a vehicle object. All other systems share a limited rate of probes.
         """
@@ -103,9 +103,9 @@ class LinkProbes:
             self._send(request, peer)
 
     def is_answer(self, frame: Frame, link: int) -> bool:
-        """Return True if this TIMESYNC answers one of our probes, whichever link the probe was sent over.
+        """Return True if this TIMESYNC answers one of our probes over any link.
 
-        An answer of the autopilot is recorded if it arrived over the link of its probe.
+        The call records an answer of the autopilot that arrived over the link of its probe.
         """
         message = self._bus.dialect.decode(frame)
         is_request = isinstance(message, m.Timesync) and not message.tc1  # In an answer, tc1 is the vehicle's time.
@@ -134,7 +134,7 @@ class LinkProbes:
                 self._report_doubt(frame, candidate)
 
     def _consume_budget(self, now: float) -> bool:
-        """Take a token for a probe to a system without a vehicle object. Return False if no token is left."""
+        """Return False if no probe may be sent now to a system without a vehicle object."""
         self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
         self._budget_at = now
         if self._budget < 1:
@@ -143,7 +143,7 @@ class LinkProbes:
         return True
 
     def _round_trip_of(self, answer: m.Timesync, system_id: int, link: int, now: float) -> float | None:
-        """Return the seconds since the probe; None if the probe was sent to another system, or over another link."""
+        """Return the seconds since the probe. None if it was sent to another system or over another link."""
         probed_system, probed_link, sent_at = self._pending[answer.ts1]
         if (probed_system, probed_link) != (system_id, link):
             return None
@@ -151,7 +151,7 @@ class LinkProbes:
         return max(0.0, now - sent_at)
 
     def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
-        """If the link is doubted, report a second vehicle with the same system id; only once for each doubt."""
+        """Report a second vehicle with the same system id, once for each doubt."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)

@@ -54,7 +54,6 @@ class LinkStates:
         self.cell: StateCell[tuple[LinkStatus, ...]] = StateCell("links", clock, "frame")
 
     def update(self, now: float) -> None:
-        """Set CONNECTED or SILENT for each open link over which a system is known. Refresh the cell once a second."""
         for link in range(len(self._states)):
             candidates = [choice.candidates[link] for choice in self._choices.values() if link in choice.candidates]
             if candidates and self._link.is_available(link):
@@ -64,10 +63,9 @@ class LinkStates:
             self.set_cell(now)
 
     def set_state(self, link: int, state: LinkState, now: float) -> None:
-        """Record the state of one link, and publish a change. The next update then refreshes the cell at once."""
         before, self._states[link] = self._states[link], state
         if before is not state:
-            self._updated_at = -math.inf
+            self._updated_at = -math.inf  # The next update refreshes the cell at once.
             self._publish(
                 MemberLinkStateChanged(now, system_id=0, link=self._link.names[link], before=before, after=state)
             )
@@ -77,7 +75,6 @@ class LinkStates:
         self.cell.set(tuple(map(self._status, range(len(self._states)))), Source(0, 0, "link"))
 
     def _status(self, link: int) -> LinkStatus:
-        """Return the state of one link, and its quality for the systems that are received over it."""
         candidates = {
             system_id: choice.candidates[link]
             for system_id, choice in self._choices.items()
@@ -152,9 +149,9 @@ class MultiLinkRoutes:
     # ------------------------------------------------------------ the interface of Routes
 
     def record_heartbeat(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
-        """Record a heartbeat and the link over which it arrived. Return False if that is not possible.
+        """Record a heartbeat and the link over which it arrived.
 
-        A heartbeat is not recorded if the routing table is full, or if its system id is 0.
+        Returns False if the routing table is full, or if the system id is 0.
         """
         if not frame.system_id or not self._routes[_link_index(peer)].record_heartbeat(frame, peer, counters):
             return False
@@ -195,7 +192,6 @@ class MultiLinkRoutes:
             routes.exclude_pause(now, paused_s)
 
     def evict_idle_peer(self, peers: Iterable[Peer], now: float) -> Peer | None:
-        """Evict one idle peer of any link, see :meth:`Routes.evict_idle_peer`."""
         for index, routes in enumerate(self._routes):
             evicted = routes.evict_idle_peer([peer for peer in peers if _link_index(peer) == index], now)
             if evicted is not None:
@@ -205,15 +201,7 @@ class MultiLinkRoutes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers that get a message for this component.
 
-        ``message`` is None for a raw frame, which counts as a command. The call records the time of a command. It may
-        also change the link in use.
-
-        - A message for one system is sent over the link in use or, if that has no route to the component, over a usable
-          link that has one. If no link is in use yet, every peer gets the message.
-        - No peer gets it if the link in use leads to another vehicle with the same id, and no other link works. The
-          effect is that of a lost link.
-        - A broadcast reaches each known system, mostly only once, and is also sent over links without a known system.
-        - A broadcast of a heartbeat or of the time is sent to all peers of all links.
+        The call may change the link in use, and records the time of a command. A raw frame (None) counts as a command.
         """
         if system_id != 0:
             choice = self._choices.get(system_id)
@@ -222,7 +210,7 @@ class MultiLinkRoutes:
             now = self._now()
             self._choose(system_id, choice, now)
             if choice.used.is_other_hardware:
-                return ()  # DuplicateSender has reported the other vehicle.
+                return ()  # DuplicateSender has reported the other vehicle. The effect is that of a lost link.
             if message is None or message.ID in COMMANDS:
                 choice.record_command(now)
             return self._peers_on(self._link_reaching(choice, (system_id, component_id)), system_id, component_id)
@@ -235,10 +223,10 @@ class MultiLinkRoutes:
     def is_copy(self, frame: Frame, peer: Peer, *, is_other_peer: bool) -> bool:
         """Return True if this frame was already accepted over another link, or has our own ids.
 
-        PX4 forwards our heartbeats from one of its ports to its other ports. Another program with our ids is ignored,
-        too. ``is_other_peer`` is the result of `arrived_on_other_peer`. If it is False, a copy of a heartbeat or of a
-        hardware id is recorded for the link over which it arrived.
+        ``is_other_peer`` is the result of `arrived_on_other_peer`.
         """
+        # PX4 forwards our heartbeats from one of its ports to its other ports. Another program with our ids is ignored,
+        # too.
         if (frame.system_id, frame.component_id) == self._own_source:
             return True
         link = _link_index(peer)
@@ -254,7 +242,7 @@ class MultiLinkRoutes:
         return True
 
     def accepts(self, frame: Frame, peer: Peer, counters: SourceStatistics | None) -> bool:
-        """Return True if the frame is to be delivered. Record heartbeats even if they are not to be delivered."""
+        """Return True if the frame is to be delivered. Heartbeats are recorded in any case."""
         link = _link_index(peer)
         if frame.message_id == m.Timesync.ID and self._probes.is_answer(frame, link):
             return False
@@ -266,7 +254,6 @@ class MultiLinkRoutes:
     # ------------------------------------------------------------------ state of the links
 
     def link_changed(self, link: int, is_available: bool) -> None:
-        """Record that a link was lost or is available again, and choose anew for each system that it reaches."""
         now = self._now()
         if not is_available:  # A lost link has no unsent data.
             self._stalled.discard(link)
@@ -297,7 +284,6 @@ class MultiLinkRoutes:
             await anyio.sleep(POLL_INTERVAL_S)
 
     def update(self, now: float) -> None:
-        """Update the counts of all links, send probes that are due, and choose the link for each system."""
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
                 # The counts are first, because frames may have waited while the event loop was blocked.
@@ -324,15 +310,13 @@ class MultiLinkRoutes:
         return choice.used.link
 
     def _peers_on(self, link: int, system_id: int, component_id: int) -> Collection[Peer]:
-        """Return the peers on this link that get a message; all peers of the link if the route has expired."""
+        """Return the peers on this link that get a message for a component."""
         peers = self._routes[link].peers_of(system_id, component_id)
+        # If the route has expired, all peers of the link get the message.
         return (LinkPeer(link, None),) if None in peers else peers
 
     def _one_per_system(self, now: float) -> Collection[Peer]:
-        """Return peers that together reach every system that has a link in use. Most systems are reached only once.
-
-        The peers are chosen greedily. Links over which no system is known are added as well.
-        """
+        """Return peers that together reach every system that has a link in use."""
         peers: set[Peer] = set()
         links_with_systems: set[int] = set()
         # Each system has a list of options, one for each usable link: the peers on this link that reach the system. The
@@ -349,16 +333,16 @@ class MultiLinkRoutes:
                 options_by_system.append(
                     [self._peers_on(candidate.link, system_id, component_id=0) for candidate in (choice.used, *usable)]
                 )
-        # Systems with a single option come first, because their peers must be added in any case. If these peers also
-        # reach a system with several options, no peer needs to be added for that system.
+        # The peers are chosen greedily. Systems with a single option come first, because their peers must be added in
+        # any case. If these peers also reach a system with several options, no peer needs to be added for that system.
         for options in sorted(options_by_system, key=len):
             if not any(peers.issuperset(option) for option in options):
                 peers.update(options[0])
+        # Links over which no system is known are added as well.
         peers.update(LinkPeer(link, None) for link in range(len(self._routes)) if link not in links_with_systems)
         return peers
 
     def _choose(self, system_id: int, choice: LinkChoice, now: float) -> None:
-        """Choose the link for a system. Publish a change, and discard the unsent data of the previous link."""
         before = choice.used
         reason = choice.choose(now)
         used = choice.used
@@ -392,7 +376,6 @@ class MultiLinkRoutes:
         self._states.set_cell(now)
 
     def _probe(self, system_id: int, choice: LinkChoice, candidate: Candidate, now: float) -> None:
-        """Send the probes that are now due on one link to the system's autopilot."""
         if choice.needs_proof and candidate.is_available and not candidate.is_stalled:
             is_attached = system_id in self._attached
             for peer in self._routes[candidate.link].peers_of(system_id, MavComponent.AUTOPILOT1):

@@ -37,10 +37,7 @@ class VehicleClock:
         self._previous_rate: tuple[float, float] | None = None
 
     def add(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
-        """Add a sample from the link in use. Return False if the clock jumped, which shows that the vehicle rebooted.
-
-        A simulation that paused for up to `MAX_PAUSE_S` does not count as rebooted, although its clock is late.
-        """
+        """Add a sample from the link in use. Return False if the vehicle rebooted."""
         continues = not self._samples or self._continues(at, vehicle_s, round_trip_s)
         is_unexpected = self._fits(at, vehicle_s, round_trip_s) is False  # None: the rate is not known yet
         self.is_steady = continues and not is_unexpected
@@ -52,18 +49,15 @@ class VehicleClock:
         return continues
 
     def matches(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample from another link agrees with this clock; ``at`` is the middle of the round trip.
-
-        Until the clock's rate is measured, a mismatch proves nothing, because a simulation may run at any rate. The
-        result is then True if the sample fits the rate from before the last pause or reboot, otherwise None.
-        """
+        """Return True if a sample from another link agrees with this clock. None means that this is unknown."""
         fits = self._fits(at, vehicle_s, round_trip_s)
+        # Until the rate is measured, a mismatch proves nothing, because a simulation may run at any rate.
         if self._measured_rate is None and not fits:
             return None
         return fits
 
     def _fits(self, at: float, vehicle_s: float, round_trip_s: float) -> bool | None:
-        """Return True if a sample agrees with the last sample and the clock's rate; None while the rate is unknown."""
+        """Return True if a sample agrees with the last one. None while the rate is unknown."""
         rate = self._rate
         if rate is None:
             return None
@@ -72,10 +66,7 @@ class VehicleClock:
         return abs(last_vehicle_s + rate * (at - last_at) - vehicle_s) <= tolerance
 
     def _continues(self, at: float, vehicle_s: float, round_trip_s: float) -> bool:
-        """Return False if the vehicle's clock went back or ran too fast since the last sample.
-
-        Once the rate of the clock is measured, also return False if the clock stood still for more than `MAX_PAUSE_S`.
-        """
+        """Return False if the vehicle's clock went back, ran too fast or stood still for too long."""
         last_at, last_vehicle_s = self._samples[-1]
         advance_s = vehicle_s - last_vehicle_s
         rate = self._measured_rate
@@ -95,11 +86,7 @@ class VehicleClock:
 
     @property
     def _rate(self) -> float | None:
-        """Rate of the clock; None if it is unknown.
-
-        After a pause or reboot, the rate measured before it is returned until a new one is measured, for at most
-        SPEED_MAX_AGE_S.
-        """
+        """Rate of the clock, measured now or before a pause or reboot. None if it is unknown."""
         if self._measured_rate is not None:
             return self._measured_rate
         if self._previous_rate is None:
@@ -110,7 +97,7 @@ class VehicleClock:
 
     @property
     def _measured_rate(self) -> float | None:
-        """Seconds of the vehicle's clock per second of ours; None if the stored samples span too short a time."""
+        """Seconds of the vehicle's clock per second of ours. None if the samples span too short a time."""
         if not self._samples:
             return None
         (first_at, first_vehicle_s), (last_at, last_vehicle_s) = self._samples[0], self._samples[-1]
@@ -135,16 +122,13 @@ class HardwareId(NamedTuple):
 
     @classmethod
     def from_message(cls, message: AutopilotVersion) -> HardwareId:
-        """Return the hardware id in an AUTOPILOT_VERSION."""
         return cls(bytes(message.uid2), message.uid)
 
     @property
     def has_value(self) -> bool:
-        """True unless all fields are zero."""
         return bool(self.uid or any(self.uid2))
 
     def contradicts(self, other: HardwareId) -> bool:
-        """Return True if both have the same field with different values. ``uid2`` takes precedence."""
         if any(self.uid2) and any(other.uid2):
             return self.uid2 != other.uid2
         return bool(self.uid and other.uid) and self.uid != other.uid

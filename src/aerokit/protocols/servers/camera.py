@@ -20,10 +20,6 @@ _TO_THE_END = -1
 
 
 def camera_builders(camera: CameraDevice) -> dict[int, Builder]:
-    """Return a builder for each message id of the camera protocol.
-
-    Param 2 of REQUEST_MESSAGE is the number of a storage or stream, or the index of the image to begin with.
-    """
     return {
         m.CameraInformation.ID: lambda _: [_information(camera)],
         m.CameraSettings.ID: lambda _: [camera_settings(camera)],
@@ -39,7 +35,6 @@ def camera_builders(camera: CameraDevice) -> dict[int, Builder]:
 
 
 def camera_settings(camera: CameraDevice) -> m.CameraSettings:
-    """Return CAMERA_SETTINGS; zoom and focus are NaN if the camera does not have them."""
     return m.CameraSettings(
         time_boot_ms=camera.host.time_boot_ms,
         mode_id=camera.mode,
@@ -49,7 +44,8 @@ def camera_settings(camera: CameraDevice) -> m.CameraSettings:
 
 
 def _number(command: ReceivedCommand | None) -> int:
-    """Return param 2 of a request: the number of a storage or stream; 0 (all) for a message that is streamed."""
+    """Return the requested number of a storage or stream. 0 means all."""
+    # None stands for a message that is streamed.
     return 0 if command is None else to_int(command.param2)
 
 
@@ -67,13 +63,11 @@ def _information(camera: CameraDevice) -> m.CameraInformation:
 
 
 def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[Message]:
-    """Return CAMERA_IMAGE_CAPTURED of the requested images, or of the last image if ``command`` is None (periodic).
-
-    Param 2 is the index of the first image (-1: all images). Param 3 is the index of the last one (0: request only
-    the image of param 2, -1: to the end).
-    """
+    """Return the requested images, or the last image for a periodic message (None)."""
     if command is None:
         return camera.captures.images[-1:]
+    # Param 2 is the index of the first image, or -1 for all images. Param 3 is the index of the last one, 0 for only
+    # one image, or -1 for all further images.
     first, last = to_int(command.param2), to_int(command.param3)
     if first < 0:
         return list(camera.captures.images)
@@ -81,7 +75,6 @@ def _images(camera: CameraDevice, command: ReceivedCommand | None) -> Iterable[M
 
 
 def _streams(camera: CameraDevice, number: int) -> list[m.VideoStreamInformation]:
-    """Return VIDEO_STREAM_INFORMATION for one stream, or for all streams if ``number`` is 0."""
     return [
         m.VideoStreamInformation(
             **_stream_fields(camera, stream), count=len(camera.streams),
@@ -99,7 +92,6 @@ def _stream_status(camera: CameraDevice, number: int) -> list[m.VideoStreamStatu
 
 
 def _stream_fields(camera: CameraDevice, stream: int) -> dict[str, Any]:
-    """Return the fields that VIDEO_STREAM_INFORMATION and VIDEO_STREAM_STATUS have in common."""
     width, height = camera.stream_size
     return {
         "stream_id": stream,
@@ -122,12 +114,10 @@ def _flags(camera: CameraDevice, stream: int) -> int:
 
 
 def _thermal_stream(camera: CameraDevice) -> int:
-    """Return the number of the last stream, which is the thermal one if the camera has a thermal sensor."""
     return len(camera.streams)
 
 
 def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
-    """Return CAMERA_THERMAL_RANGE with the coldest point at the upper left and the hottest at the lower right."""
     if camera.thermal_celsius is None:
         return []
     coldest, hottest = camera.thermal_celsius
@@ -140,7 +130,7 @@ def _thermal_range(camera: CameraDevice) -> list[m.CameraThermalRange]:
 
 
 def _field_of_view(camera: CameraDevice) -> int:
-    """Return the horizontal field of view in degrees; 0 if unknown."""
+    """Return the horizontal field of view in degrees. 0 means unknown."""
     sensor_width_mm, _ = camera.sensor_mm
     tangent = sensor_width_mm / 2 / camera.focal_length_mm
     return 0 if math.isnan(tangent) else round(math.degrees(2 * math.atan(tangent)))

@@ -21,7 +21,6 @@ _CAN_ALWAYS_RECORD = CameraCapFlags.CAN_CAPTURE_VIDEO_IN_IMAGE_MODE
 
 
 def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
-    """Return the handler for each MAV_CMD of the camera protocol."""
     pictures, videos, settings = _Pictures(camera), _Videos(camera), _Settings(camera)
     return {
         MavCmd.IMAGE_START_CAPTURE: pictures.start,
@@ -44,7 +43,6 @@ def camera_commands(camera: CameraDevice) -> dict[int, AsyncHandler]:
 
 
 def legacy_requests(streams: MessageStreams) -> dict[int, CommandHandler]:
-    """Return handlers of the older requests that REQUEST_MESSAGE supersedes."""
     message_ids: dict[int, int] = {
         MavCmd.REQUEST_CAMERA_INFORMATION: m.CameraInformation.ID,
         MavCmd.REQUEST_CAMERA_SETTINGS: m.CameraSettings.ID,
@@ -70,11 +68,6 @@ class _Pictures:
         self._last_single: tuple[tuple[int, int], int] | None = None  # sender and sequence number of a single image
 
     async def start(self, command: ReceivedCommand) -> int:
-        """Take images, if param 1 selects this camera.
-
-        A command for a single image is a repetition if it has the same sender and sequence number (param 4) as the last
-        one. It then takes no further image.
-        """
         camera, captures = self._camera, self._camera.captures
         interval_s = command.param2 if math.isfinite(command.param2) else 0.0
         count = to_int(command.param3)
@@ -85,6 +78,7 @@ class _Pictures:
         if not _selects_this(command.param1) or interval_s < 0 or count < 0 or in_wrong_mode:
             return MavResult.DENIED
         single = (command.sender, sequence) if count == 1 and sequence > 0 else None
+        # A single image with the same sender and sequence number is not taken again.
         is_repeated = single is not None and single == self._last_single
         if is_repeated:
             return MavResult.ACCEPTED
@@ -103,13 +97,11 @@ class _Pictures:
         return MavResult.ACCEPTED
 
     async def digicam_control(self, command: ReceivedCommand) -> int:
-        """Execute DO_DIGICAM_CONTROL, a command of the older camera protocol. Param 5 is 1 to take an image."""
-        if command.x != 1:
+        if command.x != 1:  # Param 5 is 1 to take an image.
             return MavResult.ACCEPTED
         return await self.start(replace(command, param1=0.0, param2=0.0, param3=1.0, param4=0.0))
 
     async def format(self, command: ReceivedCommand) -> int:
-        """Format the storage if param 2 is 1, and reset the image log if param 3 is 1."""
         camera, captures = self._camera, self._camera.captures
         if not _selects_this(command.param1):
             return MavResult.DENIED
@@ -131,7 +123,6 @@ class _Videos:
         self._was_cancelled = False  # True if a start was cancelled, so that the camera may be recording
 
     async def start(self, command: ReceivedCommand) -> int:
-        """Start recording. Param 2 is the rate in Hz at which CAMERA_CAPTURE_STATUS is sent during the recording."""
         camera, captures = self._camera, self._camera.captures
         if not camera.can(CameraCapFlags.CAPTURE_VIDEO):
             return MavResult.UNSUPPORTED
@@ -148,7 +139,8 @@ class _Videos:
         except BaseException as error:
             self._was_cancelled = not isinstance(error, Exception)
             raise
-        status_interval_s = 1.0 / command.param2 if command.param2 else 0.0  # 0 requests no status.
+        # Param 2 is the rate of CAMERA_CAPTURE_STATUS in Hz; 0 requests no status.
+        status_interval_s = 1.0 / command.param2 if command.param2 else 0.0
         captures.record(status_interval_s)
         if self._must_stop:  # The command to stop arrived while the camera was starting.
             await self._stop_recording()
@@ -167,7 +159,6 @@ class _Videos:
             self._camera.host.send(self._camera.captures.status())
 
     async def stream(self, command: ReceivedCommand, *, runs: bool) -> int:
-        """Start or stop the stream with the number in param 1; 0 selects all streams."""
         camera, number = self._camera, to_int(command.param1)
         available = range(1, len(camera.streams) + 1)
         if not available:
@@ -190,7 +181,6 @@ class _Settings:
         self._camera = camera
 
     async def set_mode(self, command: ReceivedCommand) -> int:
-        """Set the CAMERA_MODE in param 2, unless the camera is taking images or recording."""
         camera, mode = self._camera, to_int(command.param2)
         if not camera.can(CameraCapFlags.HAS_MODES):
             return MavResult.UNSUPPORTED
@@ -241,10 +231,10 @@ class _Settings:
 
 
 def _selects_this(number: float) -> bool:
-    """Return True if param 1 selects this camera or its storage: 0 (all), 1 (the first), or NaN, which MAVSDK sends."""
+    # 0 selects all, 1 the first. MAVSDK sends NaN.
     return math.isnan(number) or number in (0.0, 1.0)
 
 
 def _has_wrong_mode(camera: CameraDevice, *, wrong_mode: int, unless_can: int) -> bool:
-    """Return True if the camera is in ``wrong_mode``, and lacks the CAMERA_CAP_FLAGS ``unless_can``."""
+    """Return True if the camera is in ``wrong_mode`` and has none of the capabilities ``unless_can``."""
     return camera.can(CameraCapFlags.HAS_MODES) and camera.mode == wrong_mode and not camera.can(unless_can)

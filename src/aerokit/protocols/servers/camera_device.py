@@ -186,7 +186,6 @@ class Captures:
 
     @property
     def is_busy(self) -> bool:
-        """True while an image is being taken or a series runs."""
         return self._is_exposing or self._remaining != 0
 
     @property
@@ -197,7 +196,10 @@ class Captures:
         self.take_series(interval_s=0.0, count=1)
 
     def take_series(self, interval_s: float, count: int) -> None:
-        """Take ``count`` images (0: until `stop`), the first at once, then one every ``interval_s`` seconds."""
+        """Take ``count`` images, one every ``interval_s`` seconds.
+
+        The first image is taken at once. A count of 0 means until `stop`.
+        """
         self.interval_s = interval_s if count != 1 else 0.0
         self._remaining = count or _UNLIMITED
         self._is_late = False
@@ -209,22 +211,20 @@ class Captures:
         self._remaining = 0
 
     def clear(self) -> None:
-        """Clear the image log; the next index is 0."""
         self.images.clear()
         self.dropped_count = 0
 
     @property
     def image_count(self) -> int:
-        """Number of images since the image log was cleared; the next image index."""
+        """Number of images since the image log was cleared. It is also the next image index."""
         return self.dropped_count + len(self.images)
 
     def between(self, first: int, last: int | None) -> list[CameraImageCaptured]:
-        """Return the logged images with the indices ``first`` to ``last``; None: to the newest image."""
+        """Return the logged images with the indices ``first`` to ``last``. None means to the newest image."""
         end = None if last is None else max(0, last + 1 - self.dropped_count)
         return self.images[max(0, first - self.dropped_count) : end]
 
     def _begin_image(self, series: int) -> None:
-        """Take the next image of a series, and schedule the one after it."""
         camera = self._camera
         if series != self._series or self._remaining == 0:
             return
@@ -240,7 +240,7 @@ class Captures:
             camera.host.call_later(wait_s, lambda: self._begin_image(series))
 
     def _finish(self, series: int, shot: Shot | None) -> None:
-        """Log and announce an image. ``shot`` is None if the device failed to take it."""
+        """Log and announce an image. None means that the device failed to take it."""
         if series != self._series:
             return
         self._is_exposing = False
@@ -264,14 +264,20 @@ class Captures:
             self._begin_image(series)
 
     def record(self, status_interval_s: float) -> None:
-        """Register the start of a video. Send CAMERA_CAPTURE_STATUS now, and then at this interval (0: not again)."""
+        """Register the start of a video, and send CAMERA_CAPTURE_STATUS at this interval.
+
+        An interval of 0 sends it only once, now.
+        """
         self._recording_since = self._camera.host.now
         self._camera.host.send(self.status())
         if 0.0 < status_interval_s < math.inf:
             self._send_status_every(self._recording_since, max(MIN_STATUS_INTERVAL_S, status_interval_s))
 
     def stop_recording(self) -> float:
-        """Register the end of the video and return its length in seconds; 0 if no video was being recorded."""
+        """Register the end of the video, and return its length in seconds.
+
+        The length is 0 if no video was being recorded.
+        """
         if not self.is_recording:
             return 0.0
         seconds = self._camera.host.now - self._recording_since
@@ -287,7 +293,6 @@ class Captures:
         self._camera.host.call_later(interval_s, send_status)
 
     def status(self) -> CameraCaptureStatus:
-        """Return the CAMERA_CAPTURE_STATUS for the current series and video."""
         camera = self._camera
         is_series = self._remaining != 0 and self.interval_s > 0.0
         if is_series:
@@ -319,7 +324,6 @@ class Tracking:
         self.is_lost: bool = False
 
     def lose(self) -> None:
-        """Simulate the loss of the target."""
         self.is_lost = True
 
     async def track_point(self, command: ReceivedCommand) -> int:
@@ -350,7 +354,7 @@ class Tracking:
 
     @property
     def flags(self) -> int:
-        """State of the tracking (CAMERA_TRACKING_STATUS_FLAGS)."""
+        """CAMERA_TRACKING_STATUS_FLAGS of the tracking."""
         if self.mode == CameraTrackingMode.NONE:
             return 0
         return Flags.ERROR if self.is_lost else Flags.ACTIVE

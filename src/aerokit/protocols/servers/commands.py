@@ -37,12 +37,10 @@ class ReceivedCommand:
 
     @property
     def is_long(self) -> bool:
-        """True if it was sent as COMMAND_LONG."""
         return self.frame is None
 
     @property
     def params(self) -> tuple[float, float, float, float, float, float, float]:
-        """Params 1 to 7 as sent."""
         return (self.param1, self.param2, self.param3, self.param4, self.x, self.y, self.z)
 
     def place(self) -> tuple[int, int]:
@@ -52,7 +50,7 @@ class ReceivedCommand:
 
     @property
     def altitude_frame(self) -> int:
-        """MAV_FRAME of ``z``. In a COMMAND_LONG, ``z`` is relative to home."""
+        """MAV_FRAME of ``z``. The ``z`` of a COMMAND_LONG is relative to home."""
         return MavFrame.GLOBAL_RELATIVE_ALT if self.frame is None else self.frame
 
 
@@ -108,7 +106,6 @@ class CommandDispatcher:
         self.execute(command)
 
     def execute(self, command: ReceivedCommand) -> None:
-        """Refuse a command, or dispatch it to its handler."""
         refusal = self._refusal(command)
         if refusal is not None:
             self.answer(command, refusal)
@@ -116,7 +113,10 @@ class CommandDispatcher:
         self.dispatch(command)
 
     def dispatch(self, command: ReceivedCommand) -> None:
-        """Call the command's handler, and send the acknowledgement unless the handler returned None."""
+        """Call the command's handler, and send its result as acknowledgement.
+
+        A handler that returns None sends the acknowledgement itself.
+        """
         answer = self.handle(command)
         if isinstance(answer, CommandProgress):
             self.report(command, answer, lambda: self.answer(command, answer.result))
@@ -124,7 +124,6 @@ class CommandDispatcher:
             self.answer(command, answer)
 
     def handle(self, command: ReceivedCommand) -> int | CommandProgress | None:
-        """Call the command's handler, and return its result."""
         handler = self._handlers.get(command.command)
         return MavResult.UNSUPPORTED if handler is None else handler(command)
 
@@ -144,7 +143,7 @@ class CommandDispatcher:
         self._host.call_later(max(1, len(progress.percents)) * progress.interval_s, complete)
 
     def answer(self, command: ReceivedCommand, result: int, progress: int = 0, detail: int = 0) -> None:
-        """Send an acknowledgement; ``detail`` is its ``result_param2``."""
+        """Send an acknowledgement with ``detail`` as its ``result_param2``."""
         system, component = command.sender
         ack = CommandAck(
             command.command, result, progress=progress, result_param2=detail, target_system=system,
@@ -211,10 +210,10 @@ class RunningCommands:
     def start(
         self, command: ReceivedCommand, cancel: Callable[[], bool], *, is_stop: bool = False
     ) -> RunningCommand | None:
-        """Register a command that is to be executed. If it must not be executed, answer the sender and return None.
+        """Register a command that is to be executed.
 
-        With ``is_stop``, the command cancels a running one with the same MAV_CMD, and is executed again if the sender
-        repeats it after its end.
+        If it must not be executed, answer the sender and return None. A stop command (``is_stop``) cancels a running
+        one with the same MAV_CMD.
         """
         running = self._running.get(command.command)
         if running is not None and _is_repeated(command, running.command):
@@ -247,19 +246,16 @@ class RunningCommands:
         return True
 
     def report(self, running: RunningCommand, percent: int) -> None:
-        """Send IN_PROGRESS with this percentage now."""
         running.progress = percent
         if self._running.get(running.command.command) is running:
             self._server.answer(running.command, MavResult.IN_PROGRESS, percent)
 
     def _report_repeatedly(self, running: RunningCommand) -> None:
-        """Send IN_PROGRESS now and at intervals, until the command has ended."""
         if self._running.get(running.command.command) is running:
             self._server.answer(running.command, MavResult.IN_PROGRESS, running.progress)
             self._host.call_later(PROGRESS_INTERVAL_S, lambda: self._report_repeatedly(running))
 
     def finish(self, running: RunningCommand, outcome: Outcome) -> None:
-        """Send the result."""
         command = running.command
         if self._running.get(command.command) is running:
             del self._running[command.command]
@@ -267,10 +263,7 @@ class RunningCommands:
             self._server.answer(command, *outcome)
 
     def _record_result(self, command: ReceivedCommand, outcome: Outcome) -> None:
-        """Store the result, to answer repetitions of the command.
-
-        Each sender has its own entry, because a repetition may arrive after the same command of another sender.
-        """
+        # Each sender has its own entry, because a repetition may arrive after the same command of another sender.
         key = (command.command, command.sender)
         self._ended.pop(key, None)  # The new entry must be the last one.
         if len(self._ended) >= MAX_RESULTS:
@@ -278,7 +271,6 @@ class RunningCommands:
         self._ended[key] = (command, outcome, self._host.now)
 
     def cancel_all(self) -> None:
-        """Cancel all running commands, because the component ends."""
         for running in tuple(self._running.values()):
             running.cancel()
 
@@ -289,7 +281,6 @@ class RunningCommands:
 
 
 def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
-    """Return True if ``command`` is a repeated transmission of the command ``first``."""
     if command.confirmation == 0 or command.sender != first.sender:
         return False
     pairs = zip(command.params, first.params, strict=True)
@@ -298,5 +289,5 @@ def _is_repeated(command: ReceivedCommand, first: ReceivedCommand) -> bool:
 
 
 def to_int(value: float) -> int:
-    """Return a parameter as an integer; 0 for NaN (unset) and for values beyond 32 bits."""
+    """Return a parameter as an integer. NaN (unset) and values beyond 32 bits become 0."""
     return int(value) if not math.isnan(value) and abs(value) < 2**31 else 0

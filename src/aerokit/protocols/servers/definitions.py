@@ -38,26 +38,23 @@ class DefinedParameterServer(ExtendedParameterServer):
         self.reset()
 
     def reset(self) -> None:
-        """Restore all defaults."""
         for name, setting in self.definition.settings.items():
             self.values[name] = _ZEROS.get(setting.type, 0) if setting.default is None else setting.default
 
     def refresh(self) -> None:
-        """Update values that the device changes by itself. Called before a value is sent or set."""
+        """Called before a value is sent or set. Updates values that the device changes by itself."""
 
     def can_set(self, name: str) -> bool:
-        """Return True if a setting can be changed now; otherwise the answer is FAILED."""
+        """Return False to answer a request for this setting with FAILED."""
         return True
 
-    def on_set(self, name: str, value: SettingValue) -> None:
-        """Called when the value of a setting has changed."""
+    def on_set(self, name: str, value: SettingValue) -> None: ...
 
     def limited(self, name: str, value: SettingValue) -> SettingValue:
-        """Return the value that is checked and stored instead of the received value, e.g. a clamped value."""
+        """Return the value to check and store instead of the received value, e.g. a clamped one."""
         return value
 
     def restart(self) -> None:
-        """Drop changes of slow settings that are not finished, as a reboot does."""
         super().restart()
         self._pending.clear()
 
@@ -66,7 +63,10 @@ class DefinedParameterServer(ExtendedParameterServer):
         return self.values[name], self.definition.settings[name].wire_type
 
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
-        """Set a value, at once or after the time in `slow`. Return PARAM_ACK, and the value and type to report."""
+        """Set a value, now or later. Return PARAM_ACK, and the value and type to report.
+
+        A setting in `slow` is set after its time.
+        """
         setting = self.definition.settings.get(name)
         if setting is None:
             return ParamAck.VALUE_UNSUPPORTED, data, kind
@@ -81,7 +81,7 @@ class DefinedParameterServer(ExtendedParameterServer):
         return result, setting_bytes(self.values[name], setting.wire_type), setting.wire_type
 
     def _check(self, name: str, value: SettingValue, kind: int) -> tuple[ParamAck, SettingValue]:
-        """Check a received value. Return PARAM_ACK for the answer, and the value to store."""
+        """Return PARAM_ACK for the answer, and the value to store."""
         self.refresh()
         setting, definition = self.definition.settings[name], self.definition
         if setting.read_only or not self.can_set(name) or definition.excluded_by(name, self.values):

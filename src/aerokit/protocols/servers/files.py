@@ -29,13 +29,13 @@ class FileHandle(ABC):
 
     @abstractmethod
     def read(self, offset: int, size: int) -> bytes:
-        """Return up to ``size`` bytes; empty at the end."""
+        """Return up to ``size`` bytes. The result is empty at the end of the file."""
 
     def write(self, offset: int, data: bytes) -> None:
         raise FileFault(EROFS)
 
     def close(self) -> None:  # noqa: B027 - most subclasses need no cleanup
-        """Close the file; an upload takes effect now."""
+        """Close the file. An uploaded file takes effect now."""
 
 
 class FileSystem(Protocol):
@@ -43,17 +43,13 @@ class FileSystem(Protocol):
 
     def __contains__(self, path: str) -> bool: ...
 
-    def size(self, path: str) -> int:
-        """Return the size of a file in bytes."""
-        ...
+    def size(self, path: str) -> int: ...
 
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
-        """Open a file; ``create`` creates a missing file and empties an existing one."""
+        """Open a file. ``create`` creates a missing file and empties an existing one."""
         ...
 
-    def entries(self, path: str) -> list[Entry]:
-        """Return the entries of a folder."""
-        ...
+    def entries(self, path: str) -> list[Entry]: ...
 
     def truncate(self, path: str, size: int) -> None: ...
 
@@ -83,30 +79,24 @@ class UploadedFile(FileHandle):
         self.content[offset : offset + len(data)] = data
 
     def announced_size(self, data: bytes) -> int:
-        """Return the size of the whole file according to its first block; 0 if the block does not contain the size."""
+        """Return the size of the whole file according to its first block. 0 means unknown."""
         return 0
 
 
 class Mount(ABC):
-    """Generated files whose paths begin with a common prefix such as ``@PARAM``."""
+    """Generated files whose paths begin with a common prefix such as ``@PARAM``. Methods raise FileFault on failure."""
 
     is_listed = False
     """True if the mount appears in the root folder and its files can be listed."""
 
     @abstractmethod
     def size(self, path: str) -> int:
-        """Return the size to report when a file is opened, which may be an estimate.
-
-        Raises:
-            FileFault: there is no such file.
-        """
+        """Return the size to report when a file is opened. It may be an estimate."""
 
     @abstractmethod
-    def open(self, path: str, *, writing: bool) -> FileHandle:
-        """Open a file; raises FileFault on failure."""
+    def open(self, path: str, *, writing: bool) -> FileHandle: ...
 
     def entries(self) -> list[Entry]:
-        """Return the files; raises FileFault if the mount cannot be listed."""
         raise FileFault(ENOENT)
 
 
@@ -152,7 +142,6 @@ class _File:
 
     @property
     def size(self) -> int:
-        """Size in bytes. A size that was given is returned without creating the content."""
         if self._make_content is not None and self._size is not None:
             return self._size
         return len(self.content)
@@ -196,8 +185,7 @@ class FileTree:
     def put(self, path: str, content: bytes | Callable[[], bytes], *, size: int | None = None) -> Self:
         """Create or replace a file, and create its folders.
 
-        A function as content is called when the content is first needed; until then, ``size`` is reported. A folder
-        with this path is replaced, with all its files.
+        A function as content is called when the content is first needed. Until then, ``size`` is reported.
         """
         folder = self._root
         *parents, name = _parts(path)
@@ -210,11 +198,9 @@ class FileTree:
         return self
 
     def append(self, path: str, data: bytes) -> None:
-        """Append to a file; open handles see the new content."""
         self._file(path).content.extend(data)
 
     def get(self, path: str) -> bytes:
-        """Return the content of a file; raises FileFault if it does not exist."""
         return bytes(self._file(path).content)
 
     def __contains__(self, path: str) -> bool:
@@ -225,7 +211,7 @@ class FileTree:
         return True
 
     def mounted(self, path: str) -> tuple[Mount, str] | None:
-        """Return the mount of a path, and the rest of the path; None if the path is in no mount."""
+        """Return the mount of a path and the rest of the path. None means that the path is in no mount."""
         relative_path = path.removeprefix("/")
         for prefix, mount in self.mounts.items():
             if relative_path.startswith(prefix):
@@ -233,7 +219,6 @@ class FileTree:
         return None
 
     def size(self, path: str) -> int:
-        """Return the size of a file in bytes; 4096 for a folder."""
         mounted = self.mounted(path)
         if mounted is not None:
             mount, path_in_mount = mounted
@@ -242,10 +227,9 @@ class FileTree:
         return 4096 if isinstance(node, dict) else node.size
 
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
-        """Open a file.
+        """Open a file. ``create`` creates a missing file and empties an existing one.
 
-        In a mount (see `Mount`), the file can be written only with ``writing``, and ``create`` is ignored. Any other
-        file can always be written; ``create`` creates it if it is missing, and otherwise empties it.
+        A file in a mount can be written only with ``writing``. Any other file can always be written.
         """
         mounted = self.mounted(path)
         if mounted is not None:
@@ -256,7 +240,6 @@ class FileTree:
         return _Opened(self, self._file(path))
 
     def _create(self, path: str) -> None:
-        """Create an empty file, or empty an existing one."""
         folder, name = self._parent(path)
         node = folder.get(name)
         if isinstance(node, dict):
@@ -281,7 +264,6 @@ class FileTree:
         del folder[name]
 
     def rename(self, path: str, to: str) -> None:
-        """Move a file or folder. A file replaces an existing file, a folder an empty folder."""
         node = self._find(path)
         folder, name = self._parent(to)
         existing = folder.get(name)
@@ -300,7 +282,10 @@ class FileTree:
         folder[name] = node
 
     def reserve(self, size: int) -> None:
-        """Subtract ``size`` from the free bytes; a negative size frees bytes. FileFault if too few bytes are free."""
+        """Subtract ``size`` from the free bytes. A negative size frees bytes.
+
+        Raises FileFault if too few bytes are free.
+        """
         if self.free_bytes is None:
             return
         if size > self.free_bytes:
@@ -308,12 +293,10 @@ class FileTree:
         self.free_bytes -= size
 
     def _check_space_for_entry(self) -> None:
-        """Raise FileFault if no byte is free, because even an empty file or folder needs space."""
-        if self.free_bytes == 0:
+        if self.free_bytes == 0:  # Even an empty file or folder needs space.
             raise FileFault(ENOSPC)
 
     def entries(self, path: str) -> list[Entry]:
-        """Return the entries of a folder, oldest first."""
         mounted = self.mounted(path)
         if mounted is not None:
             mount, path_in_mount = mounted
@@ -326,7 +309,6 @@ class FileTree:
         return [(name, None if isinstance(node, dict) else node.size) for name, node in folder.items()]
 
     def make_folder(self, path: str) -> None:
-        """Create a folder; its parent folder must exist."""
         folder, name = self._parent(path)
         if name in folder:
             raise FileFault(EEXIST)
@@ -334,7 +316,6 @@ class FileTree:
         folder[name] = {}
 
     def remove_folder(self, path: str) -> None:
-        """Remove a folder, which must be empty."""
         folder, name = self._parent(path)
         node = self._find(path)
         if not isinstance(node, dict):
@@ -344,7 +325,7 @@ class FileTree:
         del folder[name]
 
     def _find(self, path: str) -> _File | _Folder:
-        """Return the file or folder with this path; raises FileFault if there is none."""
+        """Return the file or folder with this path. Raises FileFault if there is none."""
         node: _File | _Folder = self._root
         for part in _parts(path):
             if not isinstance(node, dict):
@@ -372,7 +353,6 @@ class FileTree:
 
 
 def _parts(path: str) -> list[str]:
-    """Split a path. ``..`` removes the folder before it, and never leads above the root."""
     parts: list[str] = []
     for part in path.split("/"):
         if part == "..":

@@ -102,7 +102,6 @@ class SessionFtpServer(Generic[FilesT]):
 
     @property
     def open_sessions(self) -> int:
-        """Number of open files."""
         return sum(len(peer.sessions) for peer in self._peers.values())
 
     def restart(self) -> None:
@@ -110,7 +109,6 @@ class SessionFtpServer(Generic[FilesT]):
         self._peers.clear()
 
     def close(self) -> None:
-        """Close all files."""
         for peer in self._peers.values():
             with suppress(FileFault):
                 self._close_all(peer)
@@ -124,34 +122,28 @@ class SessionFtpServer(Generic[FilesT]):
             self.receive(FtpPacket.parse(message), channel)
 
     def _key(self, request: FtpPacket, channel: Channel) -> Hashable:
-        """Return the key under which the state of this request's client is stored."""
+        """Return the key under which the state of this client is stored."""
         return request.client
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, reply: FtpPacket) -> bool:
-        """Return True if this request repeats the latest one, and ``reply`` is the reply to the latest one.
-
-        Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. If ``reply``
-        is the last of several to a burst request, the result is False, so that the whole burst is sent again.
-        """
+        """Return True if this request repeats the latest one, and ``reply`` answers the latest one."""
+        # Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. The last
+        # reply of a burst has a higher number, so that the whole burst is sent again.
         is_same = peer.request is not None and request.repeats(peer.request)
         reply_sequence = (request.sequence + 1) & 0xFFFF
         return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 
     def _new_number(self, peer: FtpPeer, request: FtpPacket) -> int:
-        """Return the number for a new session.
-
-        The client may request a number, as MAVProxy does. If it requests 0 or a number in use, a free one is used.
-        """
+        # A client may request a number, as MAVProxy does. 0 means any number.
         if request.session and request.session not in peer.sessions:
             return request.session
         return next(number for number in range(self.max_sessions) if number not in peer.sessions)
 
     def _answer_fault(self, peer: FtpPeer, request: FtpPacket, fault: FileFault) -> FtpPacket:
-        """Return the answer to a request that failed."""
         return request.refuse_errno(fault.errno)
 
     def _peer(self, request: FtpPacket, channel: Channel) -> FtpPeer | None:
-        """Return the state of a client; None if there are too many clients with open files."""
+        """Return the state of a client, or None if too many clients have open files."""
         key = self._key(request, channel)
         if key not in self._peers and len(self._peers) >= self.max_clients:
             idle = (other for other, peer in self._peers.items() if not peer.sessions and peer.checksum_request is None)
@@ -164,7 +156,6 @@ class SessionFtpServer(Generic[FilesT]):
         return peer
 
     def receive(self, request: FtpPacket, channel: Channel) -> None:
-        """Handle one request; the answer is sent now or later."""
         peer = self._peer(request, channel)
         if peer is None:
             self._host.send(request.refuse(MavFtpErr.NOSESSIONSAVAILABLE).message(), channel)
@@ -192,7 +183,7 @@ class SessionFtpServer(Generic[FilesT]):
             self._reply(peer, self._adapted(peer, request, answer))
 
     def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
-        """Return the answer with its fields set as the firmware sets them. Here, the offset is that of the request."""
+        """Return the answer with its fields set as the firmware sets them."""
         return answer.replace(offset=request.offset)
 
     def _reply(self, peer: FtpPeer, answer: FtpPacket) -> None:
@@ -206,7 +197,6 @@ class SessionFtpServer(Generic[FilesT]):
         return checked_path(request.data[: request.size])
 
     def _session_of(self, peer: FtpPeer, request: FtpPacket) -> FtpSession:
-        """Return the session that a request names; raises Refused if it is not open."""
         session = peer.sessions.get(request.session)
         if session is None:
             raise Refused(MavFtpErr.INVALIDSESSION)
@@ -230,7 +220,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge()
 
     def _close_all(self, peer: FtpPeer) -> None:
-        """Close all files of a client, then raise the last error, if any."""
+        """Close all files of a client. If an error occurs, it is raised after the last file."""
         sessions = list(peer.sessions.values())
         peer.sessions.clear()
         fault = None
@@ -244,7 +234,6 @@ class SessionFtpServer(Generic[FilesT]):
             raise fault
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Open a file for OpenFileRO, OpenFileWO or CreateFile, and return the ACK with its size and session."""
         if len(peer.sessions) >= self.max_sessions:
             return request.refuse(MavFtpErr.NOSESSIONSAVAILABLE)
         path = self._path(request)
@@ -262,7 +251,6 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(size.to_bytes(4, "little"), session=number)
 
     def _size(self, path: str, *, reading: bool) -> int:
-        """Return the size of a file. If it is unknown, raise FileFault when reading; otherwise return 0."""
         try:
             return self.files.size(path)
         except FileFault:
@@ -300,7 +288,7 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge(request.size.to_bytes(4, "little"))
 
     def _start_burst(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
-        """Start a burst, or move a running one to another offset. Return None, because the blocks are the answer."""
+        """Start a burst, or move a running one to another offset."""
         session = self._session_of(peer, request)
         is_running = session.next_block is not None
         first_sequence = (request.sequence + 1) & 0xFFFF
@@ -311,20 +299,18 @@ class SessionFtpServer(Generic[FilesT]):
         return None
 
     def _send_blocks(self, peer: FtpPeer, session: FtpSession) -> None:
-        """Send up to `self.burst` blocks, none while the link is congested; then schedule a call for the rest."""
         max_blocks = 0 if self._is_congested() else self.burst
         for number in range(max_blocks):
             if session.next_block is None:
                 return
             self._send_block(peer, session, session.next_block, may_end=number == self.burst - 1)
-        if session.next_block is None:
-            return
-        self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
+        if session.next_block is not None:
+            self._host.call_later(self.burst_interval_s, lambda: self._send_blocks(peer, session))
 
     def _send_block(self, peer: FtpPeer, session: FtpSession, burst: FtpPacket, *, may_end: bool) -> None:
-        """Send a block of a burst. At the end of the file, or on an error, send the NAK that ends the burst instead.
+        """Send a block of a burst, or the NAK that ends the burst.
 
-        With ``may_end``, the block is marked as the burst's last one (``burst_complete``) if enough data was sent.
+        ``may_end`` marks the block as the burst's last one if enough data was sent.
         """
         # Unlike in a request, the sequence number in `burst` is already that of the reply.
         number = session.number
@@ -348,7 +334,6 @@ class SessionFtpServer(Generic[FilesT]):
         session.next_block = None if is_complete else next_block
 
     def _list(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Answer with the folder's entries from number ``offset`` on: as many as fit into one message."""
         max_line_size = DATA_SIZE - len(self.line_end)
         lines = [*self.list_prefix, *map(_line, self._entries(self._path(request)))]
         # A line that fits into no message becomes S ("skip"). Otherwise the answer would be EOF, the end of the list.
@@ -384,7 +369,6 @@ class SessionFtpServer(Generic[FilesT]):
         return request.acknowledge()
 
     def _crc32(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket | None:
-        """Compute a checksum in slices, so that a large file does not block the event loop."""
         path = self._path(request)
         is_repeated = peer.checksum_request is not None and request.repeats(peer.checksum_request)
         if not is_repeated:  # The running computation also answers a repeated request.
@@ -394,7 +378,7 @@ class SessionFtpServer(Generic[FilesT]):
         return None
 
     def _continue_crc32(self, peer: FtpPeer, request: FtpPacket, file: FileHandle, offset: int, checksum: int) -> None:
-        """Add the next slice of the file to the checksum, and schedule the slice after it, or answer at the end."""
+        # The checksum is computed in slices, so that a large file does not block the event loop.
         has_more = True
         try:
             for _ in range(self.crc_blocks_at_once):

@@ -25,7 +25,6 @@ class FtpPacket(FtpMessage):
         return cls.decode(message.payload, cut=False).replace(client=sender_of(message))
 
     def repeats(self, other: FtpPacket) -> bool:
-        """Return True if this request equals ``other``. Only the first ``size`` bytes of ``data`` are compared."""
         fields = ("client", "sequence", "session", "opcode", "offset", "size")
         are_equal = all(getattr(self, field) == getattr(other, field) for field in fields)
         return are_equal and self.data[: self.size] == other.data[: other.size]
@@ -37,7 +36,6 @@ class FtpPacket(FtpMessage):
         )
 
     def acknowledge(self, data: bytes = b"", *, offset: int = 0, session: int | None = None) -> FtpPacket:
-        """Return the ACK of this request."""
         return FtpPacket(
             sequence=(self.sequence + 1) & 0xFFFF, opcode=MavFtpOpcode.ACK,
             session=self.session if session is None else session, size=len(data), request_opcode=self.opcode,
@@ -45,12 +43,10 @@ class FtpPacket(FtpMessage):
         )  # fmt: skip
 
     def refuse(self, code: int, errno: int | None = None) -> FtpPacket:
-        """Return the NAK of this request."""
         data = bytes([code]) if errno is None else bytes([code, errno])
         return self.acknowledge(data).replace(opcode=MavFtpOpcode.NAK)
 
     def refuse_errno(self, errno: int) -> FtpPacket:
-        """Return the NAK for an errno; MAVFTP has separate error codes for EEXIST and ENOENT."""
         separate_code = {EEXIST: MavFtpErr.FILEEXISTS, ENOENT: MavFtpErr.FILENOTFOUND}.get(errno)
         return self.refuse(MavFtpErr.FAILERRNO, errno) if separate_code is None else self.refuse(separate_code)
 
@@ -60,7 +56,7 @@ def path_in(data: bytes) -> str:
 
 
 def crc32(data: bytes, start: int = 0) -> int:
-    """Return the checksum for CalcFileCRC32, which is CRC32 without the inversions at the start and the end."""
+    # CalcFileCRC32 is CRC-32 without the inversions at the start and the end.
     return zlib.crc32(data, start ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
@@ -72,7 +68,7 @@ class Refused(Exception):
 
 
 def checked_path(data: bytes) -> str:
-    """Return the path of a request; raises Refused if it contains ``..``."""
+    """Return the path of a request. Raises Refused if it contains ``..``."""
     path = path_in(data)
     if ".." in path.split("/"):
         raise Refused(MavFtpErr.FILEPROTECTED)

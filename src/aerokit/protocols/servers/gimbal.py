@@ -131,7 +131,7 @@ def gimbal_manager_status(gimbal: GimbalMount) -> m.GimbalManagerStatus:
 
 
 def _flags(gimbal: GimbalMount) -> int:
-    """Return GIMBAL_MANAGER_FLAGS; roll and pitch are always relative to the horizon."""
+    # Roll and pitch are always relative to the horizon.
     flags = gimbal.flags & (Flags.RETRACT | Flags.NEUTRAL) | Flags.ROLL_LOCK | Flags.PITCH_LOCK
     if gimbal.is_yaw_locked:
         return flags | Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME
@@ -139,7 +139,6 @@ def _flags(gimbal: GimbalMount) -> int:
 
 
 def _attitude_status(gimbal: GimbalMount) -> m.GimbalDeviceAttitudeStatus:
-    """Return the attitude as a broadcast. The yaw is relative to north if it is locked, otherwise to the nose."""
     is_from_north = gimbal.is_yaw_locked
     angles = gimbal.angles_from_north() if is_from_north else gimbal.angles()
     return m.GimbalDeviceAttitudeStatus(
@@ -184,14 +183,9 @@ class GimbalRequests:
         self._gimbal = gimbal
 
     def _selects_gimbal(self, device_id: float) -> bool:
-        """Return True if a device id in a command or message selects this gimbal; 0 selects all."""
-        return to_int(device_id) in (0, self._gimbal.device_id)
+        return to_int(device_id) in (0, self._gimbal.device_id)  # 0 selects all gimbals.
 
     def configure(self, command: ReceivedCommand) -> int:
-        """Set primary control (params 1 and 2) and secondary control (params 3 and 4).
-
-        Each pair is a system and component id. -1 means unchanged, -2 the sender, -3 release.
-        """
         gimbal, sender = self._gimbal, command.sender
         ids = (command.param1, command.param2, command.param3, command.param4)
         if not self._selects_gimbal(command.z) or not all(_RELEASE <= number <= 255 for number in ids):
@@ -204,7 +198,6 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def pitch_and_yaw(self, command: ReceivedCommand) -> int:
-        """Apply angles in degrees or rates in degrees per second; NaN means not given."""
         if not self._selects_gimbal(command.z) or not self._gimbal.is_in_control(command.sender):
             return MavResult.DENIED
         pitch, yaw, pitch_rate, yaw_rate = map(
@@ -215,20 +208,20 @@ class GimbalRequests:
         return MavResult.ACCEPTED if is_applied else MavResult.DENIED
 
     def _refusal(self, device_id: float, command: ReceivedCommand) -> int | None:
-        """Return the MAV_RESULT for a command that the gimbal cannot or must not execute, or None."""
+        """Return the MAV_RESULT that refuses the command, or None."""
         if not self._gimbal.can_point_at_positions:
             return MavResult.UNSUPPORTED
         is_allowed = self._selects_gimbal(device_id) and self._gimbal.is_in_control(command.sender)
         return None if is_allowed else MavResult.DENIED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """Point at a position; the altitude of a COMMAND_LONG is above mean sea level."""
         gimbal = self._gimbal
         if (refusal := self._refusal(command.param1, command)) is not None:
             return refusal
         scale = 1.0 if command.is_long else 1e-7
         if not (abs(command.x * scale) <= 90.0 and abs(command.y * scale) <= 180.0):  # False for NaN, too.
             return MavResult.DENIED
+        # The altitude of a COMMAND_LONG is above mean sea level.
         frame = MavFrame.GLOBAL if command.is_long else command.altitude_frame
         altitude = command.z
         if frame not in _ABSOLUTE_FRAMES:
@@ -237,7 +230,6 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def follow(self, command: ReceivedCommand) -> int:
-        """Follow the vehicle whose system id is param 1."""
         if (refusal := self._refusal(command.param2, command)) is not None:
             return refusal
         system_id = to_int(command.param1)
@@ -247,7 +239,6 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def on_global_position(self, message: m.GlobalPositionInt, _: Channel) -> None:
-        """Update the target if the message comes from the followed vehicle."""
         system_id, _component = sender_of(message)
         self._gimbal.update_followed(system_id, (message.lat, message.lon, message.alt * 1e-3))
 
@@ -258,15 +249,12 @@ class GimbalRequests:
         return MavResult.ACCEPTED
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> bool:
-        """Move to the rest position if ``flags`` contain RETRACT or NEUTRAL. Otherwise apply the angles or the rates.
-
-        The rates are applied if an angle is not finite (NaN: not given). Return False if a rate is not finite, too.
-        """
+        """Apply the flags, the angles or the rates. Return False if none of them can be applied."""
         gimbal = self._gimbal
         locked = bool(flags & (Flags.YAW_LOCK | Flags.YAW_IN_EARTH_FRAME))
         if flags & (Flags.RETRACT | Flags.NEUTRAL):
             gimbal.point(_REST_ANGLES, flags, locked=False)
-        elif all(map(math.isfinite, angles)):
+        elif all(map(math.isfinite, angles)):  # NaN means that an angle or a rate was not given.
             gimbal.point(angles, flags, locked=locked)
         elif all(map(math.isfinite, rates)):
             gimbal.turn(rates, flags, locked=locked)
@@ -279,7 +267,8 @@ class GimbalRequests:
             self._apply_attitude(message)
 
     def on_device_attitude(self, message: m.GimbalDeviceSetAttitude, _: Channel) -> None:
-        """Apply the set-point of another manager, such as an autopilot, if it or no component is in control."""
+        # The sender is another manager, such as an autopilot. It may set the attitude if it is in control, or if no
+        # component is.
         if self._gimbal.primary in ((0, 0), sender_of(message)):
             self._apply_attitude(message)
 
@@ -294,15 +283,15 @@ class GimbalRequests:
             self.apply(message.flags, (0.0, message.pitch, message.yaw), (0.0, message.pitch_rate, message.yaw_rate))
 
     def on_manual_control(self, message: m.GimbalManagerSetManualControl, _: Channel) -> None:
-        """Apply the angles, taken as radians, or the rates, which are fractions of the slew rate, from -1 to 1."""
         gimbal = self._gimbal
         if self._selects_gimbal(message.gimbal_device_id) and gimbal.is_in_control(sender_of(message)):
+            # The angles are taken as radians. The rates are fractions of the slew rate, from -1 to 1.
             rates = (0.0, message.pitch_rate * gimbal.slew_rad_s, message.yaw_rate * gimbal.slew_rad_s)
             self.apply(message.flags, (0.0, message.pitch, message.yaw), rates)
 
 
 def _owner(current: Owner, requested: tuple[int, int], sender: Owner) -> Owner:
-    """Return the component that has control after the pair ``requested`` was applied to ``current``; (0, 0) if none."""
+    """Return the component that has control after a request for these ids."""
     if _SENDER in requested:
         return sender
     if _RELEASE in requested:  # Only the component that has control can release it.
@@ -313,7 +302,6 @@ def _owner(current: Owner, requested: tuple[int, int], sender: Owner) -> Owner:
 
 
 def gimbal_commands(gimbal: GimbalMount) -> dict[int, CommandHandler]:
-    """Return the handler for each MAV_CMD of the gimbal protocol."""
     control = GimbalRequests(gimbal)
     return {
         MavCmd.DO_GIMBAL_MANAGER_CONFIGURE: control.configure,
@@ -325,7 +313,6 @@ def gimbal_commands(gimbal: GimbalMount) -> dict[int, CommandHandler]:
 
 
 def gimbal_builders(gimbal: GimbalMount) -> dict[int, Builder]:
-    """Return a builder for each message id of the gimbal protocol."""
     return {
         m.GimbalDeviceInformation.ID: lambda _: [_device_information(gimbal)],
         m.GimbalDeviceAttitudeStatus.ID: lambda _: [_attitude_status(gimbal)],
@@ -335,7 +322,6 @@ def gimbal_builders(gimbal: GimbalMount) -> dict[int, Builder]:
 
 
 def listen_for_gimbal(gimbal: GimbalMount) -> None:
-    """Register handlers for the messages, other than commands, that the gimbal receives."""
     host, control = gimbal.host, GimbalRequests(gimbal)
     host.on(m.GimbalManagerSetAttitude, control.on_attitude)
     host.on(m.GimbalManagerSetPitchyaw, control.on_pitch_and_yaw)

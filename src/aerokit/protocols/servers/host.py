@@ -41,6 +41,6 @@ class ServerHost(Protocol):
 
 
 def sender_of(message: Message) -> tuple[int, int]:
-    """Return system and component id of the sender; zeros if the message was not received."""
+    """Return system and component id of the sender. They are 0 if the message was not received."""
     frame = message.received_frame
     return (0, 0) if frame is None else (frame.system_id, frame.component_id)

@@ -35,7 +35,6 @@ class MessageStreams:
         self._streams: dict[tuple[Channel, int], _Stream] = {}
 
     def commands(self) -> dict[int, CommandHandler]:
-        """Return the handler for each MAV_CMD that requests or streams messages."""
         return {
             MavCmd.REQUEST_MESSAGE: self._request_message,
             MavCmd.SET_MESSAGE_INTERVAL: self._set_interval,
@@ -43,13 +42,12 @@ class MessageStreams:
         }
 
     def clear(self) -> None:
-        """Stop all streams."""
         self._streams.clear()
 
     def stream(self, message_id: int, interval_s: float, channel: Channel = None) -> bool:
-        """Stream messages with this id on one channel (None: on all channels). An interval of 0 or less stops that.
+        """Stream messages with this id on one channel, or on all channels (None).
 
-        Return False if there are too many streams already.
+        An interval of 0 or less stops the stream. Returns False if there are too many streams.
         """
         key = (channel, message_id)
         if interval_s <= 0.0:
@@ -84,9 +82,9 @@ class MessageStreams:
             self._host.call_later(stream.interval_s, lambda: self._send_stream(key, stream))
 
     def answer_with(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send the requested messages and return ACCEPTED.
+        """Send the requested messages, and return the MAV_RESULT.
 
-        Return DENIED if the id is unknown, and FAILED if there is nothing to send for it yet.
+        It is DENIED for an unknown id, and FAILED if there is nothing to send yet.
         """
         builder = self.builders.get(message_id)
         if builder is None:
@@ -100,20 +98,16 @@ class MessageStreams:
         return self.answer_with(to_int(command.param1), command)
 
     def _set_interval(self, command: ReceivedCommand) -> int:
-        """Set or stop a stream on one channel. Both 0 (default rate) and -1 stop it, because there is no default rate.
-
-        If one stream sends the message on all channels, it is stopped, because it would also send on this channel.
-        """
         message_id = to_int(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED
         # A stream to all channels would also be sent to this channel, in addition to the requested stream.
         self._streams.pop((None, message_id), None)
+        # There is no default rate, so 0 stops the stream as -1 does.
         is_accepted = self.stream(message_id, to_int(command.param2) / 1e6, command.channel)
         return MavResult.ACCEPTED if is_accepted else MavResult.TEMPORARILY_REJECTED
 
     def _get_interval(self, command: ReceivedCommand) -> int:
-        """Send MESSAGE_INTERVAL, as MAV_CMD_GET_MESSAGE_INTERVAL requests, and return the MAV_RESULT."""
         message_id = to_int(command.param1)
         if message_id not in self.builders:
             return MavResult.DENIED

@@ -20,7 +20,7 @@ AnyListMessage = m.MissionRequestList | AnyRequest | m.MissionCount | m.MissionW
 
 
 def item_from(message: AnyItem) -> MissionItem:
-    """Convert a MISSION_ITEM_INT or MISSION_ITEM to an item; does not scale ``x`` and ``y``."""
+    """Convert a message to an item. ``x`` and ``y`` are not scaled."""
     numbers = (message.param1, message.param2, message.param3, message.param4, message.x, message.y, message.z)
     return MissionItem(message.command, message.frame, *numbers, autocontinue=bool(message.autocontinue))
 
@@ -37,7 +37,6 @@ def item_message_int(
 def item_message_float(
     item: MissionItem, place: tuple[float, float], seq: int, to: tuple[int, int], mission_type: int, current: int = 0
 ) -> m.MissionItem:
-    """Create a MISSION_ITEM; ``place`` becomes ``x`` and ``y``."""
     system, component = to
     return to_wire_float(
         item, seq, target_system=system, target_component=component, mission_type=mission_type, current=current,
@@ -125,7 +124,6 @@ class MissionServer:
 
     @property
     def transfer_is_open(self) -> bool:
-        """True during an upload."""
         return bool(self._uploads)
 
     def reset(self) -> None:
@@ -134,7 +132,7 @@ class MissionServer:
         self._clearing = None
 
     def id(self, mission_type: int) -> int:
-        """Return the opaque id: a checksum of a list, or 0 for an empty list. The current item does not change it."""
+        """Return the opaque id of a list, a checksum of its items. It is 0 for an empty list."""
         items = self.lists.get(mission_type, ())
         if items and mission_type not in self._opaque_ids:
             messages = (_item_message(item, seq, (0, 0), mission_type, current=False) for seq, item in enumerate(items))
@@ -149,14 +147,13 @@ class MissionServer:
         )  # fmt: skip
 
     def store(self, mission_type: int, items: Sequence[MissionItem]) -> None:
-        """Replace a list."""
         self.lists[mission_type] = tuple(items)
         self._opaque_ids.pop(mission_type, None)
         if mission_type == MavMissionType.MISSION:
             self.current = 0
 
     def set_current(self, seq: int) -> bool:
-        """Make the component continue its mission at an item, and announce the item; return False if it refuses."""
+        """Make the component continue its mission at an item. Return False if it refuses."""
         if not 0 <= seq < self.count(MavMissionType.MISSION) or not self._may_set_current(seq):
             return False
         self.current = seq
@@ -164,24 +161,21 @@ class MissionServer:
         return True
 
     def capacity(self, mission_type: int) -> int:
-        """Return the maximum number of items of a list."""
         return self._capacity
 
     def count(self, mission_type: int) -> int:
-        """Return the number of stored items; 0 for an unknown type."""
         return len(self.lists.get(mission_type, ()))
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
-        """Return the MAV_MISSION_RESULT that refuses a transfer, else None."""
+        """Return the MAV_MISSION_RESULT that refuses a transfer, or None."""
         return None if message.mission_type in self.lists else _Result.UNSUPPORTED
 
     def _item(self, mission_type: int, seq: int) -> MissionItem | int:
-        """Return the requested item; if it does not exist, the MAV_MISSION_RESULT for the answer."""
+        """Return the requested item, or the MAV_MISSION_RESULT that refuses the request."""
         items = self.lists.get(mission_type, ())
         return items[seq] if 0 <= seq < len(items) else _Result.INVALID_SEQUENCE
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        """Return the item as MISSION_ITEM_INT or MISSION_ITEM, whichever was requested."""
         seq, kind = request.seq, request.mission_type
         system, component = sender_of(request)
         current = seq == self.current and kind == MavMissionType.MISSION
@@ -192,13 +186,13 @@ class MissionServer:
         )
 
     def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
-        """Store the expected item of an upload; return the MAV_MISSION_RESULT."""
+        """Store the expected item of an upload, and return the MAV_MISSION_RESULT."""
         upload.uses_int = isinstance(message, m.MissionItemInt)
         upload.items.append(from_wire(message))
         return _Result.ACCEPTED
 
     def _key(self, mission_type: int) -> int:
-        """Return the key of an upload; uploads with different keys can run at the same time."""
+        """Return the key of an upload. Uploads with different keys can run at the same time."""
         return 0
 
     def _acknowledge(self, to: tuple[int, int], kind: int, result: int, channel: Channel, opaque_id: int = 0) -> None:
@@ -226,7 +220,6 @@ class MissionServer:
         self._acknowledge(sender_of(request), request.mission_type, result, channel)
 
     def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
-        """Begin an upload, unless it must be refused."""
         client, kind = sender_of(message), message.mission_type
         running = self._uploads.get(self._key(kind))
         refusal = self._refusal(message, channel)
@@ -264,11 +257,10 @@ class MissionServer:
         self._watch(upload)
 
     def _drop(self, upload: ListUpload) -> None:
-        """End an upload. This sends no answer to the client."""
+        """End an upload without an answer to the client."""
         self._uploads.pop(self._key(upload.mission_type), None)
 
     def _end(self, upload: ListUpload, result: int) -> None:
-        """End an upload with this MAV_MISSION_RESULT."""
         self._drop(upload)
         opaque_id = self.id(upload.mission_type) if result == _Result.ACCEPTED else 0
         self._acknowledge(upload.client, upload.mission_type, result, upload.channel, opaque_id)
@@ -308,11 +300,8 @@ class MissionServer:
         self._end(upload, _Result.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        """Process an item. Only the expected item from the client that uploads is stored.
-
-        As in ArduPilot (MissionItemProtocol.cpp), the sequence is checked before the sender, and the upload's channel
-        gets the answer.
-        """
+        # As in ArduPilot (MissionItemProtocol.cpp), the sequence is checked before the sender, and the upload's channel
+        # gets the answer.
         upload = self._uploads.get(self._key(message.mission_type))
         if upload is None or message.mission_type != upload.mission_type:
             self._answer_item(message, _Result.ERROR, channel)
@@ -324,10 +313,10 @@ class MissionServer:
             self._receive_item(upload, message)
 
     def _answer_item(self, message: AnyItem, result: int, channel: Channel) -> None:
-        """Called for an unexpected item. Sends nothing here: an upload requests its expected item again anyway."""
+        """Called for an unexpected item."""
+        # Nothing is sent, because an upload requests its expected item again anyway.
 
     def _receive_item(self, upload: ListUpload, message: AnyItem) -> None:
-        """Store the expected item of an upload, and request the next one."""
         result = self._store_item(upload, message)
         if result != _Result.ACCEPTED:
             self._end(upload, result)
@@ -340,7 +329,6 @@ class MissionServer:
             self._finish(upload)
 
     def _finish(self, upload: ListUpload) -> None:
-        """Validate the complete list, store it if it is accepted, and end the upload."""
         upload.is_being_validated = True
 
         def answer(result: int) -> None:
@@ -355,18 +343,16 @@ class MissionServer:
             answer(_Result.INVALID)
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """Drop an upload that its client cancels before validation. The ACCEPTED that ends a download is ignored."""
         upload = self._uploads.get(self._key(ack.mission_type))
         if (
             upload is not None
             and sender_of(ack) == upload.client
             and not upload.is_being_validated
-            and ack.type != _Result.ACCEPTED
+            and ack.type != _Result.ACCEPTED  # ACCEPTED ends a download.
         ):
             self._drop(upload)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear one list or all lists, unless a transfer is open or another request to clear is running."""
         client, kind = sender_of(request), request.mission_type
         if kind not in (*self.lists, MavMissionType.ALL):
             self._acknowledge(client, kind, _Result.UNSUPPORTED, channel)
@@ -382,7 +368,7 @@ class MissionServer:
             self._clear(non_empty if kind == MavMissionType.ALL else [kind], request, channel)
 
     def _clear(self, kinds: list[int], request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear these lists in turn. Acknowledge when all are cleared, or when ``validate`` refuses to clear one."""
+        """Clear these lists one after the other, and acknowledge the request."""
         if not kinds:
             self._end_clearing(_Result.ACCEPTED, request, channel)
             return

@@ -42,15 +42,14 @@ class ParameterLists:
 
     @property
     def running_lists(self) -> int:
-        """Number of channels on which a list is being sent."""
         return len(self._lists)
 
     def restart(self) -> None:
-        """Called after the component has rebooted: drop the lists that are being sent."""
+        """Drop the lists that are being sent, as a reboot does."""
         self._lists.clear()
 
     def start_list(self, channel: Channel) -> None:
-        """Send all parameters on a channel. If the list is already being sent there, it restarts."""
+        """Send all parameters on a channel. A list that is being sent there starts again."""
         self._list_number += 1
         number = self._list_number
         self._lists[channel] = number
@@ -67,10 +66,6 @@ class ParameterLists:
         return self.burst / self.list_rate_hz
 
     def _send_group(self, start: int, channel: Channel, number: int) -> None:
-        """Send ``burst`` parameters from index ``start`` on, and schedule the next group, unless the list was stopped.
-
-        ``number`` identifies the list: a list that was restarted has another number.
-        """
         if self._lists.get(channel) != number:  # The list was stopped, or restarted with another number.
             return
         names, end = self._listed.names, start + self.burst
@@ -82,9 +77,9 @@ class ParameterLists:
         self._host.call_later(self._group_interval_s, lambda: self._send_group(end, channel, number))
 
     def requested(self, name: str, index: int) -> tuple[str, int] | None:
-        """Return name and index of the parameter that a request selects: by ``name`` if ``index`` is negative.
+        """Return name and index of the requested parameter, or None if there is no such parameter.
 
-        Return None if there is no such parameter.
+        ``name`` counts only if ``index`` is negative.
         """
         names = self._listed.names
         if index < 0:
@@ -92,7 +87,7 @@ class ParameterLists:
         return (names[index], index) if index < len(names) else None
 
     def send(self, name: str, index: int, channel: Channel) -> None:
-        """Send a value on one channel, or on all if ``channel`` is None."""
+        """Send a value on one channel, or on all channels (None)."""
         raise NotImplementedError
 
 
@@ -118,7 +113,6 @@ class ParameterProtocolServer(ParameterLists):
         raise NotImplementedError
 
     def send(self, name: str, index: int, channel: Channel) -> None:
-        """Send a PARAM_VALUE on one channel, or on all if ``channel`` is None."""
         self._host.send(self.value_message(name, index), channel)
 
     def send_error(self, to: tuple[int, int], name: str, index: int, code: int, channel: Channel) -> None:
@@ -130,7 +124,10 @@ class TypedStore(NamedList, Protocol):
 
     @property
     def small_names(self) -> Sequence[str]:
-        """Names of the parameters whose type `fits_param_value`. Needed for every PARAM_VALUE, so it must be fast."""
+        """Names of the parameters whose type `fits_param_value`.
+
+        This must be fast, because every PARAM_VALUE needs it.
+        """
         ...
 
     def __contains__(self, name: object) -> bool: ...
@@ -140,7 +137,7 @@ class TypedStore(NamedList, Protocol):
     def type(self, name: str) -> MavParamExtType: ...
 
     def problem(self, name: str, value: SettingValue, type: int) -> tuple[int, int] | None:  # noqa: A002
-        """Return MAV_PARAM_ERROR and PARAM_ACK for a value that must not be stored; None if it may be stored."""
+        """Return MAV_PARAM_ERROR and PARAM_ACK if the value must not be stored, otherwise None."""
         ...
 
     def store(self, name: str, value: SettingValue) -> None:
@@ -162,7 +159,6 @@ class TypedParameterServer(ParameterProtocolServer):
 
     @property
     def names(self) -> Sequence[str]:
-        """Names of the parameters whose type fits into PARAM_VALUE."""
         return self._store.small_names
 
     def value_message(self, name: str, index: int) -> m.ParamValue:
@@ -172,7 +168,7 @@ class TypedParameterServer(ParameterProtocolServer):
         return value_message(parameter, len(self.names), bytewise=self.bytewise)
 
     def publish(self, name: str) -> None:
-        """Send a changed value to all other programs if its type fits into PARAM_VALUE."""
+        """Send a value to all programs. Does nothing if its type does not fit into PARAM_VALUE."""
         if fits_param_value(self._store.type(name)):
             self.send(name, self.names.index(name), None)
 
@@ -181,7 +177,6 @@ class TypedParameterServer(ParameterProtocolServer):
             self.start_list(channel)
 
     def _on_read(self, request: m.ParamRequestRead, channel: Channel) -> None:
-        """Answer with the value, or with a PARAM_ERROR that has the unknown name or index."""
         name, index = request.param_id, request.param_index
         name_and_index = self.requested(name, index)
         if name_and_index is not None:
@@ -191,7 +186,6 @@ class TypedParameterServer(ParameterProtocolServer):
             self.send_error(sender_of(request), unknown_name, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: m.ParamSet, channel: Channel) -> None:
-        """Store a received value and answer with it. Refuse an invalid value or an unknown name by PARAM_ERROR."""
         name, names, store = request.param_id, self.names, self._store
         if name not in names:
             self.send_error(sender_of(request), name, -1, MavParamError.DOES_NOT_EXIST, channel)
@@ -258,7 +252,7 @@ class ExtendedParameterServer(ParameterLists):
         self.acknowledge(request.param_id, data, kind, result)
 
     def acknowledge(self, name: str, data: bytes, kind: int, result: int) -> None:
-        """Send PARAM_EXT_ACK to all, because other clients read changes from it."""
+        # All channels get the acknowledgement, because other clients read changes from it.
         known_type = kind if kind in MavParamExtType.__members__.values() else int(MavParamExtType.CUSTOM)
         self._host.send(m.ParamExtAck(name, data, known_type, result))
 

@@ -31,7 +31,6 @@ from aerokit.transport.zenoh.session import (
     NetworkLink,
     NetworkOptions,
     attachment_of,
-    call,
     open_session,
     payload_of,
 )
@@ -109,9 +108,8 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
-        """Open the session, and wait for the first beacon of the vehicle side."""
         self._first_beacon.clear()
-        self._queue = LoopQueue(call)
+        self._queue = LoopQueue()
         with anyio.move_on_after(self._open_timeout_s):
             self._session = await open_session(self.address, self._options, partial(self._declare, self._queue))
             self._released.clear()
@@ -124,13 +122,10 @@ class ZenohConnect(NetworkLink):
             raise LinkOpenError(f"cannot open {self.address}: {reason}")
         raise LinkOpenError(f"cannot open {self.address}: {self._describe_missing()}")
 
-    def _declare(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        """Declare the subscribers, the token and the publisher of this client.
+    def _declare(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
+        """Declare the subscribers, the token and the publisher. Runs on a thread of the executor."""
 
-        This function runs on a thread of the loop's executor. Its callbacks run on threads of zenoh, so each of them
-        posts its sample to the event loop.
-        """
-
+        # The callbacks run on threads of zenoh, so each of them posts its sample to the event loop.
         # A sample that is not a PUT is a DELETE: the vehicle side was closed, or a liveliness token has ended.
         def callback_for(process: Callable[[bytes, bytes, bool], object]) -> Callable[[Any], None]:
             def on_sample(sample: Any) -> None:
@@ -174,7 +169,6 @@ class ZenohConnect(NetworkLink):
                 self._deliver(data)
 
     def _on_beacon(self, data: bytes, attachment: bytes, is_put: bool) -> None:
-        """Record a sign of life of the vehicle side. End the link if the vehicle side has deleted its beacon."""
         if not is_put:  # A vehicle side that closes deletes its beacon.
             sent_at = decode_sent_at(attachment)
             if sent_at is not None:
@@ -194,7 +188,6 @@ class ZenohConnect(NetworkLink):
             self._put(b"", self._requested_mode())
 
     def _on_notice(self, data: bytes, _attachment: bytes, _is_put: bool) -> None:
-        """Report that the vehicle side has refused messages of this client."""
         notice = RefusalNotice.decode(data)
         # The nonce tells programs with the same client name apart. A notice without a nonce is for all of them.
         if notice is None or notice.nonce not in (None, self._nonce):
@@ -213,7 +206,7 @@ class ZenohConnect(NetworkLink):
     # ---------------------------------------------------------------------------------- sending
 
     def _requested_mode(self) -> ControlMode | None:
-        """Return the control mode for the next stamp; None stands for the usual mode of this client."""
+        """Return the control mode for the next stamp. None is the usual mode of this client."""
         return "take" if self._takes_control else None
 
     def _put(self, data: bytes, mode: ControlMode | None) -> None:
@@ -229,14 +222,10 @@ class ZenohConnect(NetworkLink):
 
     # ---------------------------------------------------------------------------------- supervision
 
-    def _now(self) -> float:
-        return asyncio.get_running_loop().time()
-
     def _schedule_poll(self) -> None:
         self._timer = asyncio.get_running_loop().call_later(_POLL_INTERVAL_S, self._poll)
 
     def _poll(self) -> None:
-        """End the link if the vehicle side has gone. Called every `_POLL_INTERVAL_S`."""
         tracker, now = self._tracker, self._now()
         if tracker.epoch is not None and tracker.is_silent(now):
             # The end of the liveliness token shows a loss earlier than a long silence does.
@@ -249,7 +238,6 @@ class ZenohConnect(NetworkLink):
         self._schedule_poll()
 
     def _describe_missing(self) -> str:
-        """Return why opening timed out: the vehicle sent nothing, or the fleet has no vehicle of this name."""
         names = sorted({key.split("/")[2] for key in self._vehicle_tokens})  # A key is aerokit/FLEET/NAME/alive/EPOCH.
         keys = self._keys
         if keys.name in names:

@@ -82,7 +82,7 @@ _MISSION_WRITES = ("MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_WRITE_PARTIAL_
 
 
 def is_read_only(frame: Frame) -> bool:
-    """Return True if clients without control may send this frame too. Unknown messages count as commands."""
+    """Return True if clients without control may send this frame. Unknown messages count as commands."""
     if frame.message_id in _READ_IDS:  # Most frames need not be decoded.
         return True
     if frame.message_id in (CommandLong.ID, CommandInt.ID):
@@ -94,7 +94,7 @@ def is_read_only(frame: Frame) -> bool:
 
 
 def rejection_frames(answer: bytes) -> tuple[bytes, ...]:
-    """Return the frames of a notice's ``answer`` that reject a command. All other frames are ignored."""
+    """Return the frames of a notice's ``answer`` that reject a command."""
     return tuple(frame.raw for frame in Framer().receive(answer) if _is_rejection(_decoded(frame)))
 
 
@@ -128,13 +128,12 @@ class ControlLease:
             self._received_at = now
 
     def acquire(self, client: str, now: float) -> bool:
-        """Acquire the lease for a client if it is free. Return True if the client now holds the lease."""
+        """Acquire the lease if it is free. Return True if the client now holds it."""
         if self.holder(now) is None:
             self.take(client, now)
         return self._holder == client
 
     def take(self, client: str, now: float) -> None:
-        """Give the lease to this client, even if another client holds it."""
         self._holder, self._received_at = client, now
 
     def release(self, client: str) -> None:
@@ -161,8 +160,7 @@ class ClientFilter:
     def receive(self, data: bytes, mode: ControlMode, now: float, nonce: int = 0) -> tuple[bytes, list[RefusalNotice]]:
         """Process a fresh datagram. Return the accepted frames, and the notices for the client.
 
-        ``nonce`` distinguishes programs that use the same client name by mistake. The program that used the name first
-        gets control, until it is silent for `LEASE_TIMEOUT_S` or another one takes control.
+        ``nonce`` distinguishes programs that use the same client name by mistake.
         """
         is_namesake = self._is_namesake(nonce, mode, now)
         if not is_namesake:
@@ -188,10 +186,7 @@ class ClientFilter:
         return b"".join(accepted), notices
 
     def _is_namesake(self, nonce: int, mode: ControlMode, now: float) -> bool:
-        """Return True if another program recently used this client name. Otherwise record this program as its user.
-
-        With the mode "take", this program becomes the user of the name in any case.
-        """
+        """Return True if another program recently used this client name."""
         is_other_program = self._nonce not in (None, nonce)
         is_recent = now - self._nonce_at <= LEASE_TIMEOUT_S
         if is_other_program and is_recent and mode != "take":
@@ -200,11 +195,7 @@ class ClientFilter:
         return False
 
     def refuse_late(self, data: bytes, now: float) -> list[RefusalNotice]:
-        """Refuse the frames of a datagram that arrived too late. Return the notices for the client.
-
-        The notices contain no answer to the late command, such as a COMMAND_ACK. A client that has meanwhile sent the
-        command again would process it as the answer to the new command.
-        """
+        """Refuse the frames of a late datagram. Return the notices for the client."""
         notices: list[RefusalNotice] = []
         for frame in _framer().receive(data, now):
             if is_read_only(frame):
@@ -223,13 +214,11 @@ class ClientFilter:
         *,
         is_late: bool = False,
     ) -> list[RefusalNotice]:
-        """Count a refused frame, and return a notice of it.
-
-        Notices about the same type of message are limited in rate, except those with an answer to a command, because
-        the client waits for this answer.
-        """
+        """Count a refused frame. Return a notice of it, or nothing if another was sent a moment ago."""
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
+        # A late command gets no answer. A client that has sent the command again would process it as the answer to the
+        # new command.
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
         noticed_at, unreported = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
         # A notice with an answer is sent at once, because the client waits for the answer to its command.
@@ -253,7 +242,7 @@ def _decoded(frame: Frame) -> Message | None:
 
 
 def _answer(frame: Frame, message: Message, reason: str) -> bytes:
-    """Return the frames by which a vehicle would reject a message. Empty if it is a broadcast or needs no answer."""
+    """Return the frames by which a vehicle would reject a message. Empty if it needs no answer."""
     fields: object = message  # The type is `object`, because the class Message does not declare these fields.
     system: int = getattr(fields, "target_system", 0)
     # A message for all components (0) is answered by the autopilot (1).
@@ -311,7 +300,7 @@ class FreshnessChecker:
         return Beacon(self.epoch, self._number, now, lease_holder)
 
     def accepts(self, client: str, stamp: Stamp | None, now: float) -> bool:
-        """Return True if a datagram with this stamp is neither outdated nor a duplicate. Count refused datagrams."""
+        """Return True if a datagram with this stamp is neither outdated nor a duplicate."""
         self._expire(now)
         if stamp is None or not self._is_fresh(stamp):
             self.late += 1
@@ -351,9 +340,9 @@ class DelayEstimator:
         self._measured_at = 0.0  # time at which `_min_offset` was measured
 
     def delay(self, sent_s: float, now: float) -> float:
-        """Return by how many seconds this data was slower than the fastest data so far; 0 for the first data.
+        """Return by how many seconds this data was slower than the fastest data so far.
 
-        ``sent_s`` is the send time on the sender's clock, ``now`` the receive time on ours.
+        ``sent_s`` is the send time on the sender's clock.
         """
         offset = now - sent_s
         if self._min_offset is not None:
@@ -385,10 +374,9 @@ class VehicleSideTracker:
         self._delays = DelayEstimator()
 
     def receive_beacon(self, beacon: Beacon, now: float) -> bool:
-        """Record a beacon. Return False if it is late, older than the last one, or not from the tracked vehicle side.
+        """Record a beacon. Return False if it is late, outdated, or not from the tracked vehicle side.
 
-        A vehicle side is a program that serves the vehicle to clients. Another one is tracked when the tracked one has
-        been silent for `MAX_DELAY_S`, or after :meth:`reset`.
+        A vehicle side is a program that serves the vehicle to clients.
         """
         if beacon.epoch != self.epoch:
             if self.epoch is not None and not self.is_silent(now):
@@ -408,10 +396,9 @@ class VehicleSideTracker:
         return True
 
     def accepts(self, epoch: int, sent_s: float, now: float) -> bool:
-        """Return True if a datagram is to be delivered: it is not late, and the tracked vehicle side sent it.
+        """Return True if a datagram is on time and from the tracked vehicle side.
 
-        A vehicle side is a program that serves the vehicle to clients. A client tracks one of them. ``epoch``
-        identifies the one that sent the datagram; ``sent_s`` is the time of sending on its clock.
+        A vehicle side is a program that serves the vehicle to clients. ``sent_s`` is the send time on its clock.
         """
         if epoch != self.epoch:
             self.foreign += 1
@@ -422,7 +409,7 @@ class VehicleSideTracker:
         return True
 
     def make_stamp(self, now: float, mode: ControlMode | None = None) -> Stamp | None:
-        """Make the stamp for a datagram. Return None if no datagram may be sent, because beacons are missing."""
+        """Make the stamp for a datagram. None means that nothing may be sent, because beacons are missing."""
         if self.epoch is None or self.is_silent(now):
             return None
         self._sequence += 1

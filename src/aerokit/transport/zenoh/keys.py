@@ -39,13 +39,9 @@ _SENT = struct.Struct(">BIQ")  # version, epoch, milliseconds on the sender's cl
 
 
 def check_name(argument: str, name: str) -> str:
-    """Return ``name`` if it may be part of a key.
+    """Return ``name`` if it may be part of a key. Raises InvalidArgument if not.
 
-    Names have up to 63 letters, digits, ``_``, ``.`` and ``-``, and start with a letter or digit. A client must not be
-    named "all". ``argument`` is the argument's name for the error text.
-
-    Raises:
-        InvalidArgument: the name is not allowed.
+    ``argument`` is the argument's name for the error text.
     """
     if argument == "client" and name == _ALL_CLIENTS:
         raise InvalidArgument(f"client = {name!r} is not allowed: this name stands for all clients")
@@ -85,14 +81,14 @@ class KeySpace(Snapshot):
         return f"{self.root}/refused/{client}"
 
     def vehicle_token(self, epoch: int | None = None) -> str:
-        """Return the key of a vehicle side's liveliness token; without an epoch, a pattern for all of its runs."""
+        """Return the key of a liveliness token. Without an epoch, it is a pattern for all runs."""
         return f"{self.root}/alive/{'*' if epoch is None else format(epoch, '08x')}"
 
     def client_token(self, client: str = "*") -> str:
         return f"{self.root}/client/{client}"
 
     def state(self, name: str) -> str:
-        """Return the key under which a state is published as JSON. ``name`` is e.g. "1/position", or "**" for all."""
+        """Return the key of a state, e.g. of "1/position". The name "**" stands for all states."""
         return f"{self.root}/state/{name}"
 
 
@@ -114,7 +110,6 @@ class Beacon(Snapshot):
 
     @classmethod
     def decode(cls, data: bytes) -> Beacon | None:
-        """Decode a beacon; return None if the data is not a valid one."""
         fields = _decode_object(data)
         epoch, number, holder = fields.get("epoch"), fields.get("number"), fields.get("holder")
         clock = fields.get("clock_s")
@@ -181,7 +176,6 @@ class RefusalNotice(Snapshot):
 
     @classmethod
     def decode(cls, data: bytes) -> RefusalNotice | None:
-        """Decode a notice; return None if the data is not a valid one."""
         fields = _decode_object(data)
         if fields.get("event") != "order_refused":
             return None
@@ -204,12 +198,12 @@ class RefusalNotice(Snapshot):
 
 
 def encode_sent_at(epoch: int, clock_s: float) -> bytes:
-    """Return the attachment of a datagram from the vehicle side: `Beacon.epoch`, and the send time on its clock."""
+    """Return the attachment of a datagram from the vehicle side."""
     return _SENT.pack(VERSION, epoch, int(clock_s * 1000))
 
 
 def decode_sent_at(data: bytes) -> tuple[int, float] | None:
-    """Return epoch and seconds from an attachment; None if it is invalid."""
+    """Return epoch and seconds from an attachment. None if it is invalid."""
     if len(data) != _SENT.size:
         return None
     version, epoch, milliseconds = _SENT.unpack(data)
@@ -217,7 +211,7 @@ def decode_sent_at(data: bytes) -> tuple[int, float] | None:
 
 
 def _decode_object(data: bytes) -> dict[str, object]:
-    """Return the fields of a JSON object of this protocol version; empty if it is invalid."""
+    """Return the fields of a JSON object of this protocol version. Empty if it is invalid."""
     try:
         fields = json.loads(data)
     except (ValueError, RecursionError):

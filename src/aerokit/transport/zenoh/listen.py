@@ -27,7 +27,6 @@ from aerokit.transport.zenoh.session import (
     NetworkLink,
     NetworkOptions,
     attachment_of,
-    call,
     open_in_thread,
     open_session,
     payload_of,
@@ -115,9 +114,8 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- opening and closing
 
     async def _connect(self) -> None:
-        """Open the session, and serve clients unless another program already serves this name."""
         self._rival_found.clear()
-        self._queue = queue = LoopQueue(call)
+        self._queue = queue = LoopQueue()
         self._session = session = await open_session(self.address, self._options, partial(self._find_rivals, queue))
         self._released.clear()
         if self._may_have_rival:
@@ -130,11 +128,10 @@ class ZenohListen(NetworkLink):
         self._is_serving = True
         self._send_beacon()
 
-    def _find_rivals(self, queue: LoopQueue[Callable[[], object]], zenoh: Any, session: Any) -> None:
-        """Find out whether the name may be in use, and subscribe to beacons. Runs on an executor's thread.
+    def _find_rivals(self, queue: LoopQueue, zenoh: Any, session: Any) -> None:
+        """Find out whether the name may be in use, and subscribe to beacons.
 
-        A liveliness token alone does not prove that the name is in use, because the token of a killed program remains
-        for a while. A beacon proves it.
+        Runs on a thread of the executor.
         """
 
         def on_beacon(sample: Any) -> None:
@@ -144,18 +141,18 @@ class ZenohListen(NetworkLink):
 
         self._zenoh = zenoh
         declared = [session.declare_subscriber(self._keys.beacon, on_beacon)]
+        # A token alone does not prove that the name is in use, because the token of a killed program remains for a
+        # while. A beacon proves it.
         tokens = session.liveliness().get(self._keys.vehicle_token(), timeout=_RIVAL_QUERY_TIMEOUT_S)
         may_have_rival = bool(list(tokens))
         if queue is self._queue:  # Otherwise this opening has ended meanwhile, and another one may have begun.
             self._declared, self._may_have_rival = declared, may_have_rival
 
-    def _serve(self, queue: LoopQueue[Callable[[], object]], session: Any) -> None:
-        """Declare the subscribers, publisher and token that clients need. Runs on an executor's thread.
-
-        The callbacks run on threads of zenoh, so they post to the event loop.
-        """
+    def _serve(self, queue: LoopQueue, session: Any) -> None:
+        """Declare the subscribers, the publisher and the token. Runs on a thread of the executor."""
         zenoh, keys = self._zenoh, self._keys
 
+        # The callbacks run on threads of zenoh, so they post to the event loop.
         def on_datagram(sample: Any) -> None:
             payload = payload_of(sample)
             if len(payload) <= MAX_PAYLOAD_BYTES:
@@ -190,7 +187,6 @@ class ZenohListen(NetworkLink):
     # ---------------------------------------------------------------------------------- receiving
 
     def _on_datagram(self, name: str, data: bytes, attachment: bytes) -> None:
-        """Deliver the frames that a client may send, and notify the client of refused frames."""
         now = self._now()
         client = self._add_client(name)
         if client is None:
@@ -212,7 +208,7 @@ class ZenohListen(NetworkLink):
             self._deliver(accepted, name)
 
     def _add_client(self, name: str) -> ClientFilter | None:
-        """Return the client with this name, new or known; None if there are too many, or the name is not allowed."""
+        """Return the client with this name, new or known. None if it cannot be added."""
         client = self._clients.get(name)
         if client is None and len(self._clients) >= MAX_CLIENTS:
             self._remove_silent_client()
@@ -223,16 +219,13 @@ class ZenohListen(NetworkLink):
         return client
 
     def _remove_silent_client(self) -> None:
-        """Remove the client that has been silent longest, if its silence exceeds `CLIENT_TIMEOUT_S`.
-
-        New clients must not be blocked by a client that has left although zenoh did not report the end of its token.
-        """
+        # A client may have left although zenoh did not report the end of its token. It must not block new clients.
         oldest = min(self._clients, key=lambda name: self._clients[name].received_at)
         if self._now() - self._clients[oldest].received_at > CLIENT_TIMEOUT_S:
             self._remove_client(str(oldest))
 
     def _on_client_joined(self, name: str) -> None:
-        """Add a client that has come online, and send the next beacon earlier, so that the client need not wait."""
+        # The next beacon is sent earlier, so that the client need not wait.
         if self._add_client(name) is not None and self._timer is not None:
             self._timer.cancel()
             delay_s = max(0.0, self._beacon_at + _MIN_BEACON_INTERVAL_S - self._now())
@@ -245,7 +238,6 @@ class ZenohListen(NetworkLink):
             self._lease.release(name)
 
     def _on_beacon(self, data: bytes) -> None:
-        """Detect another vehicle side with the same name. Our own beacons arrive here, too."""
         beacon = Beacon.decode(data)
         if beacon is None or beacon.epoch == self._freshness.epoch:  # A beacon with this epoch is our own.
             return
@@ -263,7 +255,7 @@ class ZenohListen(NetworkLink):
         self._timer = asyncio.get_running_loop().call_later(BEACON_INTERVAL_S, self._send_beacon)
 
     def _send_notices(self, client: str, notices: list[RefusalNotice], stamp: Stamp | None) -> None:
-        """Send notices to the client whose datagram had this stamp; if it is None, to all clients with this name."""
+        """Send notices about a datagram with this stamp. None addresses all clients with this name."""
         nonce = None if stamp is None else stamp.nonce
         for notice in notices:
             self._put(self._keys.notices(client), notice.replace(nonce=nonce).encode(), b"")
@@ -280,14 +272,10 @@ class ZenohListen(NetworkLink):
         except Exception:  # zenoh raises various errors after its session has ended.
             self._drop(1)
 
-    def _now(self) -> float:
-        return asyncio.get_running_loop().time()
-
 
 def _nothing(_: object) -> None:
     pass
 
 
 def _client_of(sample: Any) -> str:
-    """Return the name of the client, which is the last part of the sample's key."""
     return str(sample.key_expr).rpartition("/")[2]

@@ -9,7 +9,7 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from aerokit._internal.values import Snapshot
 from aerokit.errors import InvalidArgument, LinkOpenError
@@ -18,37 +18,37 @@ from aerokit.transport.link import BaseLink, import_optional
 ItemT = TypeVar("ItemT")
 
 MAX_QUEUED = 2048
-"""Maximum number of items that wait for a blocked event loop. A further item replaces the oldest."""
+"""Maximum number of calls that wait for a blocked event loop. A further call replaces the oldest."""
 
-_MAX_PER_ITERATION = 256  # maximum number of items processed in one loop iteration, so that other tasks can run
+_MAX_PER_ITERATION = 256  # maximum number of calls in one loop iteration, so that other tasks can run
 
 
-class LoopQueue(Generic[ItemT]):
-    """Queue from other threads to the event loop: ``post(item)`` in any thread calls ``process(item)`` on the loop.
+class LoopQueue:
+    """Queue from other threads to the event loop: ``post(call)`` in any thread runs ``call()`` on the loop.
 
-    At most ``limit`` items wait. A further item replaces the oldest, which is counted as dropped. The loop is woken
-    once for all waiting items.
+    At most ``limit`` calls wait. A further call replaces the oldest, which is counted as dropped. The loop is woken
+    once for all waiting calls.
     """
 
-    def __init__(self, process: Callable[[ItemT], object], limit: int = MAX_QUEUED) -> None:
+    def __init__(self, limit: int = MAX_QUEUED) -> None:
         self.dropped: int = 0
-        """Number of dropped items."""
+        """Number of dropped calls."""
         self._loop = asyncio.get_running_loop()
-        self._process: Callable[[ItemT], object] | None = process  # None after close()
         self._limit = limit
-        self._waiting: deque[ItemT] = deque()
+        self._waiting: deque[Callable[[], object]] = deque()
+        self._is_closed = False
         self._is_scheduled = False  # True while a call of `_drain` is pending
         self._lock = threading.Lock()  # protects all of these attributes
 
-    def post(self, item: ItemT) -> None:
-        """Add an item. Never blocks or raises; ignored after :meth:`close`."""
+    def post(self, call: Callable[[], object]) -> None:
+        """Add a call. Never blocks or raises. Does nothing after :meth:`close`."""
         with self._lock:
-            if self._process is None:
+            if self._is_closed:
                 return
             if len(self._waiting) >= self._limit:
                 self._waiting.popleft()
                 self.dropped += 1
-            self._waiting.append(item)
+            self._waiting.append(call)
             if self._is_scheduled:
                 return
             self._is_scheduled = True
@@ -57,28 +57,26 @@ class LoopQueue(Generic[ItemT]):
 
     def close(self) -> None:
         with self._lock:
-            self._process = None
+            self._is_closed = True
             self._waiting.clear()
 
     def _drain(self) -> None:
-        """Process waiting items on the loop. After `_MAX_PER_ITERATION` items, continue in the next iteration."""
         for _ in range(_MAX_PER_ITERATION):
             with self._lock:
-                process = self._process
-                if process is None or not self._waiting:
+                if not self._waiting:
                     self._is_scheduled = False
                     return
-                item = self._waiting.popleft()
+                call = self._waiting.popleft()
             try:
-                process(item)
+                call()
             except BaseException:
-                self._loop.call_soon(self._drain)  # The other items must be processed although this one failed.
+                self._loop.call_soon(self._drain)  # The other calls must run although this one failed.
                 raise
         self._loop.call_soon(self._drain)
 
 
 async def open_in_thread(work: Callable[[], ItemT], close: Callable[[ItemT], object]) -> ItemT:
-    """Run ``work()`` in a thread of the loop's executor and return what it opens.
+    """Run ``work()`` in a thread and return what it opens.
 
     A thread cannot be stopped. After a cancellation, the result is passed to ``close`` as soon as it is available.
     """
@@ -142,11 +140,14 @@ class NetworkLink(BaseLink):
         super().__init__(address)
         self._session: Any = None  # None while the link is not open
         self._declared: list[Any] = []  # references to all declarations, which would end when garbage-collected
-        self._queue: LoopQueue[Callable[[], object]] | None = None  # passes calls of zenoh's threads to the loop
+        self._queue: LoopQueue | None = None  # passes calls of zenoh's threads to the loop
         self._timer: asyncio.TimerHandle | None = None
 
+    def _now(self) -> float:
+        return asyncio.get_running_loop().time()
+
     def _on_release(self, session: Any) -> None:
-        """Release the session's objects; a vehicle side also tells its clients. ``session`` is None if none is open."""
+        """Release the session's objects. ``session`` is None if none is open."""
         raise NotImplementedError
 
     def _release(self) -> None:
@@ -162,11 +163,6 @@ class NetworkLink(BaseLink):
             close_session(session, self._released.set)
 
 
-def zenoh_module(address: str) -> Any:
-    """Import ``zenoh``; raise LinkOpenError with the package to install if it is missing."""
-    return import_optional(address, "zenoh", "eclipse-zenoh", "zenoh")
-
-
 async def open_session(address: str, options: NetworkOptions, declare: Callable[[Any, Any], object]) -> Any:
     """Open a session, and call ``declare(zenoh, session)`` in the same thread, where declarations may block.
 
@@ -174,7 +170,7 @@ async def open_session(address: str, options: NetworkOptions, declare: Callable[
         LinkOpenError: zenoh is not installed, or the session could not be opened.
         InvalidArgument: the configuration is wrong.
     """
-    zenoh = zenoh_module(address)
+    zenoh = import_optional(address, "zenoh", "eclipse-zenoh", "zenoh")
     config = _config(zenoh, address, options)
 
     def work() -> Any:
@@ -192,7 +188,7 @@ async def open_session(address: str, options: NetworkOptions, declare: Callable[
 
 @contextlib.contextmanager
 def zenoh_errors(address: str, zenoh: Any) -> Iterator[None]:
-    """Convert the errors that zenoh raises while a link is being opened to LinkOpenError."""
+    """Convert zenoh's errors to LinkOpenError."""
     try:
         yield
     except zenoh.ZError as error:
@@ -200,24 +196,19 @@ def zenoh_errors(address: str, zenoh: Any) -> Iterator[None]:
 
 
 def close_session(session: Any, closed: Callable[[], object]) -> None:
-    """Close a session on a thread, because closing may block, and then call ``closed()``."""
+    """Close a session on a thread, and then call ``closed()``."""
 
     def work() -> None:
         with contextlib.suppress(Exception):  # If close() raises, the session is closed all the same.
             session.close()
 
-    try:
+    try:  # Closing may block.
         future = asyncio.get_running_loop().run_in_executor(None, work)
     except RuntimeError:  # The loop is closed or closing.
         work()
         closed()
     else:
         future.add_done_callback(lambda _: closed())
-
-
-def call(function: Callable[[], object]) -> object:
-    """Call a function. Used as the argument ``process`` of a `LoopQueue` whose items are functions."""
-    return function()
 
 
 def payload_of(sample: Any) -> bytes:
@@ -230,7 +221,6 @@ def attachment_of(sample: Any) -> bytes:
 
 
 def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
-    """Build zenoh's configuration from the options. A file, ``options.config``, replaces aerokit's default settings."""
     try:
         config = zenoh.Config.from_file(options.config) if options.config else zenoh.Config()
     except zenoh.ZError as error:
@@ -248,7 +238,6 @@ def _config(zenoh: Any, address: str, options: NetworkOptions) -> Any:
 
 
 def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
-    """Yield the keys and values of zenoh's configuration that the options determine."""
     if options.mode or not options.config:  # Without `mode`, a configuration file determines the mode.
         is_client = bool(options.connect) and not options.listen
         yield "mode", options.mode or ("client" if is_client else "peer")
@@ -264,7 +253,7 @@ def _settings(options: NetworkOptions) -> Iterable[tuple[str, object]]:
 
 
 def _reason(error: Exception) -> str:
-    """Return the error text for the user, without zenoh's source location. A failed connection gets a clearer text."""
+    # The text ends with the location in zenoh's source.
     text = str(error).split(" at /", 1)[0].strip().rstrip("!.") or type(error).__name__
     if text.startswith(_CONNECT_FAILED):
         endpoints = ", ".join(_ENDPOINTS.findall(text)) or text
