@@ -73,7 +73,6 @@ class ArduPilotStorage:
             self.parameters.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions because of a reboot. Files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -138,7 +137,6 @@ class ArduPilotSigning(VehicleSigning):
         self._ardupilot.call_later(self._ardupilot.timeline.gps_fix, self._on_gps_time)
 
     def _on_gps_time(self) -> None:
-        """Advance the time stamps to GPS time."""
         stamp = timestamp_at(int(self._ardupilot.unix_time))
         for channel in self._ardupilot.channels:
             if channel.signing is not None:
