@@ -65,7 +65,7 @@ def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> M
 
 
 def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
-    """Return an item as downloaded: as stored, except for global frames, which become _INT frames with ``as_int``."""
+    """Return an item as downloaded. With ``as_int``, global frames become _INT frames."""
     return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
 
 
@@ -86,7 +86,6 @@ def checksum(items: Sequence[MissionItem], previous: int = 0) -> int:
 
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
-    """Return a fence item as stored: param 1, z and, in a global frame, x and y. Every global frame becomes GLOBAL."""
     if item.frame == Frame.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}
@@ -94,7 +93,6 @@ def _as_fence_point(item: MissionItem) -> MissionItem:
 
 
 def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
-    """Return an item of a global frame as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
     layout = _COMMANDS_WITH_PLACE.get(item.command)
     if layout is None:
         return MavMissionResult.UNSUPPORTED
@@ -109,7 +107,6 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
 
 
 def _without_place(item: MissionItem) -> MissionItem | int:
-    """Return an item of MAV_FRAME_MISSION as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
     if item.command not in _COMMANDS_WITHOUT_PLACE:
         return MavMissionResult.UNSUPPORTED
     p1, p2, command = item.param1, item.param2, item.command
@@ -136,7 +133,7 @@ def _rounded(value: float) -> int:
 
 
 def _heading(degrees: float) -> float:
-    """Return a heading in degrees, from 0 to 360, with the rounding errors of PX4, which stores it in radians."""
+    """Return a heading in degrees with the rounding errors of PX4, which stores radians."""
     if not math.isfinite(degrees):
         return math.nan
     radians = float32(degrees * _RADIANS_PER_DEGREE)
