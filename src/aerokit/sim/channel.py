@@ -29,13 +29,13 @@ def fitted(message: MessageT) -> MessageT:
     fitting = copy.copy(message)
     for field in fitting.FIELDS:
         value = getattr(fitting, field.name)
-        # Values of a wrong type are not changed, so that encoding them reveals the bug.
         if field.problem(value) is not None:
             setattr(fitting, field.name, _fit_field(field, value))
     return fitting
 
 
 def _fit_field(field: Field, value: Any) -> Any:
+    # Values of a wrong type are not changed, so that encoding them reveals the bug.
     if field.type == "char":
         if isinstance(value, str) and field.is_text:
             max_bytes = field.array_length or 1

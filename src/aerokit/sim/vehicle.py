@@ -34,7 +34,6 @@ Handler = Callable[[Any, Channel], None]
 
 
 def _whole_ticks(seconds: float) -> int:
-    """Return the number of complete ticks."""
     # A tick that is incomplete only by a rounding error counts.
     return int(seconds / TICK_S + 1e-6)
 

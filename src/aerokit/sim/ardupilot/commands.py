@@ -204,7 +204,7 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def reset_battery(self, command: ReceivedCommand) -> int:
-        # Only the first battery is simulated, which has the first bit of the mask.
+        # The simulation has one battery, which is the first bit of the mask.
         if to_int(command.param1) & 1:
             self._vehicle.battery.percent = max(0.0, min(100.0, command.param2))
         return Result.ACCEPTED

@@ -48,9 +48,9 @@ class FenceZones:
         return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
 
     def breach_m(self, place: Point, *, union: bool = False) -> float:
-        """Return the metres beyond the border, which are negative inside the allowed area.
+        """Return the metres beyond the border. They are negative inside the allowed area.
 
-        With ``union``, the allowed area is the union of the inclusion zones, otherwise their intersection.
+        With ``union``, the allowed area is the union of the inclusion zones. Otherwise it is their intersection.
         """
         out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
         into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]

@@ -130,7 +130,7 @@ class ArduPilotGimbal:
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
     def _update_target_for(self, place: Ned | None) -> MountTarget:
-        """Set the target to the angles to a place, if both positions are known."""
+        """Point the target at a place, if the place and the vehicle's position are known."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             place_north, place_east, place_down = place

@@ -59,7 +59,8 @@ class ArduPilotMode:
     def enter(self, *, force: bool) -> bool:
         """Send the entry texts and start the mode. Return False to refuse it.
 
-        With ``force``, as while disarmed, subclasses may accept a mode that cannot run yet.
+        With ``force``, a subclass may accept a mode that cannot run yet. The vehicle forces a mode while it is
+        disarmed.
         """
         for text in self.entry_texts:
             self.vehicle.send_text(self.entry_severity, text)

@@ -89,7 +89,7 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the MAV_FRAME that a download reports after an upload with ``frame``, or None to refuse it."""
+    """Return the MAV_FRAME that a download reports after an upload with ``frame``. None refuses the upload."""
     return _DOWNLOADED_FRAMES.get(frame)
 
 

@@ -241,11 +241,11 @@ class Px4Failsafes:
         return reasons
 
     def on_armed(self) -> None:
+        # A failure that exists at arming does not trigger a failsafe.
         self._had_manual_control = self._px4.sticks.are_fresh
         self._position_at = self._px4.now
         level = self._battery_level()
         self.battery_state = level
-        # A failure that exists at arming does not trigger a failsafe.
         self._battery_at_arming = level
         self._reported_battery_level = level
         self._reset()
