@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 
 _MAX_ALTITUDE_M = 83000.0
@@ -155,11 +156,6 @@ def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
     sign = -1.0 if item.param3 < 0 else 1.0
     exits_at_tangent = float(item.param4 > 0)
     return (turn_byte * float(turn_unit), 0.0, sign * radius_byte * radius_unit, exits_at_tangent)
-
-
-def to_int(value: float) -> int:
-    """Truncate a number towards zero, like C. Values beyond 32 bits become 0."""
-    return int(value) if abs(value) < 2**31 else 0
 
 
 def _whole_within(value: float, low: int, high: int) -> int:

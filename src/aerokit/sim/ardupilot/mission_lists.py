@@ -13,7 +13,8 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.mission_items import altitude_frame, as_stored, check_place, to_int
+from aerokit.sim.ardupilot.mission_items import altitude_frame, as_stored, check_place
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 
 _MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767

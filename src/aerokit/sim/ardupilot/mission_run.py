@@ -218,7 +218,7 @@ class MissionRun:
         self.reset()
         self._vehicle.call_later(0.0, self._mode.on_disarmed)
 
-    def clear(self) -> None:
+    def on_cleared(self) -> None:
         self.reset()
         self._state = MissionState.NOT_STARTED
 

@@ -26,9 +26,10 @@ from aerokit.protocols.servers.missions import (
     item_message_int,
 )
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.ardupilot.mission_items import as_stored, has_location, to_int
+from aerokit.sim.ardupilot.mission_items import as_stored, has_location
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
 from aerokit.sim.channel import Channel
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 from aerokit.sim.vehicle import sender_of
 
@@ -247,7 +248,7 @@ class ArduPilotMissionServer(MissionServer):
     def _clear_list(self, items: ItemList) -> bool:
         is_cleared = items.clear()
         if is_cleared and items is self.commands:
-            self._vehicle.mission.clear()
+            self._vehicle.mission.on_cleared()
         return is_cleared
 
     def _guide(self, item: MissionItem, current: int) -> int:

@@ -218,7 +218,7 @@ class Px4Arming:
         self.armed_at = px4.now
         px4.info(f"Armed by {by}")
         px4.on_armed()
-        self._start_log()
+        self.start_log()
         return True
 
     @property
@@ -259,11 +259,7 @@ class Px4Arming:
             )
         )
 
-    def start_first_log(self) -> None:
-        """Start a log at the boot. This log also records the first flight."""
-        self._start_log()
-
-    def _start_log(self) -> None:
+    def start_log(self) -> None:
         if self._is_logging:
             return
         self._is_logging = True

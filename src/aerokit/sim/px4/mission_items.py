@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame as Frame
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavRoi
 from aerokit.missions import MissionItem
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
@@ -98,7 +99,7 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
         return MavMissionResult.UNSUPPORTED
     command = item.command
     if command in _ROI_COMMANDS:
-        if _to_int(item.param1) not in _ROI_WITH_PLACE:
+        if to_int(item.param1) not in _ROI_WITH_PLACE:
             return MavMissionResult.INVALID_PARAM1
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     params = (item.param1, item.param2, item.param3, item.param4)
@@ -111,21 +112,17 @@ def _without_place(item: MissionItem) -> MissionItem | int:
         return MavMissionResult.UNSUPPORTED
     p1, p2, command = item.param1, item.param2, item.command
     if command == Cmd.DO_JUMP:  # PX4 stores the target as int16 and the number of repetitions as uint16.
-        target = _to_int(p1) & 0xFFFF
+        target = to_int(p1) & 0xFFFF
         if target & 0x8000:  # The highest bit of an int16 is its sign.
             target -= 0x10000
-        p1, p2 = float(target), float(_to_int(p2) & 0xFFFF)
+        p1, p2 = float(target), float(to_int(p2) & 0xFFFF)
     if command in _ROI_COMMANDS:
-        if _to_int(p1) not in _ROI_WITHOUT_PLACE:
+        if to_int(p1) not in _ROI_WITHOUT_PLACE:
             return MavMissionResult.INVALID_PARAM1
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     # PX4 stores x and y as floats, and rounds them to integers for a download (mavlink_mission.cpp).
     x, y = _rounded(float32(item.x)), _rounded(float32(item.y))
     return item.replace(command=command, frame=Frame.MISSION, param1=p1, param2=p2, x=x, y=y)
-
-
-def _to_int(value: float) -> int:
-    return int(value) if abs(value) < 2**31 else 0
 
 
 def _rounded(value: float) -> int:
@@ -147,8 +144,8 @@ def _heading(degrees: float) -> float:
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,
-    "u": lambda value: float(_to_int(value) & 0xFFFF),
-    "v": lambda value: float(_to_int(value + 0.5) & 0xFFFF),
+    "u": lambda value: float(to_int(value) & 0xFFFF),
+    "v": lambda value: float(to_int(value + 0.5) & 0xFFFF),
     "?": lambda value: 1.0 if value > 0 else 0.0,
     "y": _heading,
 }
