@@ -86,7 +86,7 @@ class FixedWing(Motion):
     def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
         """Fly towards a point, without slowing down or circling there."""
         course = math.atan2(east - self.east, north - self.north)
-        self.head(course, airspeed, self.climb_to(down))
+        self.head(course, airspeed, self.climb_rate_to(down))
 
     def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
         """Circle a point. A negative radius is counter-clockwise."""
@@ -100,13 +100,12 @@ class FixedWing(Motion):
         course = course_to_center - turn_sign * (math.pi / 2) * (1.0 - share_to_center)
         is_near_circle = distance < 1.5 * radius
         turn_rate = turn_sign * self.ground_speed_m_s / radius if is_near_circle else 0.0
-        self.head(course, airspeed, self.climb_to(down), turn_rate=turn_rate)
+        self.head(course, airspeed, self.climb_rate_to(down), turn_rate=turn_rate)
 
     def roll_out(self) -> None:
         self.bank_and_climb(0.0, 0.0, 0.0)
 
-    def climb_to(self, down: float) -> float:
-        """Return the climb rate in m/s with which the plane approaches the coordinate ``down``."""
+    def climb_rate_to(self, down: float) -> float:
         return _HEIGHT_GAIN_PER_S * (self.down - down)
 
     @property

@@ -341,7 +341,7 @@ class GimbalCommands:
         if mode == MavMountMode.MAVLINK_TARGETING:
             pitch, roll, yaw = command.param1, command.param2, command.param3
             if abs(pitch) > 90.0 or abs(roll) > 180.0 or abs(yaw) > 360.0:
-                gimbal.warn()
+                self._vehicle.send_text(_WARNING, "Mount: invalid angle targets")
                 return Result.FAILED
             gimbal.point(roll, pitch, yaw, from_north=False)
             return Result.ACCEPTED

@@ -17,7 +17,6 @@ from aerokit.mavlink.enums import (
     MavFrame,
     MavMountMode,
     MavResult,
-    MavSeverity,
 )
 from aerokit.mavlink.messages import GlobalPositionInt
 from aerokit.sim.ardupilot.host import ArduPilotHost
@@ -85,8 +84,7 @@ class ArduPilotGimbal:
         return self._vehicle.parameters["MNT1_TYPE"] != 0
 
     def setting(self, name: str) -> float:
-        parameters = self._vehicle.parameters
-        return parameters[name] if name in parameters else DEFAULTS[name]
+        return self._vehicle.parameters.get(name, DEFAULTS[name])
 
     @property
     def angles(self) -> tuple[float, float, float]:
@@ -237,9 +235,6 @@ class ArduPilotGimbal:
         else:
             return MavResult.FAILED
         return MavResult.ACCEPTED
-
-    def warn(self) -> None:
-        self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
 
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
         if not self.is_fitted:

@@ -304,7 +304,7 @@ class PlaneGuided(PlaneNavigatingMode):
         # Half throttle flies at cruise speed.
         speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if has_throttle else self.airspeed
         _, _, target_down = self._place or wing.place
-        climb = max(-self._climb_limit, min(self._climb_limit, wing.climb_to(target_down)))
+        climb = max(-self._climb_limit, min(self._climb_limit, wing.climb_rate_to(target_down)))
         if has_pitch:  # A commanded pitch replaces the altitude.
             climb = max(-limits.sink_m_s, min(limits.climb_m_s, speed * math.sin(self._pitch.value)))
         if not has_bank and self._course is not None:

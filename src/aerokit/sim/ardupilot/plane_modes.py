@@ -138,7 +138,7 @@ class PlaneLanding:
             length = max(1.0, math.hypot(north - start_north, east - start_east))
             down_on_slope = down + (start_down - down) * max(0.0, remaining) / length
             slope_sink = (down - start_down) * wing.ground_speed_m_s / length
-            climb = -slope_sink + wing.climb_to(down_on_slope)
+            climb = -slope_sink + wing.climb_rate_to(down_on_slope)
             speed = _APPROACH_SHARE * plane.cruise_m_s
         # The course points to the approach line, more directly the farther the plane is from it.
         wing.head(course + math.atan2(aside, _CORRECTION_LENGTH_M), speed, climb)
@@ -226,7 +226,7 @@ class PlaneAltitudeMode(PlaneModeBase):
             wing.roll_out()
             return
         self._down -= self.climb_rate() * dt
-        self.steer(wing.climb_to(self._down))
+        self.steer(wing.climb_rate_to(self._down))
 
     def climb_rate(self) -> float:
         """Return the climb rate in m/s that the pitch stick commands."""

@@ -149,16 +149,14 @@ class ArduPilotJoystick:
         """Scale the value of an axis to RCn_MIN … RCn_MAX. Return 0 if the message has no value for the axis."""
         if value == _NO_VALUE:
             return 0
-        low = self.setting(f"RC{channel + 1}_MIN", 1100.0)
-        high = self.setting(f"RC{channel + 1}_MAX", 1900.0)
+        parameters = self._vehicle.parameters
+        low = parameters.get(f"RC{channel + 1}_MIN", 1100.0)
+        high = parameters.get(f"RC{channel + 1}_MAX", 1900.0)
         if reverse:
             value = -value
         share = (value - lowest) / (1000 - lowest)
         # Like the firmware, do not limit an axis that is out of range. The mask keeps the 16 bits of a pulse.
         return int(low + (high - low) * share) & 0xFFFF
-
-    def setting(self, name: str, default: float) -> float:
-        return self._vehicle.parameters.get(name, default)
 
 
 class RoverJoystick(ArduPilotJoystick):
@@ -175,9 +173,10 @@ class SubJoystick(ArduPilotJoystick):
     """
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
-        gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
+        parameters = self._vehicle.parameters
+        gain = max(0.1, min(1.0, parameters.get("JS_GAIN_DEFAULT", 0.5)))
         scale = _SUB_SCALE * gain
-        throttle_scale = 2 * scale * self.setting("JS_THR_GAIN", 1.0)
+        throttle_scale = 2 * scale * parameters.get("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTER - 500 * throttle_scale  # 500 is the middle of the axis z.
         # Like the firmware, do not scale pitch and roll, and use an axis without a value like any other (joystick.cpp).
         offsets = {

@@ -109,8 +109,7 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
     return None
 
 
-def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return a warning if the first waypoint of a mission is far away."""
+def distance_warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     home_north, home_east, _ = px4.home
     for item in items:
         if item.command in _WITH_PLACE:
@@ -199,7 +198,7 @@ class Px4Mission:
     def _check(self) -> None:
         items = self._px4.missions.commands
         problem = rejection(self._px4, items)
-        warning_text = warning(self._px4, items)
+        warning = distance_warning(self._px4, items)
         outside_number = outside_fence(self._px4, items)
         # An invalid mission stays stored, but is not flown.
         self.is_valid = bool(items) and problem is None and outside_number is None
@@ -207,8 +206,8 @@ class Px4Mission:
             self._px4.send_text(MavSeverity.CRITICAL, f"Geofence violation for waypoint {outside_number}")
         if problem is not None:
             self._px4.send_text(MavSeverity.CRITICAL, f"Mission rejected: {problem}")
-        if warning_text is not None:
-            self._px4.send_text(MavSeverity.CRITICAL, warning_text)
+        if warning is not None:
+            self._px4.send_text(MavSeverity.CRITICAL, warning)
 
     def forget_reached(self) -> None:
         self.reached = -1

@@ -75,7 +75,7 @@ class SimulatedPx4(Px4Vehicle):
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
 # In a descent, the target altitude is below the plane by this time multiplied by the wanted sink rate. For such a
-# target, `FixedWing.climb_to` returns the wanted sink rate.
+# target, `FixedWing.climb_rate_to` returns the wanted sink rate.
 _SINK_TARGET_LEAD_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
@@ -191,7 +191,7 @@ class Px4PlaneFlight(Px4Flight):
         target_north, target_east, _ = self.target
         north, east = target_north - motion.north, target_east - motion.east
         height = math.hypot(north, east) * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
-        climb = min(0.0, motion.climb_to(motion.ground_down - height))
+        climb = min(0.0, motion.climb_rate_to(motion.ground_down - height))
         motion.head(math.atan2(east, north), self._plane.parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
 
     def _return(self) -> None:
