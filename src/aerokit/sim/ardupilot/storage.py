@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
@@ -89,7 +90,8 @@ class ArduPilotStorage:
     def _apply(self, name: str, value: float) -> None:
         """Set a parameter that an uploaded file contains."""
         parameters = self._vehicle.parameters
-        if name not in self._vehicle.faults.read_only_parameters:
+        # The firmware ignores a value that is not finite (AP_Param.cpp, set_float).
+        if name not in self._vehicle.faults.read_only_parameters and math.isfinite(value):
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import pkgutil
 from collections.abc import Callable, Sequence
 
 from aerokit.errors import RemoteProtocolError
-from aerokit.mavlink.enums import MavSeverity
+from aerokit.mavlink.enums import MavParamType, MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat
 from aerokit.mavlink.signing import SigningKey
@@ -193,8 +194,10 @@ class Px4Storage:
 
     def _apply(self, name: str, value: float) -> None:
         """Apply a parameter of an uploaded file."""
-        if name not in self._px4.faults.read_only_parameters:
-            self._px4.parameters[name] = self.parameters.clamped(name, value)
+        parameters = self._px4.parameters
+        can_store = math.isfinite(value) or parameters.type(name) == MavParamType.REAL32
+        if name not in self._px4.faults.read_only_parameters and can_store:
+            parameters[name] = self.parameters.clamped(name, value)
 
 
 def _log_path(number: int) -> str:
