@@ -245,6 +245,19 @@ def test_random_uploads_are_handled(noise: bytes, count: int) -> None:
         file.close()
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("name", ["FENCE_TYPE", "GUID_TIMEOUT", "GF_ACTION"])
+def test_uploaded_value_that_is_not_finite_is_ignored(name: str, value: float) -> None:
+    vehicle = SimulatedPx4(parameter_file=True) if name == "GF_ACTION" else SimulatedCopter()
+    before = vehicle.parameters[name]
+    float_type = 4
+    entry = bytes([float_type, (len(name) - 1) << 4]) + name.encode() + struct.pack("<f", value)
+    file = vehicle.files.open("@PARAM/param.pck", writing=True)
+    file.write(0, struct.pack("<HHH", 0x671B, 1, 6 + len(entry)) + entry)
+    file.close()
+    assert vehicle.parameters[name] == before
+
+
 # ------------------------------------------------------------------------------------------ PX4
 
 

@@ -50,7 +50,7 @@ class VehicleSigning:
             self.start(channel)
 
     def start(self, channel: Channel) -> None:
-        """Apply the stored key to one port. The index of the port is its link id in signatures."""
+        """Apply the stored key to one port."""
         link_id = self._vehicle.channels.index(channel)
         if self.key is None or channel.version == 1 or not self.is_for(link_id):
             channel.sign_with(None)
@@ -63,26 +63,24 @@ class VehicleSigning:
         channel.sign_with(signing)
 
     def is_for(self, link_id: int) -> bool:
-        """Return True if the port with this link id signs and checks frames while a key is set."""
+        """Return True if the port with this link id signs and checks frames."""
         return True
 
     def unsigned_on(self, link_id: int) -> Callable[[Frame], bool] | None:
-        """Return the function that decides which unsigned frames this port accepts; None to accept none."""
+        """Return the function that decides which unsigned frames a port accepts. None accepts none."""
         raise NotImplementedError
 
     def may_change(self) -> bool:
         """Return True if the key can be changed now. If not, send a text with the reason."""
         raise NotImplementedError
 
-    def on_key_changed(self) -> None:
-        """Called after the key was set or removed."""
+    def on_key_changed(self) -> None: ...
 
     def _power_on(self) -> None:
         self._streams = {}
         self.load()
 
     def _on_setup(self, message: SetupSigning, _channel: Channel) -> None:
-        """Handle SETUP_SIGNING: use the key in the message, or turn signing off."""
         if not self.may_change():
             return
         has_key = any(message.secret_key)  # A key whose bytes are all 0 turns signing off.
@@ -121,7 +119,6 @@ class ReceivedCorrections:
         return self._vehicle.now - self._received_at < _CORRECTIONS_MAX_AGE_S
 
     def _on_fragment(self, message: GpsRtcmData) -> None:
-        """Store a fragment of an RTCM message, and assemble the message when all fragments are there."""
         data = bytes(message.data[: message.len])
         is_fragmented = message.flags & 1
         fragment_id = message.flags >> 1 & 3
@@ -271,7 +268,6 @@ class SimulatedBattery:
 
     @property
     def percent(self) -> float:
-        """Remaining charge, 0 to 100."""
         return 100.0 * self._charge_mah / self.capacity_mah
 
     @percent.setter

@@ -25,11 +25,7 @@ NS_PER_S = 1e9
 
 
 def fitted(message: MessageT) -> MessageT:
-    """Return a copy of the message whose values fit their fields.
-
-    Integers are clamped, floats that are too large become infinite, and texts are cut. Values of a wrong type are not
-    changed, so that encoding them reveals the bug.
-    """
+    """Return a copy of the message whose values fit their fields."""
     fitting = copy.copy(message)
     for field in fitting.FIELDS:
         value = getattr(fitting, field.name)
@@ -39,7 +35,7 @@ def fitted(message: MessageT) -> MessageT:
 
 
 def _fit_field(field: Field, value: Any) -> Any:
-    """Return the value of a field, fitted as `fitted` describes."""
+    # Values of a wrong type are not changed, so that encoding them reveals the bug.
     if field.type == "char":
         if isinstance(value, str) and field.is_text:
             max_bytes = field.array_length or 1
@@ -136,7 +132,6 @@ class Streams:
         self._update_next_due()
 
     def _group_starting_now(self, interval_s: float, now: float) -> _StreamGroup:
-        """Return the group of streams that start at ``now`` with this interval. Create it if it does not exist yet."""
         for group in self._groups.values():
             if group.start == now and group.interval_s == interval_s and group.count == 0:
                 return group
@@ -146,16 +141,14 @@ class Streams:
         return group
 
     def interval(self, message_id: int) -> float:
-        """Return the interval in seconds; 0 if the message is not streamed."""
+        """Return the interval in seconds, or 0 if the message is not streamed."""
         group = self._groups.get(message_id)
         return 0.0 if group is None else group.interval_s
 
     def ids(self) -> frozenset[int]:
-        """Return the ids of all streamed messages."""
         return frozenset(self._groups)
 
     def postpone(self, seconds: float) -> None:
-        """Delay all streams by this time."""
         for _, _, group in self._heap:
             group.start += seconds
         self._heap = [(due + seconds, number, group) for due, number, group in self._heap]
@@ -223,7 +216,7 @@ class Channel:
         return [message for message in messages if message.received_frame and signing.accepts(message.received_frame)]
 
     def encode(self, message: Message, sender: tuple[int, int] | None = None) -> bytes:
-        """Return a frame with the next sequence number. It is empty if a MAVLink 1 port cannot send the message."""
+        """Return a frame, or nothing if a MAVLink 1 port cannot send the message."""
         if self.version == 1 and message.ID > 255:  # The id of a MAVLink 1 message has one byte.
             return b""
         sender = self._own_ids if sender is None else sender
@@ -244,11 +237,10 @@ class Channel:
 
     @property
     def has_output(self) -> bool:
-        """True while the outbox is not empty."""
         return bool(self._outbox)
 
     def take_outbox(self) -> bytes:
-        """Return and clear the outbox, which contains only whole frames."""
+        """Return and clear the outbox."""
         if not self._outbox:
             return b""
         data = b"".join(self._outbox)
@@ -262,11 +254,10 @@ class Channel:
         return pieces
 
     def take_datagrams(self) -> list[bytes]:
-        """Return and clear the outbox, divided into datagrams."""
         return datagrams(self.take_pieces())
 
     def reset(self) -> None:
-        """Reset stream rates, partial frames and sequence numbers because of a reboot. The outbox is kept."""
+        """Reset stream rates, partial frames and sequence numbers. The outbox is kept."""
         self.streams = Streams()
         self.reader = MessageReader(self._wanted)
         self._encoders.clear()

@@ -35,7 +35,6 @@ class CommandServer(commands.CommandDispatcher):
         self._vehicle = vehicle
 
     def dispatch(self, command: ReceivedCommand) -> None:
-        """Execute a command and answer it. A fault may ignore or refuse the command, or change the answer."""
         fault = self._vehicle.faults.next_command_fault(command.command)
         if fault is not None and fault.ignore:
             return
@@ -51,7 +50,6 @@ class CommandServer(commands.CommandDispatcher):
             self._answer_with(command, answer, fault)
 
     def _answer_with(self, command: ReceivedCommand, result: int, fault: CommandFault | None) -> None:
-        """Send the acknowledgement. A fault may send progress before it, or repeat, delay or lose it."""
         fault = CommandFault() if fault is None else fault
         if fault.progress:
             # The final acknowledgement follows the progress. `final_fault` repeats, delays or drops it.
@@ -112,7 +110,6 @@ class Setpoint:
 
     @property
     def is_force(self) -> bool:
-        """True if the accelerations are forces (FORCE_SET)."""
         return bool(self.mask & Mask.FORCE_SET) and self.has_acceleration
 
     def axes(self, position: Ned) -> tuple[Ned, Ned, Ned]:
@@ -144,5 +141,5 @@ def constrained(value: float, low: float, high: float) -> float:
 
 
 def is_finite(*vectors: Ned | None) -> bool:
-    """Return True if all components of all vectors are finite. Vectors that are None do not count."""
+    """Return True if all components are finite. Vectors that are None do not count."""
     return all(math.isfinite(part) for vector in vectors if vector is not None for part in vector)

@@ -28,14 +28,13 @@ _KINDS = {
 
 
 def kind_names() -> tuple[str, ...]:
-    """Return the kinds that `simulated` accepts, such as "copter" and "px4"."""
     return tuple(_KINDS)
 
 
 def kind_class(name: str) -> type[SimulatedVehicle]:
     """Return the class that simulates vehicles of a kind, such as "copter".
 
-    Raises InvalidArgument, with the list of kinds, for an unknown name.
+    Raises InvalidArgument for an unknown name.
     """
     if name not in _KINDS:
         raise InvalidArgument(
@@ -47,7 +46,7 @@ def kind_class(name: str) -> type[SimulatedVehicle]:
 
 
 def simulated(name: str, **options: Any) -> SimulatedVehicle:
-    """Create a vehicle of the kind ``name``. Its class gets the ``options``, such as ``system_id`` and ``home``.
+    """Create a vehicle of the kind ``name``. Its class gets the ``options``.
 
     Raises InvalidArgument for an unknown kind, TypeError for an unknown option.
     """
@@ -63,13 +62,9 @@ _INT8_MAX = 127.0  # The maximum of DISARM_DELAY, which is an INT8.
 
 
 def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leave: Collection[str] = ()) -> None:
-    """Multiply the timeouts in the vehicles' parameters by ``speedup``, except the parameters named in ``leave``.
-
-    A client times its heartbeats and set-points by its own clock. With a ``speedup`` of ten, five simulated seconds
-    last only half a second for the client. PX4's simulation scales COM_DL_LOSS_T in the same way. The type of
-    ArduPilot's DISARM_DELAY limits this parameter to 127 s. The time for which PX4 keeps texts for a silent ground
-    station is multiplied, too. A ``speedup`` of 1 or less changes nothing.
-    """
+    """Multiply the timeouts in the vehicles' parameters by ``speedup``, except those in ``leave``."""
+    # A client times its heartbeats and set-points by its own clock. With a speedup of ten, five simulated seconds last
+    # only half a second for the client. PX4's simulation scales COM_DL_LOSS_T in the same way.
     if speedup <= 1.0:
         return
     from aerokit.sim.autopilot import SimulatedAutopilot
@@ -77,7 +72,7 @@ def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leav
     for vehicle in vehicles:
         if isinstance(vehicle, SimulatedAutopilot):
             _scale(vehicle.parameters, speedup, leave)
-            vehicle.on_speedup(speedup)
+            vehicle.on_speedup(speedup)  # PX4 also keeps texts longer for a silent ground station.
 
 
 def _scale(parameters: SimParameters, speedup: float, leave: Collection[str]) -> None:

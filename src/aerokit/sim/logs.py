@@ -87,11 +87,10 @@ class LogServer:
 
     @property
     def is_busy(self) -> bool:
-        """True while a list or a log is being sent."""
         return bool(self._outgoing)
 
     def restart(self) -> None:
-        """Abort the running transfer, so that another can start."""
+        """Abort the running transfer."""
         self._transfer_number += 1
         self._outgoing.clear()
 
@@ -111,7 +110,6 @@ class LogServer:
         self.restart()
 
     def content(self, index: int) -> bytes:
-        """Return the content of the log at this index."""
         log = self.logs[index]
         if index != self._content_index or len(self._content) != log.size:  # The size differs if the log has grown.
             self._content_index = index
@@ -125,14 +123,15 @@ class LogServer:
         self._append_to_file(len(self.logs) - 1, self.logs[-1].make()[old.size :])
 
     def blocks(self, index: int, log_id: int, offset: int, count: int) -> list[Callable[[], Message]]:
-        """Return functions that create the LOG_DATA messages of a range. A range without data has one empty block."""
+        """Return functions that create the LOG_DATA messages of a range."""
         data = self.content(index)
         end = min(len(data), offset + count)
+        # A range without data has one empty block.
         starts: Sequence[int] = range(offset, end, _BLOCK) if offset < end else [offset]
         return [partial(_log_data, data, log_id, start, end) for start in starts]
 
     def transfer(self, messages: Sequence[Callable[[], Message]], channel: Channel) -> None:
-        """Abort the running transfer, if any, and send these messages."""
+        """Abort the running transfer, and send these messages."""
         self.restart()
         self._outgoing.extend(messages)
         self._channel = channel
@@ -161,7 +160,6 @@ class ArduPilotLogServer(LogServer):
         self._has_warned = False
 
     def _on_list(self, request: LogRequestList, channel: Channel) -> None:
-        """Handle LOG_REQUEST_LIST: send an entry for each log in the requested range."""
         if self._refuses():
             return
         if self.is_busy:

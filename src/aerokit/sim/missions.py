@@ -29,9 +29,7 @@ class MissionStore(Protocol):
     """
 
     @property
-    def transfer_is_open(self) -> bool:
-        """True during an upload or download."""
-        ...
+    def transfer_is_open(self) -> bool: ...
 
     def items(self, mission_type: int) -> list[MissionItem]:
         """Return the items that a download sends, including ArduPilot's home (item 0)."""
@@ -75,7 +73,6 @@ class MissionMount(Mount):
         return _PLACEHOLDER_SIZE
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        """Open a file to read the stored items, or to replace them by an upload."""
         type_ = _type_of(path)
         if not writing:
             return _Reader(_packed(self._store.items(type_), type_))
@@ -109,7 +106,6 @@ class _Writer(UploadedFile):
         return 0
 
     def close(self) -> None:
-        """Decode the file and replace the list. Raises FileFault if the file or an item is invalid."""
         self.is_closed = True
         try:
             header = read_header(bytes(self.content))

@@ -95,7 +95,6 @@ _MIN_TIME_TO_GROUND_S = 0.3
 
 
 def wrap_pi(angle: float) -> float:
-    """Return the equivalent angle between -pi and pi."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
@@ -111,16 +110,14 @@ def _clamp(value: float, limit: float) -> float:
 
 
 def velocity_to_landing_target(north: float, east: float) -> tuple[float, float]:
-    """Return the horizontal velocity (m/s) towards a landing target that is ``north`` and ``east`` metres away."""
+    """Return the horizontal velocity in m/s towards a landing target at this offset in metres."""
     gain_per_s = min(_APPROACH_PER_S, _MAX_APPROACH_M_S / max(math.hypot(north, east), 1e-6))
     return (north * gain_per_s, east * gain_per_s)
 
 
 def approach_speed(distance: float, gain: float, deceleration: float) -> float:
-    """Return the speed with which a vehicle approaches a point ``distance`` metres away, to stop there.
-
-    Near the point, the speed is ``gain`` times the distance. Farther away, the speed allows a constant deceleration.
-    """
+    """Return the speed at which a vehicle approaches a point ``distance`` metres away, to stop there."""
+    # Near the point, the speed is `gain` times the distance. Farther away, it allows a constant deceleration.
     linear_distance = deceleration / (gain * gain)
     if distance <= linear_distance:
         return distance * gain
@@ -196,7 +193,6 @@ class Motion:
 
     @property
     def place(self) -> Ned:
-        """Metres north, east and down of the origin."""
         return (self.north, self.east, self.down)
 
     @property
@@ -208,11 +204,9 @@ class Motion:
         return (self.north + self.velocity_north * seconds, self.east + self.velocity_east * seconds, self.down)
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
-        """Fly at this velocity (m/s)."""
         self._set_target((north, east, down))
 
     def seek_acceleration(self, north: float, east: float, down: float) -> None:
-        """Accelerate with these components (m/s²) until the next target is set."""
         self._set_target((north, east, down), is_acceleration=True)
 
     def seek_attitude(self, roll: float, pitch: float, velocity_down: float) -> None:
@@ -268,7 +262,6 @@ class Motion:
 
     @property
     def airspeed_m_s(self) -> float:
-        """Horizontal speed through the air."""
         return math.hypot(
             self.velocity_north - self.wind.north_m_s - self._gust_north,
             self.velocity_east - self.wind.east_m_s - self._gust_east,
@@ -276,7 +269,6 @@ class Motion:
 
     @property
     def ground_speed_m_s(self) -> float:
-        """Horizontal speed over the ground."""
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def step(self, dt: float, *, powered: bool = True) -> None:
@@ -307,14 +299,13 @@ class Motion:
         self._wanted_yaw_rate = 0.0
 
     def _update_gusts(self, dt: float) -> None:
-        """Change the gusts, which are a random walk that returns to zero. Its standard deviation is `gusts_m_s`."""
+        # The gusts are a random walk that returns to zero. Its standard deviation is `gusts_m_s`.
         decay = 1.0 - dt / 2.0
         kick = self.wind.gusts_m_s * math.sqrt(dt)
         self._gust_north = self._gust_north * decay + self._rng.gauss(0.0, kick)
         self._gust_east = self._gust_east * decay + self._rng.gauss(0.0, kick)
 
     def _commanded_acceleration(self) -> tuple[float, float, float]:
-        """Return the acceleration (north, east, down) towards the target, within `limits`."""
         limits = self.limits
         north, east, down = self._target
         if not self._target_is_acceleration:
@@ -332,7 +323,6 @@ class Motion:
         return north, east, down
 
     def _acceleration_from_lean(self, roll: float, pitch: float) -> tuple[float, float]:
-        """Return the acceleration (north, east), reduced by drag, of a copter that leans by these angles in radians."""
         max_lean = self.limits.lean_rad
         # A positive pitch raises the nose, which pushes the copter backwards. A positive roll pushes it to the right.
         forward = -GRAVITY_M_S2 * math.tan(_clamp(pitch, max_lean))
@@ -349,7 +339,6 @@ class Motion:
         )
 
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
-        """Accelerate for ``dt`` seconds. On the ground, the vehicle stops."""
         self.acceleration_north = north
         self.acceleration_east = east
         self.acceleration_down = down
@@ -369,7 +358,6 @@ class Motion:
             self.velocity_down = 0.0
 
     def _lean(self, north: float, east: float, dt: float, *, powered: bool) -> None:
-        """Lean in the direction of the acceleration. Without power, or on the ground, become level."""
         roll = pitch = 0.0
         if powered and not self.is_on_ground:
             # The copter also leans against its drag.
@@ -389,7 +377,6 @@ class Motion:
         self.pitch_rate = pitch_step / dt
 
     def _turn(self, dt: float, *, powered: bool) -> None:
-        """Turn for ``dt`` seconds, towards the wanted heading or at the wanted turn rate."""
         rate = 0.0
         if powered and not self.is_on_ground:
             rate = self._wanted_yaw_rate

@@ -39,7 +39,6 @@ class ParameterServer(servers.ParameterProtocolServer):
         return ParamValue(name, parameters[name], parameters.type(name), len(parameters), index)
 
     def send(self, name: str, index: int, channel: Channel | None) -> None:
-        """Send a PARAM_VALUE on one port, or on all ports if ``channel`` is None."""
         if name not in self._vehicle.faults.mute_parameters:
             super().send(name, index, channel)
 
@@ -98,7 +97,6 @@ class ArduPilotParameterServer(ParameterServer):
             self._vehicle.call_later(0.0, self._read_next)
 
     def _read_next(self) -> None:
-        """Answer the oldest read request, and schedule the next answer."""
         self._is_reading = bool(self._reads)
         if not self._reads:
             return
@@ -114,7 +112,6 @@ class ArduPilotParameterServer(ParameterServer):
             self.send_error(sender_of(request), name, index, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
-        """Handle PARAM_SET: store and broadcast the value, or refuse it."""
         name, faults = request.param_id, self._vehicle.faults
         if name not in self._parameters:
             self._refuse(request, MavParamError.DOES_NOT_EXIST, channel)
@@ -161,7 +158,6 @@ class Px4ParameterServer(ParameterServer):
     burst = 10
 
     def value_message(self, name: str, index: int) -> ParamValue:
-        """Return the PARAM_VALUE, whose float field contains the bytes of the value."""
         parameter = self._parameters.row(name).as_parameter(index)
         return value_message(parameter, len(self._parameters), bytewise=True)
 
@@ -180,7 +176,6 @@ class Px4ParameterServer(ParameterServer):
         self._vehicle.send(value_message(parameter, len(rows), bytewise=True), channel)
 
     def _on_read(self, request: ParamRequestRead, channel: Channel) -> None:
-        """Answer a read by index, or by name if the index is −1. _HASH_CHECK is read by name only."""
         names, index, sender = self._parameters.names, request.param_index, sender_of(request)
         if index >= 0:
             if index < len(names):
@@ -195,7 +190,6 @@ class Px4ParameterServer(ParameterServer):
             self._refuse(sender, request.param_id, _UNUSED_INDEX, MavParamError.DOES_NOT_EXIST, channel)
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
-        """Handle PARAM_SET: store and confirm the value, and broadcast a change a moment later."""
         name, parameters = request.param_id, self._parameters
         if name == HASH_NAME:  # By this request, the client stops the running list, because it knows the parameters.
             self.stop_list(channel)
@@ -214,7 +208,7 @@ class Px4ParameterServer(ParameterServer):
             self._vehicle.call_later(_BROADCAST_DELAY_S, lambda: self.send(name, parameters.index(name), None))
 
     def _error_for(self, name: str, type_: int) -> int | None:
-        """Return the MAV_PARAM_ERROR of an invalid PARAM_SET; None if it is valid."""
+        """Return the MAV_PARAM_ERROR of an invalid PARAM_SET."""
         if name == HASH_NAME:
             return MavParamError.READ_ONLY
         if name not in self._parameters:

@@ -46,7 +46,7 @@ class SimParameter:
     """
 
     def as_parameter(self, index: int | None = None) -> Parameter:
-        """Convert to a `Parameter`, the client's class. Values of integer types become int."""
+        """Convert to the client's class. Values of integer types become int."""
         type_ = ParameterType(self.type)
         if type_.is_integer:
             return Parameter(self.name, int(self.value), type_, int(self.default), index)
@@ -89,7 +89,6 @@ class SimParameters:
         return self[name] if name in self else default  # noqa: SIM401 - this is `get`
 
     def __setitem__(self, name: str, value: float) -> None:
-        """Set a value. Raises KeyError for an unknown name."""
         row = self.row(name)
         row.value = stored_value(value, row.type)
         if name in self._switches.values():
@@ -98,7 +97,7 @@ class SimParameters:
     def change(self, values: Mapping[str, float]) -> None:
         """Set several parameters.
 
-        Raises InvalidArgument if a name is unknown. The error lists similar names, and no parameter is set.
+        Raises InvalidArgument if a name is unknown. No parameter is set then.
         """
         for name in values:
             if name not in self:
@@ -126,7 +125,7 @@ class SimParameters:
         return self._names
 
     def index(self, name: str) -> int:
-        """Return the position of a name in ``names``. Raises KeyError for a name that is not listed."""
+        """Return the position of a name in ``names``."""
         _ = self.names  # Reading the property updates `_indices`.
         return self._indices[name]
 
@@ -144,7 +143,6 @@ class SimParameters:
         return row
 
     def add(self, name: str, value: float, type: int = MavParamType.REAL32) -> None:  # noqa: A002
-        """Append a parameter, as real firmware does when a feature is enabled."""
         self._rows[name] = SimParameter(name, type, stored_value(value, type), stored_value(value, type))
         self._names = None
 
@@ -167,7 +165,7 @@ def stored_value(value: float, type_: int) -> float:
 
 
 def _row(fields: list[str]) -> SimParameter:
-    """Parse the columns of one line of a parameter table. The default and the last column may be missing."""
+    """Parse the columns of one line. The default and the last column may be missing."""
     name, type_text, value_text = fields[:3]
     type_, value = int(type_text), float(value_text)
     default = float(fields[3]) if len(fields) > 3 else value
@@ -178,7 +176,7 @@ def _row(fields: list[str]) -> SimParameter:
 
 
 def _switch_of(line: str) -> str | None:
-    """Return the last column of a line if it names the enabling parameter (`SimParameter.switch`); otherwise None."""
+    """Return the last column of a line if it names an enabling parameter (`SimParameter.switch`)."""
     if line.count(",") < 4 or line.endswith("," + _VOLATILE):
         return None
     return line.rpartition(",")[2]
@@ -188,7 +186,7 @@ def _switch_of(line: str) -> str | None:
 def _lines_and_switches(
     text: str, used: frozenset[str], count: int | None
 ) -> tuple[dict[str, SimParameter | str], dict[str, str]]:
-    """Select lines of a table. Return them, and their switches (see `SimParameter`), both by parameter name."""
+    """Return the selected lines and their switches (see `SimParameter`), both by parameter name."""
     selected = text.split() if count is None else _select_lines(text.split(), used, count)
     lines: dict[str, SimParameter | str] = {line.partition(",")[0]: line for line in selected}
     switches = {name: _switch_of(str(line)) for name, line in lines.items()}
@@ -196,10 +194,7 @@ def _lines_and_switches(
 
 
 def _select_lines(lines: list[str], used: frozenset[str], count: int) -> list[str]:
-    """Return the lines of the parameters named in ``used``, and other lines to reach ``count`` lines.
-
-    The other lines are the first lines of the table whose parameter has no switch (see `SimParameter`).
-    """
+    """Return the lines of the parameters in ``used``, and other lines to reach ``count`` lines."""
     is_used = [line.partition(",")[0] in used for line in lines]
     others_left = max(0, count - sum(is_used))
     selected: list[str] = []
@@ -232,14 +227,12 @@ class ParameterPackMount(Mount):
         self._block = block
 
     def size(self, path: str) -> int:
-        """Return the exact size of the file if the block size is fixed, otherwise a guess of 12 bytes per parameter."""
         if self._block is not None:
             return len(_Reader(self._parameters, path, self._block).content)
         _query(path)
         return len(self._parameters) * _GUESSED_ROW_SIZE
 
     def open(self, path: str, *, writing: bool) -> FileHandle:
-        """Open the file. When it is read, the options ``?start=&count=&withdefaults=`` at the end of the path apply."""
         if writing:
             _query(path)
             return _Writer(self._parameters, self._apply)
@@ -263,13 +256,11 @@ class _Reader(FileHandle):
 
     @property
     def content(self) -> bytes:
-        """File content, created on first access."""
         if self._content is None:
             self._content = self._packed()
         return self._content
 
     def _packed(self) -> bytes:
-        """Encode the file as the options in its path (``start``, ``count`` and ``withdefaults``) request."""
         try:
             return pack_for_download(
                 (self._parameters.row(name).as_parameter() for name in self._parameters.names),
@@ -317,7 +308,6 @@ class _Writer(UploadedFile):
             raise FileFault(EINVAL) from None
 
     def _read_rows(self, content: bytes, count: int) -> None:
-        """Apply the values in an uploaded file. Unknown names are skipped."""
         # An entry omits the first letters that its name shares with the previous name. `read_entry` adds them again.
         position, previous_name = HEADER.size, b""
         for _ in range(count):

@@ -124,7 +124,6 @@ class SimulatorServer:
         return self
 
     async def _open_links(self, opening: AsyncExitStack) -> None:
-        """Open each link, with one channel for each of its vehicles. ``opening`` closes the links again."""
         connected: set[int] = set()  # vehicles whose first channel is in use; `_channels` adds to them
         for link, vehicles in zip(self._links, self.vehicles_on, strict=True):
             port = _Port(self, link, vehicles, _channels(vehicles, connected))
@@ -140,7 +139,7 @@ class SimulatorServer:
         self._end(error)
 
     def _end(self, error: BaseException | None) -> None:
-        """Stop. If a vehicle has failed, raise `failure`, unless the block already raises it as ``error``."""
+        """Stop, and raise the failure of a vehicle, if there is one."""
         self._stop()
         owner = self._owner
         self._owner = None
@@ -167,7 +166,6 @@ class SimulatorServer:
             raise
 
     def _on_due(self) -> None:
-        """Run what is due. Called by the timer or the event source."""
         self._skip_lateness()
         self._timer = None
         try:
@@ -179,12 +177,12 @@ class SimulatorServer:
         return self._loop_time(min(self._dues, default=math.inf))
 
     def _fail(self, error: Exception) -> None:
-        """Close the links and cancel the owner, because asyncio would only log the exception of a callback."""
         self.failure = error
         self._stop()
         for link in self._links:
             link.close()
         owner = self._owner
+        # The owner is cancelled, because asyncio would only log the exception of a callback.
         # A fixture can enter the `async with` block in one task and leave it in another, so the owner may be done.
         if owner is not None and not owner.done() and owner is not asyncio.current_task():
             self._cancels_owner = owner.cancel()
@@ -198,13 +196,11 @@ class SimulatorServer:
         self._ports.clear()
 
     def _run(self, now: float) -> None:
-        """Run what is due at the simulated time ``now``, send the output, and set the timer."""
         self._step(now)
         self._flush()
         self._schedule()
 
     def _step(self, now: float) -> None:
-        """Advance to ``now`` each vehicle whose next event is due."""
         dues = self._dues
         for number, due in enumerate(dues):
             if due <= now:
@@ -233,7 +229,6 @@ class SimulatorServer:
             self._fail(error)
 
     def _flush(self) -> None:
-        """Write the datagrams of all vehicles to their links."""
         # On the real clock, the frames of many vehicles share datagrams, so that fewer are sent. On virtual time, each
         # vehicle sends its own datagrams.
         is_real_time = self._remove_source is None
@@ -246,7 +241,6 @@ class SimulatorServer:
             port.disconnect_clients()
 
     def _schedule(self) -> None:
-        """Set the timer for the next event of any vehicle, unless it is set already."""
         loop = self._loop
         if loop is None or self._remove_source is not None:  # An event source needs no timer.
             return
@@ -265,7 +259,6 @@ class SimulatorServer:
         self._timer = loop.call_at(when, self._on_due)
 
     def _skip_lateness(self) -> None:
-        """If the timer is over ``_MAX_CATCH_UP_S`` simulated seconds late, skip the excess, unless the speed is 1."""
         has_nothing_scheduled = self._timer is None and self._remove_source is None
         if self._loop is None or self._speedup == 1.0 or has_nothing_scheduled:
             return
@@ -298,8 +291,7 @@ class _Port:
     def take_datagrams(self, *, together: bool) -> list[bytes]:
         """Return the datagrams to send.
 
-        With ``together``, a datagram may have messages of several vehicles if there are more than ten, as behind a
-        router.
+        With ``together``, a datagram may have messages of several vehicles, as behind a router.
         """
         active = [channel for channel in self.channels if channel.has_output]
         if not active:
@@ -336,15 +328,12 @@ def _uncancel(task: asyncio.Task[Any]) -> None:
 
 
 def _channels(vehicles: Iterable[SimulatedVehicle], connected: set[int]) -> list[Channel]:
-    """Return one channel of each vehicle for a link.
-
-    A vehicle in ``connected`` gets a new channel. Other vehicles get their first channel and are added to
-    ``connected``.
-    """
+    """Return one channel of each vehicle for a link."""
     channels = []
     for vehicle in vehicles:
         is_first = id(vehicle) not in connected
         connected.add(id(vehicle))
+        # A vehicle opens another channel for each further link.
         channels.append(vehicle.channels[0] if is_first else vehicle.open_channel())
     return channels
 

@@ -34,7 +34,7 @@ Handler = Callable[[Any, Channel], None]
 
 
 def _whole_ticks(seconds: float) -> int:
-    """Return the number of complete ticks. A tick that is incomplete only by a rounding error counts."""
+    # A tick that is incomplete only by a rounding error counts.
     return int(seconds / TICK_S + 1e-6)
 
 
@@ -291,12 +291,12 @@ class SimulatedVehicle:
         self._schedule_tick(1)
 
     def _schedule_tick(self, ticks: int) -> None:
-        """Schedule the next tick after this many intervals of TICK_S. An event may cause an earlier tick."""
+        """Schedule the next tick after this many intervals of TICK_S."""
         next_tick = self._first_tick_at + (self._ticks_done + ticks) * TICK_S
         self._next_tick_at = round(next_tick * NS_PER_S) / NS_PER_S if next_tick < math.inf else math.inf
 
     def _tick_until(self, now: float) -> None:
-        """Call `tick` once with the total duration of the ticks that are due at ``now``, and schedule the next tick."""
+        """Call `tick` once for all ticks that are due at ``now``."""
         if now < self._first_tick_at:
             return
         ticks = _whole_ticks(now - self._first_tick_at) - self._ticks_done
@@ -306,7 +306,6 @@ class SimulatedVehicle:
             self._schedule_tick(_STEADY_TICKS if self.is_steady else 1)
 
     def _run_due(self, due: float) -> None:
-        """Run everything that is due at this time: ticks, timers, and messages of the streams."""
         self._tick_until(due)
         while self._timers and self._timers[0][0] <= due:
             _, _, action = heappop(self._timers)
@@ -386,7 +385,6 @@ class SimulatedVehicle:
         self.send_text(MavSeverity.INFO, text)
 
     def _handle(self, message: Message, channel: Channel) -> None:
-        """Pass a received message to its observers and, if it is for this vehicle, to its handler."""
         handler = self.handlers.get(message.ID)
         # Observers get all messages, even those for other vehicles and those that a fault drops.
         for observer in self._observers.get(message.ID, ()):

@@ -91,10 +91,10 @@ class FixedWing(Motion):
     def fly_to(self, north: float, east: float, down: float, *, airspeed: float) -> None:
         """Fly towards a point, without slowing down or circling there."""
         course = math.atan2(east - self.east, north - self.north)
-        self.head(course, airspeed, self.climb_to(down))
+        self.head(course, airspeed, self.climb_rate_to(down))
 
     def circle(self, north: float, east: float, down: float, *, radius: float, airspeed: float) -> None:
-        """Circle a point with this radius in metres, clockwise or, with a negative radius, counter-clockwise."""
+        """Circle a point. A negative radius is counter-clockwise."""
         turn_sign = math.copysign(1.0, radius)
         radius = max(1.0, abs(radius))
         distance = math.hypot(north - self.north, east - self.east)
@@ -105,14 +105,12 @@ class FixedWing(Motion):
         course = course_to_center - turn_sign * (math.pi / 2) * (1.0 - share_to_center)
         is_near_circle = distance < 1.5 * radius
         turn_rate = turn_sign * self.ground_speed_m_s / radius if is_near_circle else 0.0
-        self.head(course, airspeed, self.climb_to(down), turn_rate=turn_rate)
+        self.head(course, airspeed, self.climb_rate_to(down), turn_rate=turn_rate)
 
     def roll_out(self) -> None:
-        """Brake on the ground until the plane stops."""
         self.bank_and_climb(0.0, 0.0, 0.0)
 
-    def climb_to(self, down: float) -> float:
-        """Return the climb rate in m/s with which the plane approaches the coordinate ``down``."""
+    def climb_rate_to(self, down: float) -> float:
         return _HEIGHT_GAIN_PER_S * (self.down - down)
 
     @property
@@ -120,7 +118,6 @@ class FixedWing(Motion):
         return self.is_on_ground and self._speed < _STOPPED_M_S
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds. A plane without power glides."""
         if self.wind.gusts_m_s > 0.0:
             self._update_gusts(dt)
         was_on_ground = self.is_on_ground
@@ -142,7 +139,6 @@ class FixedWing(Motion):
         return powered and self._wanted_climb > 0.0 and self._speed >= self.wing_limits.airspeed_min_m_s
 
     def _taxi(self, dt: float, *, powered: bool) -> None:
-        """Move on the wheels over level ground, in the direction of the nose. Without power, the plane brakes."""
         wanted_speed = self._wanted_airspeed if powered else 0.0
         self._change_airspeed(wanted_speed, dt)
         self.throttle = 1.0 if powered and wanted_speed > self._speed else 0.0
@@ -154,7 +150,6 @@ class FixedWing(Motion):
         self._advance(dt)
 
     def _fly(self, dt: float, *, powered: bool) -> None:
-        """Move a flying plane for ``dt`` seconds. Without power, it glides at a fixed airspeed."""
         wing = self.wing_limits
         wanted_climb = self._wanted_climb if powered else -wing.glide_sink_m_s
         wanted_speed = max(wing.airspeed_min_m_s, min(wing.airspeed_max_m_s, self._wanted_airspeed))
@@ -176,7 +171,6 @@ class FixedWing(Motion):
         self.throttle = max(0.0, min(1.0, throttle)) if powered else 0.0
 
     def _touch_down(self) -> None:
-        """Stop the descent on the ground. The plane keeps its speed over ground."""
         self.impact_speed_m_s: float = self.velocity_down
         self._speed = self.ground_speed_m_s
         self.down = self.ground_down
@@ -184,12 +178,10 @@ class FixedWing(Motion):
         self.roll = self.pitch = 0.0
 
     def _change_airspeed(self, wanted: float, dt: float) -> None:
-        """Approach the wanted speed. On the ground, the plane brakes with another deceleration."""
         deceleration = self.wing_limits.roll_out_m_s2 if self.is_on_ground else self.wing_limits.acceleration_m_s2
         self._speed += max(-deceleration * dt, min(self.wing_limits.acceleration_m_s2 * dt, wanted - self._speed))
 
     def _bank(self, wanted: float, dt: float) -> None:
-        """Approach the wanted bank angle, and turn as a plane with this bank angle does."""
         step = (wanted - self.roll) * min(1.0, dt / _BANK_TIME_CONSTANT_S)
         self.roll += step
         self.roll_rate: float = step / dt
@@ -197,7 +189,6 @@ class FixedWing(Motion):
         self.yaw: float = wrap_pi(self.yaw + self.yaw_rate * dt)
 
     def _pitch(self, dt: float) -> None:
-        """Approach the pitch angle that belongs to the present climb."""
         sine_of_slope = -self.velocity_down / max(self._speed, 1.0)
         slope = math.asin(max(-_MAX_SLOPE, min(_MAX_SLOPE, sine_of_slope)))
         step = (slope + _ANGLE_OF_ATTACK_RAD - self.pitch) * min(1.0, dt / _PITCH_TIME_CONSTANT_S)
@@ -205,7 +196,7 @@ class FixedWing(Motion):
         self.pitch_rate: float = step / dt
 
     def _along_nose(self, speed: float) -> tuple[float, float]:
-        """Return the components (north, east) of a speed in the direction of the nose."""
+        """Return (north, east) of a speed in the direction of the nose."""
         return speed * math.cos(self.yaw), speed * math.sin(self.yaw)
 
     def _air_movement(self) -> tuple[float, float]:
@@ -293,11 +284,9 @@ class GroundMotion(Motion):
 
     @property
     def airspeed_m_s(self) -> float:
-        """Always 0: a rover has no pitot tube."""
-        return 0.0
+        return 0.0  # A rover has no pitot tube.
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds. A rover without power rolls to a stop."""
         rate = self._turn_rate()
         self._accelerate(self._curve_speed(rate) if powered else 0.0, dt)
         mean_yaw = self.yaw + 0.5 * rate * dt  # The mean during this step, so that long steps stay on the curve.
@@ -317,22 +306,21 @@ class GroundMotion(Motion):
         self.stop()
 
     def _turn_rate(self) -> float:
-        """Return the wanted turn rate, limited by the steering, which turns only while the vehicle moves."""
         rate = self._wanted_turn_rate
         if self._wanted_heading is not None:
             rate = _HEADING_GAIN_PER_S * wrap_pi(self._wanted_heading - self.yaw)
+        # The steering turns the vehicle only while it moves.
         limit = min(self.wheels.turn_rate_rad_s, abs(self.speed_m_s) / self.wheels.turn_radius_m)
         return max(-limit, min(limit, rate))
 
     def _curve_speed(self, rate: float) -> float:
-        """Return the wanted speed, reduced so that the sideways acceleration at this turn rate is within its limit."""
+        """Return the wanted speed, limited by the sideways acceleration at this turn rate."""
         limit = self.wheels.top_speed_m_s
         if rate:
             limit = min(limit, max(_SLOW_M_S, self.wheels.sideways_m_s2 / abs(rate)))
         return max(-limit, min(limit, self._wanted_speed))
 
     def _accelerate(self, wanted: float, dt: float) -> None:
-        """Approach the wanted speed."""
         change = (wanted - self.speed_m_s) * min(1.0, dt / _SPEED_TIME_CONSTANT_S)
         limit = self.wheels.acceleration_m_s2 * dt
         is_braking = abs(wanted) < abs(self.speed_m_s)
@@ -370,13 +358,12 @@ class UnderwaterMotion(Motion):
 
     @property
     def is_still(self) -> bool:
-        """True if the submarine floats motionless at the surface."""
         speed = math.hypot(self.velocity_north, self.velocity_east, self.velocity_down)
         return self.is_at_surface and speed < 0.01
 
     @property
     def airspeed_m_s(self) -> float:
-        """Horizontal speed through the water, which telemetry reports as airspeed."""
+        # Telemetry reports the speed through the water as airspeed.
         return math.hypot(self.velocity_north, self.velocity_east)
 
     def seek_velocity(self, north: float, east: float, down: float) -> None:
@@ -389,7 +376,6 @@ class UnderwaterMotion(Motion):
         self._is_floating = True
 
     def step(self, dt: float, *, powered: bool = True) -> None:
-        """Advance by ``dt`` seconds. A submarine without power rises."""
         # Without thrust, the buoyancy accelerates upwards, and the drag against the velocity.
         floating_down = -self.buoyancy_m_s2 - _DRAG_PER_S * self.velocity_down
         if powered:
@@ -403,7 +389,6 @@ class UnderwaterMotion(Motion):
         self._turn(dt, powered=powered)
 
     def _integrate(self, north: float, east: float, down: float, dt: float) -> None:
-        """Integrate, and keep the submarine between the surface and the bottom."""
         super()._integrate(north, east, down, dt)
         surface_down = self.ground_down  # where a submarine starts
         if self.down < surface_down:

@@ -48,7 +48,6 @@ class AccelerometerCalibration:
         self._request(self._run_number, AccelcalVehiclePos.LEVEL)
 
     def confirm(self, command: ReceivedCommand) -> int:
-        """Execute MAV_CMD_ACCELCAL_VEHICLE_POS, which confirms that the vehicle is in the requested position."""
         if not self.is_waiting or command.param1 != self._requested:
             return MavResult.FAILED
         self._requested = None
@@ -57,7 +56,6 @@ class AccelerometerCalibration:
         return MavResult.ACCEPTED
 
     def _on_sample(self, run_number: int, position: int) -> None:
-        """Continue after a position was measured: request the next one, or end the calibration."""
         if run_number != self._run_number:  # The calibration was started again or cancelled.
             return
         is_first_position = position == AccelcalVehiclePos.LEVEL
@@ -73,7 +71,7 @@ class AccelerometerCalibration:
         self._request(self._run_number, result)
 
     def _request(self, run_number: int, position: int) -> None:
-        """Send this position or result every second, until it is confirmed or the calibration is reset or restarted."""
+        """Send this position or result every second until it is confirmed."""
         self._requested = position
 
         def request_until_confirmed() -> None:
@@ -115,7 +113,7 @@ class CompassCalibration:
 
     @property
     def is_running(self) -> bool:
-        """True until the progress reaches 100 %. A calibration that waits for acceptance does not run any more."""
+        """True until the progress reaches 100 %."""
         return bool(self._compass_mask) and self.percent < 100
 
     @property
@@ -135,10 +133,6 @@ class CompassCalibration:
         }
 
     def _start(self, command: ReceivedCommand) -> int:
-        """Start a calibration of the compasses in the mask param 1 (0: all).
-
-        If param 3 is set, the result is saved without DO_ACCEPT_MAG_CAL.
-        """
         if self._vehicle.motors.is_armed:
             self._vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow compass calibration")
             return MavResult.FAILED
@@ -164,7 +158,6 @@ class CompassCalibration:
         return MavResult.ACCEPTED
 
     def progress(self) -> m.MagCalProgress | None:
-        """Return MAG_CAL_PROGRESS of the next compass in the calibration, or None if no calibration runs."""
         if not self.is_running:
             return None
         self._progress_compass = self._next_compass(self._progress_compass)
@@ -180,7 +173,6 @@ class CompassCalibration:
         )  # fmt: skip
 
     def report(self) -> m.MagCalReport | None:
-        """Return MAG_CAL_REPORT of the next compass in the calibration, or None if there is no result."""
         if not self._compass_mask or self.is_running:
             return None
         self._reported_compass = self._next_compass(self._reported_compass)
@@ -194,7 +186,6 @@ class CompassCalibration:
         )
 
     def _next_compass(self, compass: int) -> int:
-        """Return the compass that follows ``compass`` in the calibration. The first compass follows the last."""
         candidates = ((compass + step) % _COMPASSES for step in range(1, _COMPASSES + 1))
         return next(number for number in candidates if self._compass_mask & 1 << number)
 
@@ -224,7 +215,6 @@ class Calibrations:
         return self.compasses.is_running
 
     def reset(self) -> None:
-        """Cancel all calibrations, because of a reboot."""
         self.compasses.reset()
         self.accelerometers.reset()
 
@@ -237,11 +227,11 @@ class Calibrations:
         }
 
     def _calibrate(self, command: ReceivedCommand) -> int | CommandProgress:
-        """Handle PREFLIGHT_CALIBRATION. Only one kind of calibration is done, even if several are requested."""
         vehicle = self._vehicle
         if vehicle.motors.is_armed:
             vehicle.send_text(MavSeverity.NOTICE, "Disarm to allow calibration")
             return MavResult.FAILED
+        # Only one kind of calibration is done, even if several are requested.
         is_gyro_requested = command.param1 == 1.0
         is_barometer_requested = command.param3 == 1.0
         if is_gyro_requested:
@@ -255,10 +245,6 @@ class Calibrations:
         return self._calibrate_accelerometers(command)
 
     def _calibrate_accelerometers(self, command: ReceivedCommand) -> int | CommandProgress:
-        """Calibrate the accelerometers. Param 5 (``command.x``) selects the kind of calibration.
-
-        The value 76 in param 5 (accelerometers) or param 2 (compasses) accepts the present calibration instead.
-        """
         vehicle = self._vehicle
         if command.x == _Accelerometers.FULL:
             vehicle.info("Initialising ArduPilot")

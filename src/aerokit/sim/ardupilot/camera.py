@@ -49,7 +49,7 @@ class ArduPilotCamera:
         return self._vehicle.parameters.get("CAM1_DURATION", _DEFAULT_SHUTTER_S)
 
     def take(self) -> bool:
-        """Take an image and return True. Return False if there is no camera or its shutter is still open."""
+        """Take an image. Return False without a camera, or while its shutter is still open."""
         if not self.is_fitted or self._vehicle.now - self._taken_at < self._shutter_s:
             return False
         motion = self._vehicle.motion
@@ -61,7 +61,7 @@ class ArduPilotCamera:
         return True
 
     def take_series(self, interval_s: float, count: int) -> bool:
-        """Take ``count`` images (-1: until `stop`), the first one at once. Return False without a camera."""
+        """Take ``count`` images. -1 takes images until `stop`."""
         if not self.is_fitted:
             return False
         self.interval_s = interval_s
@@ -74,19 +74,17 @@ class ArduPilotCamera:
         self.remaining = 0
 
     def trigger_by_distance(self, metres: float) -> None:
-        """Take an image each time the vehicle has moved by this distance in metres. 0 stops the series."""
+        """Take an image each time the vehicle has moved by this distance. 0 turns this off."""
         self.trigger_distance_m = metres
         self._taken_place = None
         self._schedule_update()
 
     def _schedule_update(self) -> None:
-        """Call `_update` in 20 ms, if a trigger is active."""
         if not self._is_update_scheduled and (self.remaining or self.trigger_distance_m > 0):
             self._is_update_scheduled = True
             self._vehicle.call_later(_PERIOD_S, self._update)
 
     def _update(self) -> None:
-        """Take an image if one is due, in a series or by distance. Called repeatedly while either is active."""
         self._is_update_scheduled = False
         if self.remaining:
             is_due = self._vehicle.now - self._taken_at > self.interval_s
@@ -128,7 +126,7 @@ class ArduPilotCamera:
         return self.take_series(interval_s if math.isfinite(interval_s) else 0.0, to_int(count) or _UNLIMITED)
 
     def start_capture(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_IMAGE_START_CAPTURE. Param 1 is the number of the camera, or 0 for all cameras."""
+        # Param 1 is the number of the camera. 0 selects all cameras.
         if command.param1 < 0.0:
             return MavResult.UNSUPPORTED
         if command.param1 > 1.0:
@@ -142,25 +140,22 @@ class ArduPilotCamera:
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def digicam_control(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_DO_DIGICAM_CONTROL, which is accepted even without a camera. Param 5 is 1 to take an image."""
-        if command.x == 1:
+        if command.x == 1:  # param 5
             self.take()
         return MavResult.ACCEPTED
 
     def set_trigger_distance(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_DO_SET_CAM_TRIGG_DIST. Param 3 is 1 to take an image at once."""
         self.trigger_by_distance(command.param1)
         if command.param3 == 1.0:
             self.take()
         return MavResult.ACCEPTED
 
     def zoom(self, command: ReceivedCommand) -> int:
-        """Accept MAV_CMD_SET_CAMERA_ZOOM by rate or in percent. No zoom is stored, because no message reports it."""
+        # No zoom is stored, because no message reports it.
         is_supported = self.is_fitted and command.param1 in (1.0, 2.0)
         return MavResult.ACCEPTED if is_supported else MavResult.UNSUPPORTED
 
     def focus(self, command: ReceivedCommand) -> int:
-        """Handle MAV_CMD_SET_CAMERA_FOCUS. Focus by rate or in percent is accepted. Autofocus is UNSUPPORTED."""
         kind = to_int(command.param1)
         # The firmware denies these types even without a camera (AP_Camera.cpp).
         is_denied = kind in (SetFocusType.STEP, SetFocusType.METERS)
@@ -185,7 +180,6 @@ class ArduPilotCamera:
         return self.feedback if self.is_fitted else None
 
     def information(self) -> m.CameraInformation | None:
-        """Return CAMERA_INFORMATION; None if no camera is fitted."""
         if not self.is_fitted:
             return None
         return m.CameraInformation(
@@ -201,7 +195,6 @@ class ArduPilotCamera:
         return m.CameraSettings(self._vehicle.time_boot_ms, mode_id=0, zoomLevel=math.nan, focusLevel=math.nan)
 
     def capture_status(self) -> m.CameraCaptureStatus | None:
-        """Return CAMERA_CAPTURE_STATUS; None if no camera is fitted."""
         if not self.is_fitted:
             return None
         # `remaining` is -1 during an unlimited series, which the firmware reports as idle (AP_Camera_Backend.cpp).

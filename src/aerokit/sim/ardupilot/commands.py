@@ -34,7 +34,6 @@ _FIXED_TEXTS: dict[tuple[int, Kind], tuple[tuple[int, str], ...]] = {
 
 
 def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
-    """Return the common handlers by MAV_CMD. Each kind of vehicle adds handlers and replaces some of these."""
     common, requests = _CommonCommands(vehicle), vehicle.requests
     # The table lists commands that the simulation does not execute, and the MAV_RESULT that answers each of them.
     handlers: dict[int, CommandHandler] = {
@@ -96,10 +95,7 @@ def common_commands(vehicle: ArduPilotVehicle) -> dict[int, CommandHandler]:
 
 
 def commanded_heading(command: ReceivedCommand, yaw: float) -> float | None:
-    """Return the heading in radians that CONDITION_YAW commands; None if its params are invalid.
-
-    ``yaw`` is the vehicle's present heading, to which a relative angle is added.
-    """
+    """Return the heading in radians that CONDITION_YAW commands, or None if its params are invalid."""
     angle_deg, relative_flag = command.param1, command.param4
     if not 0.0 <= angle_deg <= 360.0 or relative_flag not in (0.0, 1.0):
         return None
@@ -117,8 +113,6 @@ class _CommonCommands:
         self._vehicle = vehicle
 
     def constant_answer(self, result: int, texts: tuple[tuple[int, str], ...]) -> CommandHandler:
-        """Return a handler that always sends these texts and answers ``result``."""
-
         def handle(_: ReceivedCommand) -> int:
             for severity, text in texts:
                 self._vehicle.send_text(severity, text)
@@ -127,7 +121,6 @@ class _CommonCommands:
         return handle
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int:
-        """Handle COMPONENT_ARM_DISARM. Arming an armed vehicle is accepted."""
         vehicle = self._vehicle
         must_arm, must_disarm = command.param1 == 1.0, command.param1 == 0.0
         if must_arm:
@@ -141,7 +134,6 @@ class _CommonCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def set_mission_current(self, command: ReceivedCommand) -> int:
-        """Handle DO_SET_MISSION_CURRENT. The new current item is reported soon, not at once."""
         vehicle = self._vehicle
         resets_mission = command.param2 == 1.0
         if not 0 <= command.param1 < vehicle.missions.commands.count:
@@ -156,7 +148,6 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Start or resume the mission. An armed vehicle on the ground may then take off."""
         vehicle = self._vehicle
         if command.param1 or command.param2:  # The firmware does not support a first and a last item.
             return Result.DENIED
@@ -168,7 +159,6 @@ class _CommonCommands:
         return result
 
     def reposition(self, command: ReceivedCommand) -> int:
-        """Handle DO_REPOSITION: enter GUIDED, if the command allows it, and go to the point."""
         vehicle, guided = self._vehicle, self._vehicle.guided
         if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return Result.UNSUPPORTED
@@ -214,20 +204,19 @@ class _CommonCommands:
         return Result.ACCEPTED
 
     def reset_battery(self, command: ReceivedCommand) -> int:
-        """Set the charge of the first battery to param 2 (percent), if the mask in param 1 selects that battery."""
+        # The simulation has one battery, which is the first bit of the mask.
         if to_int(command.param1) & 1:
             self._vehicle.battery.percent = max(0.0, min(100.0, command.param2))
         return Result.ACCEPTED
 
     def control_high_latency(self, command: ReceivedCommand) -> int:
-        """Refuse to start high-latency mode, which no port supports. Accept requests to stop it."""
+        # No port supports high-latency mode.
         if command.param1:
             return Result.FAILED
         self._vehicle.send_text(_NOTICE, "High Latency disabled")
         return Result.ACCEPTED
 
     def look_at(self, command: ReceivedCommand) -> int:
-        """Set the region of interest. DO_SET_ROI_NONE or a position of zeros clears it. No gimbal is needed."""
         point = None
         if command.command != Cmd.DO_SET_ROI_NONE:
             point = self._vehicle.world_point(*command.place(), command.z, command.altitude_frame)
@@ -268,7 +257,6 @@ class HomeAndOrigin:
         vehicle.on(m.SetGpsGlobalOrigin, self._on_origin)
 
     def _set_home(self, command: ReceivedCommand) -> int:
-        """Handle DO_SET_HOME, for the current place or the place in the command."""
         vehicle, nav = self._vehicle, self._vehicle.navigation
         uses_current_place = command.param1 == 1.0 or command.place() == (0, 0)
         if uses_current_place:
@@ -301,7 +289,6 @@ class HomeAndOrigin:
         return Result.ACCEPTED
 
     def _on_origin(self, message: m.SetGpsGlobalOrigin, channel: Channel) -> None:
-        """Set the estimator's origin and send the origin back. Invalid and repeated requests are ignored."""
         vehicle = self._vehicle
         place = (message.latitude, message.longitude)
         point = vehicle.world_point(*place, message.altitude / 1000.0, MavFrame.GLOBAL)
@@ -332,7 +319,7 @@ class GimbalCommands:
         vehicle.on(m.GimbalManagerSetPitchyaw, self._on_pitch_and_yaw)
 
     def _gimbal(self, device_id: float = 0) -> ArduPilotGimbal | None:
-        """Return the gimbal if it is fitted and ``device_id`` is 1, or 0 for all gimbals. Otherwise return None."""
+        """Return the fitted gimbal if ``device_id`` selects it. 0 selects all gimbals."""
         gimbal = self._vehicle.gimbal
         return gimbal if gimbal.is_fitted and to_int(device_id) in (0, 1) else None
 
@@ -344,7 +331,6 @@ class GimbalCommands:
         return Result.ACCEPTED
 
     def _control_mount(self, command: ReceivedCommand) -> int:
-        """Handle DO_MOUNT_CONTROL, whose last parameter (``command.z``) is the mount mode."""
         gimbal = self._gimbal()
         mode = to_int(command.z)
         if gimbal is None:
@@ -355,7 +341,7 @@ class GimbalCommands:
         if mode == MavMountMode.MAVLINK_TARGETING:
             pitch, roll, yaw = command.param1, command.param2, command.param3
             if abs(pitch) > 90.0 or abs(roll) > 180.0 or abs(yaw) > 360.0:
-                gimbal.warn()
+                self._vehicle.send_text(_WARNING, "Mount: invalid angle targets")
                 return Result.FAILED
             gimbal.point(roll, pitch, yaw, from_north=False)
             return Result.ACCEPTED
@@ -385,7 +371,6 @@ class GimbalCommands:
         return Result.ACCEPTED if is_done else Result.FAILED
 
     def _on_attitude(self, message: m.GimbalManagerSetAttitude, _: Channel) -> None:
-        """Handle GIMBAL_MANAGER_SET_ATTITUDE, which contains angles or rates."""
         gimbal = self._gimbal(message.gimbal_device_id)
         rates = (message.angular_velocity_x, message.angular_velocity_y, message.angular_velocity_z)
         has_angles = not any(map(math.isnan, message.q))
@@ -396,7 +381,6 @@ class GimbalCommands:
         gimbal.manage(message.flags, _degrees(*angles), _degrees(*rates))
 
     def _on_pitch_and_yaw(self, message: m.GimbalManagerSetPitchyaw, _: Channel) -> None:
-        """Handle GIMBAL_MANAGER_SET_PITCHYAW. A message with both angles and rates is ignored."""
         gimbal = self._gimbal(message.gimbal_device_id)
         values = (message.pitch, message.yaw, message.pitch_rate, message.yaw_rate)
         has_angles_and_rates = not any(map(math.isnan, values))

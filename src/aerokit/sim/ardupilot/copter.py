@@ -47,7 +47,6 @@ class MotorTest:
         self._test_number = 0  # number of this test; the timer of an earlier test does nothing
 
     def command(self, command: ReceivedCommand) -> int:
-        """Start a test, or replace the running test. A status text reports the end of the test."""
         if not self.is_running:
             reason = ""
             if not self._copter.is_initialised:
@@ -65,7 +64,6 @@ class MotorTest:
         return MavResult.ACCEPTED
 
     def _duration_s(self, command: ReceivedCommand) -> float:
-        """Return the seconds that the whole test takes. An invalid throttle ends the test at once, after 0 s."""
         throttle_type, throttle = command.param2, command.param3
         if throttle_type == MotorTestThrottleType.THROTTLE_PILOT:
             is_valid = True
@@ -76,7 +74,7 @@ class MotorTest:
             in_percent = (MotorTestThrottleType.THROTTLE_PERCENT, MotorTestThrottleType.COMPASS_CAL)
             is_valid = throttle_type in in_percent and throttle <= 100.0
         if not is_valid:
-            return 0.0
+            return 0.0  # ends the test at once
         seconds_per_motor = max(0.0, min(command.param4, _MAX_MOTOR_TIME_S))
         motor_count = max(1, to_int(command.x))
         return seconds_per_motor * (motor_count + (motor_count - 1) * _PAUSE_SHARE)
@@ -247,7 +245,6 @@ class SimulatedCopter(CopterHost):
             motion.settle()
 
     def _take_off(self, command: ReceivedCommand) -> int:
-        """Handle NAV_TAKEOFF. The vehicle must be armed and on the ground."""
         if command.altitude_frame != MavFrame.GLOBAL_RELATIVE_ALT:
             return MavResult.DENIED
         is_upwards = command.z > self.navigation.altitude_above_home
@@ -264,7 +261,6 @@ class SimulatedCopter(CopterHost):
         return True
 
     def _change_speed(self, command: ReceivedCommand) -> int:
-        """Handle DO_CHANGE_SPEED, which sets a speed limit of the present mode."""
         mode = self.mode
         speed = command.param2
         if not speed > 0:  # also refuses NaN
@@ -284,7 +280,6 @@ class SimulatedCopter(CopterHost):
         return MavResult.ACCEPTED
 
     def _turn(self, command: ReceivedCommand) -> int:
-        """Handle CONDITION_YAW."""
         heading = commanded_heading(command, self.motion.yaw)
         if heading is None:
             return MavResult.FAILED
@@ -296,7 +291,6 @@ class SimulatedCopter(CopterHost):
         return MavResult.ACCEPTED
 
     def _pause_or_continue(self, command: ReceivedCommand) -> int:
-        """Handle DO_PAUSE_CONTINUE."""
         if command.param1 not in (0.0, 1.0):
             return MavResult.DENIED
         is_pause = command.param1 == 0.0

@@ -77,7 +77,6 @@ class _CircleLeg:
         return self._approach is None and self._turned_rad / math.tau >= self._turns
 
     def update(self, dt: float) -> None:
-        """Fly for ``dt`` seconds: first to the circle, then around it."""
         if self._approach is not None:
             self._approach.update(dt)
             if self._approach.is_complete:
@@ -100,7 +99,6 @@ class _CircleLeg:
         )
 
     def _point(self) -> Ned:
-        """Return the point of the circle at the bearing `_angle`."""
         north = self._center_north + self._radius * math.cos(self._angle)
         east = self._center_east + self._radius * math.sin(self._angle)
         return (north, east, self._center_down)
@@ -239,10 +237,6 @@ class CopterAuto(MissionMode):
         return True
 
     def enter(self, *, force: bool) -> bool:
-        """Enter AUTO and return True. Without a mission, return False unless ``force`` is set.
-
-        Even with ``force``, an armed copter on the ground needs a mission that begins with a take-off.
-        """
         copter, run = self.vehicle, self.vehicle.mission
         if copter.mode is self:
             return True  # Arming enters the current mode again, which must not restart the mission.
@@ -262,7 +256,6 @@ class CopterAuto(MissionMode):
         self._update_upcoming()  # records the commands that the next call compares
 
     def update(self, dt: float) -> None:
-        """Continue the mission, and fly the leg of the current command for ``dt`` seconds."""
         self.start_if_waiting()
         if not self.is_waiting:
             if self._update_upcoming() and isinstance(self._leg, _FlyLeg):  # An upload has changed the next commands.
@@ -280,7 +273,7 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.update()
 
     def _update_upcoming(self) -> bool:
-        """Record the current and the next commands. Return True if an upload has changed them."""
+        """Return True if an upload has changed the current or the next commands."""
         run, commands = self.vehicle.mission, self.vehicle.missions.commands
         has_same_index = bool(self._upcoming) and self._upcoming[0].seq == run.nav_index
         if commands.version == self._list_version and has_same_index:
@@ -292,7 +285,6 @@ class CopterAuto(MissionMode):
         return has_changed and has_same_index
 
     def _restart_command(self) -> None:
-        """Start the current command again, because an upload has changed what follows it."""
         run = self.vehicle.mission
         if not run.is_running:
             return
@@ -314,7 +306,6 @@ class CopterAuto(MissionMode):
         self._last_reached = 0
 
     def end_mission(self) -> None:
-        """Hold the position in the air, or disarm on the ground."""
         if self.vehicle.is_landed:
             self.vehicle.arming.disarm()
         else:
@@ -322,7 +313,6 @@ class CopterAuto(MissionMode):
             self.vehicle.yaw.hold()
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
-        """Return True if a running command is complete. Called at each tick."""
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
             return self._has_stayed(index, item.param1)
@@ -346,7 +336,6 @@ class CopterAuto(MissionMode):
         return True
 
     def _has_stayed(self, index: int, seconds: float) -> bool:
-        """Return True, and report it, if the copter has reached a waypoint and has waited there for ``seconds``."""
         if not self._is_leg_complete:
             return False
         if self._reached_at is None:
@@ -358,10 +347,7 @@ class CopterAuto(MissionMode):
         return True
 
     def _land_or_continue(self, index: int) -> bool:
-        """Land and then disarm. Called at each tick.
-
-        Instead of disarming, return True if MIS_OPTIONS lets the mission continue with a take-off.
-        """
+        """Return True if the mission continues with a take-off. Otherwise, land and disarm."""
         copter = self.vehicle
         if isinstance(self._leg, _FlyLeg):  # The copter first flies to the place of the landing.
             if self._leg.is_complete:
@@ -376,7 +362,6 @@ class CopterAuto(MissionMode):
         return False
 
     def _place(self, item: MissionItem) -> Ned:
-        """Return the place of an item. Latitude and longitude 0 mean the present point, z 0 the present height."""
         current: Ned = self.vehicle.motion.place
         if isinstance(self._leg, _FlyLeg) and self._leg.is_complete:
             current = self._leg.destination  # more exact than the copter's position, which differs a little
@@ -398,10 +383,6 @@ class CopterAuto(MissionMode):
         self._leg = _FlyLeg(self, place, stops=stops)
 
     def _fly(self, item: MissionItem) -> None:
-        """Start a leg to the place of an item.
-
-        If a waypoint has no delay and the next command is in `_NO_STOP_IF_FOLLOWED_BY`, the copter does not stop there.
-        """
         run = self.vehicle.mission
         stops = item.command not in (Cmd.NAV_WAYPOINT, Cmd.NAV_SPLINE_WAYPOINT) or item.param1 > 0
         if not stops:
@@ -410,7 +391,6 @@ class CopterAuto(MissionMode):
         self._go(self._place(item), stops=stops)
 
     def _take_off(self, item: MissionItem) -> None:
-        """Start the climb of a take-off command."""
         copter = self.vehicle
         point = copter.world_point(0, 0, item.z, item.frame)  # Only the altitude is used.
         copter.yaw.hold()
@@ -426,7 +406,6 @@ class CopterAuto(MissionMode):
         self._leg = _CircleLeg(self, self._place(item), turns=item.param1, radius=item.param3)
 
     def _land(self, item: MissionItem) -> None:
-        """Start a landing at the place of the command or, if its coordinates are 0, at the present place."""
         self.vehicle.yaw.hold()
         if (item.x, item.y) == (0, 0):
             self._leg = _DescendLeg(self.vehicle)
@@ -455,7 +434,6 @@ class CopterAuto(MissionMode):
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)
 
     def _change_speed(self, item: MissionItem) -> None:
-        """Execute DO_CHANGE_SPEED of a mission."""
         if item.param2 <= 0:  # A value of -1 means no change.
             return
         if item.param1 == SpeedType.CLIMB_SPEED:

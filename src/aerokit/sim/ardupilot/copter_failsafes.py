@@ -25,7 +25,6 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return ()  # `position_reasons` includes these checks, because ArduCopter runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
-        """Return the failures of the first group that has any: GPS (if needed), the mandatory checks."""
         needs_gps = self.vehicle.mode.needs_position or self._fence_needs_position
         return (super().position_reasons() if needs_gps else ()) or self.mandatory_reasons()
 
@@ -38,7 +37,6 @@ class CopterArming(ArduPilotArming[CopterHost]):
         return reasons
 
     def mandatory_reasons(self) -> list[str]:
-        """Return the failures that even a forced arming does not skip: the estimator, no position or altitude."""
         copter, nav = self.vehicle, self.vehicle.navigation
         reasons = list(super().ahrs_reasons())
         is_position_usable = nav.has_position and not copter.failsafes.has_estimator_failed
@@ -59,7 +57,6 @@ class CopterArming(ArduPilotArming[CopterHost]):
         self.vehicle.path.reset()
 
     def final_reasons(self) -> list[str]:
-        """Return the failures of the checks on a request to arm: the mode and the throttle stick."""
         mode = self.vehicle.mode
         if not mode.can_arm:
             return [f"{mode.name} mode not armable"]
@@ -128,7 +125,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self.vehicle.fence.update()
 
     def _check_radio(self) -> None:
-        """Detect the loss of the radio (no pulses for RC_FS_TIMEOUT, or throttle below FS_THR_VALUE) and its return."""
         copter, parameters = self.vehicle, self.vehicle.parameters
         is_receiving = copter.rc.is_receiving
         if is_receiving:
@@ -153,7 +149,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self._set_radio_lost(is_lost=True)
 
     def _set_radio_lost(self, *, is_lost: bool) -> None:
-        """Record that the radio signal was lost or has returned, and act on a loss."""
         if is_lost == self.is_radio_lost:
             return
         self.is_radio_lost = is_lost
@@ -164,7 +159,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self.warn("Radio Failsafe Cleared")
 
     def _check_ground_station(self) -> None:
-        """Detect the loss of the ground station, and its return. Only an armed copter executes FS_GCS_ENABLE."""
         copter, parameters = self.vehicle, self.vehicle.parameters
         if not parameters["FS_GCS_ENABLE"] or math.isnan(self.ground_station_seen_at):
             return
@@ -187,11 +181,7 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return _LINK_ACTIONS[value] if 0 <= value < len(_LINK_ACTIONS) else default
 
     def _action_after_loss(self, name: str, action: int, options: Sequence[tuple[frozenset[str], int, str]]) -> int:
-        """Report the loss of the link ``name`` and return the action to execute.
-
-        This is ``action``, unless the copter disarms on the ground, continues a landing, or one of ``options`` lets
-        the present mode continue. Each option is (names of modes, bit of FS_OPTIONS, status text).
-        """
+        """Report the loss of the link ``name`` and return the action to execute."""
         mode = self.vehicle.mode
         if self._disarm_if_landed(name):
             return _NONE
@@ -209,7 +199,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def act_on_battery(self, action: int) -> None:
-        """Execute the action in the air, or disarm on the ground. With FS_OPTIONS bit 3 a landing continues."""
         if self._disarm_if_landed("Battery"):
             return
         continues_landing = self.vehicle.mode.is_landing and self._has_option(_CONTINUES_LANDING)
@@ -220,7 +209,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self._execute(action)
 
     def _check_estimator(self) -> None:
-        """Detect the loss of the position estimate. A disarmed vehicle only reports the loss."""
         copter = self.vehicle
         if copter.navigation.has_position:
             self._had_position = True
@@ -238,7 +226,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
             self._start_estimator_failsafe()
 
     def _start_estimator_failsafe(self) -> None:
-        """Start the failsafe of the estimator: an armed copter lands, unless its mode needs no position."""
         copter = self.vehicle
         self.warn("EKF variance", MavSeverity.CRITICAL)
         self.has_estimator_failed: bool = True
@@ -253,7 +240,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         self.warn(f"EKF Failsafe: changed to {copter.mode.name} Mode", MavSeverity.CRITICAL)
 
     def _check_idling(self) -> None:
-        """Disarm if the motors have idled on the ground for DISARM_DELAY."""
         copter, delay = self.vehicle, self.vehicle.parameters["DISARM_DELAY"]
         is_idling = copter.is_armed and copter.is_landed and copter.motors.is_idle
         idling_for = self._idling.seconds(is_idling and delay > 0, copter.now)
@@ -268,7 +254,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return action
 
     def _disarm_if_landed(self, name: str) -> bool:
-        """Disarm a landed vehicle and return True. A vehicle in the air, or about to take off, stays armed (False)."""
         copter = self.vehicle
         is_about_to_take_off = copter.mode.needs_mission and not copter.motors.is_idle
         if not copter.is_landed or is_about_to_take_off:
@@ -281,7 +266,6 @@ class CopterFailsafes(ArduPilotFailsafes[CopterHost]):
         return True
 
     def _execute(self, action: int) -> None:
-        """Execute a failsafe action: try its modes in order, until the copter accepts one."""
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
         if action == _AUTO:  # Landing sequences are not simulated, so the search of the firmware fails.
@@ -320,7 +304,6 @@ class CopterFence(ArduPilotFence[CopterHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION in the air. On the ground, disarm, unless FENCE_ACTION only reports."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if vehicle.is_landed:
@@ -346,7 +329,6 @@ class CopterFence(ArduPilotFence[CopterHost]):
         return MavSeverity.WARNING, f"Mode change to {mode.name} failed: in fence recovery"
 
     def on_mode_changed(self) -> None:
-        """Called after every mode change. Suspend the fence's actions for ten seconds, unless they only report."""
         super().on_mode_changed()
         if self.vehicle.parameters["FENCE_ACTION"] != REPORT_ONLY:
             self.recover_by_hand()

@@ -105,7 +105,7 @@ class CopterGuided(CopterModeBase):
         return True
 
     def lean(self, roll: float, pitch: float, climb: float) -> None:
-        """Hold roll and pitch (radians) and a climb rate (m/s). On the ground, a positive climb rate takes off."""
+        """Hold roll and pitch in radians and a climb rate in m/s."""
         self.submode = GuidedSubmode.ATTITUDE
         self._attitude = (roll, pitch)
         self._attitude_climb = climb
@@ -113,10 +113,8 @@ class CopterGuided(CopterModeBase):
         self._updated_at = self.vehicle.now
 
     def rotate(self, roll_rate: float, pitch_rate: float, climb: float) -> None:
-        """Change roll and pitch at rates in radians per second, and climb (m/s).
-
-        The first call starts at the present attitude. Later calls continue from the commanded attitude.
-        """
+        """Change roll and pitch at these rates in rad/s, and climb at a rate in m/s."""
+        # The first call starts at the present attitude. Later calls continue from the commanded attitude.
         if self.submode is not GuidedSubmode.ATTITUDE or self._body_rates is None:
             self._attitude = (self.vehicle.motion.roll, self.vehicle.motion.pitch)
         self.submode = GuidedSubmode.ATTITUDE
@@ -146,7 +144,6 @@ class CopterGuided(CopterModeBase):
         copter.yaw.apply_default()
 
     def update(self, dt: float) -> None:
-        """Follow the target of the present submode for ``dt`` seconds."""
         copter = self.vehicle
         self.is_taking_off = False
         if self._is_paused:
@@ -169,7 +166,6 @@ class CopterGuided(CopterModeBase):
         return self.vehicle.now - self._updated_at > self.vehicle.parameters["GUID_TIMEOUT"]
 
     def _run_attitude(self, dt: float) -> None:
-        """Follow the target attitude and climb rate. A copter on the ground lifts off if it is to climb."""
         copter = self.vehicle
         if self._body_rates is not None and not copter.is_landed:  # The body rates change the commanded attitude.
             roll, pitch = (angle + rate * dt for angle, rate in zip(self._attitude, self._body_rates, strict=True))
@@ -187,7 +183,6 @@ class CopterGuided(CopterModeBase):
         copter.motion.seek_attitude(roll, pitch, -climb)
 
     def _run_target(self) -> None:
-        """Follow a target of position, velocity, acceleration, or position with velocity."""
         motion = self.vehicle.motion
         if self._is_stale:
             self.vehicle.yaw.stop_turning()
@@ -249,7 +244,6 @@ class CopterSetpoints:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
-        """Handle SET_POSITION_TARGET_GLOBAL_INT."""
         if not self._is_guided:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
@@ -286,7 +280,6 @@ class CopterSetpoints:
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
-        """Handle SET_ATTITUDE_TARGET, which contains an attitude or body rates."""
         copter, mask = self._copter, target.type_mask
         guided = copter.mode
         if not isinstance(guided, CopterGuided):

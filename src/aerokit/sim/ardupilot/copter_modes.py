@@ -34,10 +34,7 @@ class AutoYaw:
         self._copter.motion.turn(0.0)
 
     def apply_default(self, *, returning: bool = False) -> None:
-        """Apply WP_YAW_BEHAVIOR: hold (0), look ahead (1), look ahead except when returning home (2).
-
-        This ends a commanded heading or region of interest, so it is called at every new guided target.
-        """
+        """Apply WP_YAW_BEHAVIOR, which ends a commanded heading or region of interest."""
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
         if behaviour == _YAW_AHEAD or (behaviour == _YAW_AHEAD_EXCEPT_RTL and not returning):
             self._control = self._look_ahead
@@ -45,9 +42,9 @@ class AutoYaw:
             self.hold()
 
     def turn_to(self, heading: float, rate: float = 0.0, direction: int = 0) -> None:
-        """Turn to a heading in radians. Positive ``direction``: clockwise; negative: anticlockwise; 0: the shorter way.
+        """Turn to a heading in radians, at a rate in rad/s.
 
-        ``rate`` is the turn rate in radians per second. If it is not positive, the vehicle turns at its default rate.
+        A positive ``direction`` is clockwise, a negative one anticlockwise. 0 takes the shorter way.
         """
         motion = self._copter.motion
         self._heading = wrap_pi(heading)
@@ -70,13 +67,14 @@ class AutoYaw:
         return self._control == self._look_at_roi
 
     def turn(self, rate: float) -> None:
-        """Turn continuously at ``rate`` radians per second."""
+        """Turn continuously at this rate in rad/s."""
         self._rate = rate
         self._control = self._turn
 
     def set_region_of_interest(self, point: Ned | None) -> None:
-        """Face a place until the next target; None ends this. A fitted gimbal turns instead of the copter."""
+        """Face a place. None ends this."""
         gimbal = self._copter.gimbal
+        # A fitted gimbal turns instead of the copter.
         gimbal.look_at(point)
         if point is None:
             self.apply_default()
@@ -86,7 +84,6 @@ class AutoYaw:
             self._control = self._look_at_roi
 
     def stop_turning(self) -> None:
-        """Stop turning because the set-points with a turn rate have stopped."""
         if self._control == self._turn:
             self.hold()
 
@@ -105,7 +102,6 @@ class AutoYaw:
             motion.face(math.atan2(motion.velocity_east, motion.velocity_north))
 
     def _go_to_heading(self) -> None:
-        """Turn to the commanded heading, at first in the commanded direction."""
         motion = self._copter.motion
         offset = wrap_pi(self._heading - motion.yaw)
         if self._rate and math.copysign(1, offset) != math.copysign(1, self._rate):
@@ -194,7 +190,6 @@ class CopterTakeOff:
         self.is_complete: bool = False
 
     def update(self, climb_m_s: float) -> None:
-        """Climb for one tick. The take-off is complete when the copter hovers at the target."""
         copter, motion = self._copter, self._copter.motion
         _, _, target_down = self.target
         copter.motors.spool_up_requested = True
@@ -234,7 +229,7 @@ class CopterPilotedMode(CopterModeBase):
         return True
 
     def climb_from_stick(self) -> float:
-        """Return the climb rate in m/s that the throttle stick commands. The middle holds the altitude."""
+        """Return the climb rate in m/s that the throttle stick commands."""
         stick = self.vehicle.rc[RC_THROTTLE] - _MID_STICK
         if abs(stick) <= _THROTTLE_DEADZONE:
             return 0.0
@@ -242,7 +237,6 @@ class CopterPilotedMode(CopterModeBase):
         return math.copysign(min(1.0, share) * self.vehicle.parameters["PILOT_SPEED_UP"] / 100.0, stick)
 
     def update(self, dt: float) -> None:
-        """Continue a take-off, or follow the sticks."""
         copter = self.vehicle
         if self._take_off is not None:
             self._take_off.update(copter.speed_limit("PILOT_SPEED_UP"))
@@ -262,7 +256,7 @@ class CopterPilotedMode(CopterModeBase):
         copter.motion.turn(yaw * _FULL_STICK_TURN_RAD_S)
 
     def fly(self, roll: float, pitch: float, climb: float) -> None:
-        """Lean as the roll and pitch sticks (-1 to 1) demand, and climb at ``climb`` m/s."""
+        """Follow the roll and pitch sticks (-1 to 1), and climb at ``climb`` m/s."""
         self.vehicle.motion.seek_attitude(roll * _FULL_STICK_LEAN_RAD, pitch * _FULL_STICK_LEAN_RAD, -climb)
 
     def take_off(self, altitude_m: float, *, must_navigate: bool) -> bool:
@@ -335,7 +329,6 @@ class CopterRtl(CopterModeBase):
         self.speed: float = 0.0
 
     def enter(self, *, force: bool) -> bool:
-        """Start the return with a climb. Never refused."""
         copter = self.vehicle
         self._phase = "climb"
         self.is_landing = False
@@ -354,7 +347,7 @@ class CopterRtl(CopterModeBase):
         return True
 
     def _return_altitude(self, distance: float) -> float:
-        """Return the altitude in metres above home at which the copter flies back from ``distance`` metres."""
+        """Return the altitude above home, in metres, of a return over ``distance`` metres."""
         parameters = self.vehicle.parameters
         current = self.vehicle.navigation.altitude_above_home
         after_min_climb = current + parameters["RTL_CLIMB_MIN"] / 100.0
@@ -366,14 +359,12 @@ class CopterRtl(CopterModeBase):
 
     @property
     def destination(self) -> Ned | None:
-        """Target of the current phase."""
         north, east, down = self._place
         if self._phase == "climb":
             return (self.vehicle.motion.north, self.vehicle.motion.east, self._return_down)
         return (north, east, down if self._phase == "land" else self._return_down)
 
     def update(self, dt: float) -> None:
-        """Continue the present phase of the return."""
         copter, target = self.vehicle, self.destination
         if self._phase == "land":
             copter.land()
@@ -384,7 +375,6 @@ class CopterRtl(CopterModeBase):
             self._update_phase(has_arrived=distance < _ARRIVED_M)
 
     def _update_phase(self, *, has_arrived: bool) -> None:
-        """Start the next phase once the present phase is over: climb, return, wait above the place, land."""
         if self._phase == "climb" and has_arrived:
             self._phase = "return"
         elif self._phase == "return" and has_arrived:
@@ -422,8 +412,8 @@ class CopterSmartRtl(CopterModeBase):
             self._way_back[-1] = (north, east, down - metres)
 
     def leave(self) -> None:
-        """Restore the points that were not reached, so that a later SMART_RTL can use them."""
         if self._way_back:
+            # A later SMART_RTL can use the points that were not reached.
             self._raise_last(-_SMART_RTL_EXTRA_ALTITUDE_M)
             self.vehicle.path.restore(self._way_back)
 
@@ -432,7 +422,6 @@ class CopterSmartRtl(CopterModeBase):
         return self._way_back[0] if self._way_back else None
 
     def update(self, dt: float) -> None:
-        """Fly to the next point of the way back, or land at its end."""
         copter = self.vehicle
         if copter.is_landed or not self._way_back:
             self.is_landing: bool = True

@@ -34,7 +34,6 @@ class ArduPilotDevices:
         return bool(self._vehicle.parameters.get(name, 0))
 
     def grip(self, command: ReceivedCommand) -> int:
-        """Move the servo gripper, and acknowledge at once. A text reports the end (AP_Gripper_Servo.cpp)."""
         is_known = command.param2 in (GripperActions.GRAB, GripperActions.RELEASE)
         if not self._is_set("GRIP_ENABLE") or not is_known:
             return Result.FAILED
@@ -46,12 +45,13 @@ class ArduPilotDevices:
         def finish() -> None:
             self._vehicle.info(f"Gripper load {'grabbed' if is_grab else 'released'}")
 
+        # The command is acknowledged at once. A text reports the end of the movement (AP_Gripper_Servo.cpp).
         self._vehicle.call_later(_GRIP_DURATION_S if has_to_move else 0.0, finish)
         self.is_gripped = is_grab
         return Result.ACCEPTED
 
     def move_gear(self, command: ReceivedCommand) -> int:
-        """Retract (param 2 is 1) or deploy the landing gear. As in the firmware, accept it even without one."""
+        # As in the firmware, the command is accepted even without a landing gear.
         is_retraction = command.param2 == 1
         if self._is_set("LGR_ENABLE") and is_retraction is not self.gear_is_up:
             self.gear_is_up = is_retraction
@@ -59,8 +59,8 @@ class ArduPilotDevices:
         return Result.ACCEPTED
 
     def handle_chute(self, command: ReceivedCommand) -> int:
-        """Enable, disable or release the parachute. Like the firmware, accept even a release that has no effect."""
         vehicle = self._vehicle
+        # Like the firmware, accept even a release that has no effect.
         if command.param1 in (ParachuteAction.DISABLE, ParachuteAction.ENABLE):
             if "CHUTE_ENABLED" in vehicle.parameters:
                 vehicle.parameters["CHUTE_ENABLED"] = command.param1
@@ -78,7 +78,6 @@ class ArduPilotDevices:
         return Result.ACCEPTED
 
     def move_winch(self, command: ReceivedCommand) -> int:
-        """Start or stop the winch (MAV_CMD_DO_WINCH)."""
         action, length_m, rate_m_s = to_int(command.param2), command.param3, command.param4
         if not self._is_set("WINCH_TYPE") or action > WinchActions.RATE_CONTROL:
             return Result.FAILED
@@ -106,7 +105,6 @@ class ArduPilotDevices:
         self._schedule_step()
 
     def winch_status(self) -> m.WinchStatus | None:
-        """Return WINCH_STATUS, or None if the vehicle has no winch."""
         if not self._is_set("WINCH_TYPE"):
             return None
         unknown, unknown_temperature, healthy = float("nan"), 0x7FFF, 1

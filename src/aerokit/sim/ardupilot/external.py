@@ -29,11 +29,11 @@ class ArduPilotExternal:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all measurements, because of a reboot."""
         self.latest: dict[type[Message], Message] = {}
         self._navigation_at = self._target_at = -math.inf  # times of the last measurements
         self._target: tuple[float, float] = (0.0, 0.0)  # (north, east) of the landing target
         # Wind speed in m/s, and the direction in degrees from which the wind comes.
+        # The wind has no effect on the flight.
         self.wind: tuple[float, float] | None = None
 
     def listen(self) -> None:
@@ -46,11 +46,10 @@ class ArduPilotExternal:
 
     @property
     def navigation_age_s(self) -> float:
-        """Seconds since the last message of external navigation; infinity before the first one."""
         return self._vehicle.now - self._navigation_at
 
     def velocity_to_target(self) -> tuple[float, float]:
-        """Return the horizontal velocity towards the landing target; zero unless the target was seen recently."""
+        """Return the velocity (north, east) in m/s towards a landing target. It is zero if none was seen recently."""
         if self._vehicle.now - self._target_at > _TARGET_TIMEOUT_S:
             return (0.0, 0.0)
         north, east = self._target
@@ -58,7 +57,6 @@ class ArduPilotExternal:
         return velocity_to_landing_target(north - motion.north, east - motion.east)
 
     def _on_navigation(self, message: Message, _: Channel) -> None:
-        """Store a measurement of position or speed, if the firmware would use it."""
         if not self._vehicle.parameters.get("VISO_TYPE", 0.0):
             return
         frames = (MavFrame.LOCAL_FRD, MavFrame.BODY_FRD)  # The firmware ignores ODOMETRY in other frames.
@@ -71,7 +69,6 @@ class ArduPilotExternal:
         self.latest[type(message)] = message
 
     def _on_target(self, target: m.LandingTarget, _: Channel) -> None:
-        """Store the position of a landing target, if the firmware would use it."""
         parameters, motion = self._vehicle.parameters, self._vehicle.motion
         is_enabled = parameters.get("PLND_ENABLED", 0.0) and parameters.get("PLND_TYPE", 0.0) == _PLND_TYPE_MAVLINK
         if not is_enabled or target.frame not in (MavFrame.BODY_FRD, MavFrame.LOCAL_FRD):
@@ -89,7 +86,6 @@ class ArduPilotExternal:
         self._target_at = self._vehicle.now
 
     def set_wind(self, command: ReceivedCommand) -> int:
-        """Record the wind of EXTERNAL_WIND_ESTIMATE. It has no effect on the flight."""
         if command.param1 < 0 or not 0 <= command.param3 <= 360:
             return MavResult.DENIED
         self.wind = (command.param1, command.param3)

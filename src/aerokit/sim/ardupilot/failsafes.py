@@ -34,7 +34,6 @@ class BatteryFailsafe:
         """Index in ``priorities`` of the most severe action executed so far."""
 
     def update(self) -> None:
-        """Check the battery. A low charge triggers at once, a low voltage after BATT_LOW_TIMER."""
         if not self._vehicle.motors.is_armed:
             return
         level = max(self._level_if_below(_LOW), self._level_if_below(_CRITICAL))
@@ -52,7 +51,6 @@ class BatteryFailsafe:
             self._act(action)
 
     def reason_not_to_arm(self) -> str | None:
-        """Return the text of the first failing arming check, or None."""
         battery, parameters = self._vehicle.battery, self._vehicle.parameters
         if battery.voltage_v < parameters["BATT_ARM_VOLT"]:
             return "Battery 1 below minimum arming voltage"
@@ -70,7 +68,7 @@ class BatteryFailsafe:
         return None
 
     def _level_if_below(self, level: int) -> int:
-        """Return ``level`` if the charge is low, or the voltage has been low for more than BATT_LOW_TIMER s; else 0."""
+        """Return ``level`` if the charge or the voltage is low, otherwise 0."""
         is_voltage_low, is_charge_low = self._low_quantities(level)
         voltage_low_for = self._voltage_low[level].seconds(is_voltage_low, self._vehicle.now)
         timeout = self._vehicle.parameters["BATT_LOW_TIMER"]  # 0 ignores a low voltage.
@@ -78,7 +76,7 @@ class BatteryFailsafe:
         return level if is_charge_low or is_voltage_low_for_long else _OK
 
     def _low_quantities(self, level: int) -> tuple[bool, bool]:
-        """Return whether the voltage, and whether the charge, is below the limit of the level."""
+        """Return (voltage is low, charge is low)."""
         parameters, name = self._vehicle.parameters, _NAMES[level]
         # The value 0 of these parameters means that there is no limit.
         min_volts, min_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
@@ -114,7 +112,6 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def battery_is_low(self) -> bool:
-        """True after the battery of the armed vehicle was low or critical once, even if it has recovered."""
         return self.battery.level > 0
 
     @property
@@ -127,21 +124,18 @@ class ArduPilotFailsafes(Generic[HostT]):
 
     @property
     def is_radio_healthy(self) -> bool:
-        """True if SYS_STATUS reports that the RC receiver is healthy."""
         return not self.is_radio_lost
 
     @property
     def ground_station_silence(self) -> float:
-        """Seconds since the last heartbeat of the ground station; NaN before the first heartbeat."""
+        """Seconds since the ground station was last received. NaN before the first time."""
         return self.vehicle.now - self.ground_station_seen_at
 
     def update(self) -> None:
-        """Run all checks once. The base class checks the battery and the fence."""
         self.battery.update()
         self.vehicle.fence.update()
 
     def act_on_battery(self, action: int) -> None:
-        """Execute the action of BATT_FS_LOW_ACT or BATT_FS_CRT_ACT."""
         raise NotImplementedError
 
     def warn(self, text: str, severity: int = MavSeverity.WARNING) -> None:
@@ -201,7 +195,7 @@ class ArduPilotArming(Generic[HostT]):
         return int(self.vehicle.parameters["ARMING_CHECK"]) == 0
 
     def reasons(self) -> list[str]:
-        """Return the firmware's texts of the failing checks; empty if the vehicle can be armed."""
+        """Return the firmware's texts of the failing checks."""
         if not self.vehicle.is_initialised:
             return ["System not initialised"]
         if self.checks_nothing:
@@ -209,7 +203,6 @@ class ArduPilotArming(Generic[HostT]):
         return [*self.common_reasons(), *self.own_reasons()]
 
     def common_reasons(self) -> list[str]:
-        """Return the texts of the failing checks that all vehicle types share, in ArduPilot's order."""
         vehicle, check = self.vehicle, ArmingCheck
         reasons = list(vehicle.faults.prearm_failures)
         if vehicle.calibrations.is_compass_running:
@@ -233,7 +226,7 @@ class ArduPilotArming(Generic[HostT]):
         return []
 
     def final_reasons(self) -> list[str]:
-        """Return the failures of the checks that run only on a request to arm: the sticks must be centered."""
+        """Return the failures of the checks that run only on a request to arm."""
         options = int(self.vehicle.parameters["RC_OPTIONS"])
         if not self.is_checked(ArmingCheck.RC) or not self.vehicle.rc.is_receiving:
             return []
@@ -248,7 +241,6 @@ class ArduPilotArming(Generic[HostT]):
         return abs(self.vehicle.rc[number - 1] - middle) > dead_zone
 
     def ahrs_reasons(self) -> Sequence[str]:
-        """Return the failures of the estimator checks."""
         nav = self.vehicle.navigation
         if nav.flags is None:
             return ("AHRS: EKF3 not started",)
@@ -257,7 +249,6 @@ class ArduPilotArming(Generic[HostT]):
         return () if nav.is_healthy else ("AHRS: Not healthy",)
 
     def gps_reasons(self) -> Sequence[str]:
-        """Return the failures of the checks of the GPS receiver and of home."""
         nav = self.vehicle.navigation
         flies_without_gps = nav.uses_external and not nav.is_gps_detected
         if nav.fix_type < GpsFixType.TYPE_3D_FIX and not flies_without_gps:
@@ -265,11 +256,9 @@ class ArduPilotArming(Generic[HostT]):
         return () if nav.home is not None else ("AHRS: waiting for home",)
 
     def position_reasons(self) -> Sequence[str]:
-        """Return the failures of the position checks. In the base class every mode needs GPS."""
         return self.gps_reasons() if self.is_checked(ArmingCheck.GPS) else ()
 
     def _check(self) -> None:
-        """Run the arming checks, and report failures if a report is due. Called once a second."""
         self._apply_requirement()
         vehicle = self.vehicle
         if vehicle.motors.is_armed:  # The checks run only while disarmed.
@@ -288,7 +277,6 @@ class ArduPilotArming(Generic[HostT]):
             self._send_reasons("PreArm", reasons)
 
     def report(self) -> None:
-        """Run the checks now and report the failures (MAV_CMD_RUN_PREARM_CHECKS)."""
         reasons = self.reasons()
         self.passes = not reasons
         self._send_reasons("PreArm", reasons)
@@ -299,11 +287,9 @@ class ArduPilotArming(Generic[HostT]):
 
     @property
     def needs_arming(self) -> bool:
-        """False with ARMING_REQUIRE 0, which keeps the vehicle armed."""
         return self.vehicle.parameters.get("ARMING_REQUIRE", 1) != _NOT_REQUIRED
 
     def _apply_requirement(self) -> None:
-        """Arm or disarm when ARMING_REQUIRE has changed."""
         vehicle, is_always_armed = self.vehicle, not self.needs_arming
         if is_always_armed == self._was_always_armed:
             return
@@ -313,7 +299,7 @@ class ArduPilotArming(Generic[HostT]):
             vehicle.set_ticking(True)
 
     def arm(self, *, force: bool = False) -> bool:
-        """Arm and return True. If checks fail, report the failures and return False."""
+        """Arm and return True, or report the failing checks and return False."""
         vehicle = self.vehicle
         reasons = self.mandatory_reasons() if force else self.reasons()
         if not reasons and not force:
@@ -336,11 +322,10 @@ class ArduPilotArming(Generic[HostT]):
         self.on_armed()
         return True
 
-    def on_armed(self) -> None:
-        """Called after arming."""
+    def on_armed(self) -> None: ...
 
     def disarm(self, *, force: bool = True) -> bool:
-        """Stop the motors, even in the air, and return True. With ``force=False``, a vehicle in the air stays armed."""
+        """Stop the motors, even in the air. With ``force=False``, a vehicle in the air stays armed."""
         vehicle = self.vehicle
         if not vehicle.motors.is_armed:
             return True

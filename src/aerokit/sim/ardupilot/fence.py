@@ -39,18 +39,18 @@ class FenceZones:
                     corners = []
 
     def __bool__(self) -> bool:
-        """Return True if there is at least one zone. A return point is not a zone."""
+        # A return point is not a zone.
         return bool(self._inclusions or self._exclusions)
 
     @property
     def smallest_inclusion_m(self) -> float:
-        """Radius of the smallest inclusion circle; infinity if there is none."""
+        """Radius of the smallest inclusion circle."""
         return min((zone.radius for zone in self._inclusions if isinstance(zone, CircleZone)), default=math.inf)
 
     def breach_m(self, place: Point, *, union: bool = False) -> float:
-        """Return the metres beyond the border, which are negative inside the allowed area.
+        """Return the metres beyond the border. They are negative inside the allowed area.
 
-        With ``union``, the allowed area is the union of the inclusion zones, otherwise their intersection.
+        With ``union``, the allowed area is the union of the inclusion zones. Otherwise it is their intersection.
         """
         out_of_inclusions = [zone.outside_m(place) for zone in self._inclusions]
         into_exclusions = [-zone.outside_m(place) for zone in self._exclusions]
@@ -67,7 +67,7 @@ class CircleZone:
         self._center = center
 
     def outside_m(self, place: Point) -> float:
-        """Return the distance from the border in metres; negative inside."""
+        """Return the distance from the border in metres, which is negative inside."""
         return math.dist(place, self._center) - self.radius
 
 
@@ -78,7 +78,7 @@ class PolygonZone:
         self._sides = list(zip(corners, [*corners[1:], corners[0]], strict=True))
 
     def outside_m(self, place: Point) -> float:
-        """Return the distance from the border in metres; negative inside."""
+        """Return the distance from the border in metres, which is negative inside."""
         distance = min(_distance_to_edge(place, start, end) for start, end in self._sides)
         crossings = sum(_crosses(place, start, end) for start, end in self._sides)
         is_inside = crossings % 2 == 1  # A ray from a point inside crosses the border an odd number of times.
@@ -86,7 +86,6 @@ class PolygonZone:
 
 
 def _distance_to_edge(place: Point, start: Point, end: Point) -> float:
-    """Return the distance from a place to the polygon's edge between two corners."""
     place_north, place_east = place
     start_north, start_east = start
     end_north, end_east = end
@@ -100,7 +99,7 @@ def _distance_to_edge(place: Point, start: Point, end: Point) -> float:
 
 
 def _crosses(place: Point, start: Point, end: Point) -> bool:
-    """Return True if a ray from ``place`` to the north crosses the edge from ``start`` to ``end``."""
+    """Return True if a ray from ``place`` to the north crosses the edge."""
     place_north, place_east = place
     start_north, start_east = start
     end_north, end_east = end
@@ -166,12 +165,11 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def configured(self) -> int:
-        """Kinds of fences in FENCE_TYPE, as a bit mask."""
         return int(self.vehicle.parameters["FENCE_TYPE"]) & _ALL
 
     @property
     def present(self) -> int:
-        """Configured kinds of fences that exist: polygons exist once zones are uploaded."""
+        # Polygons exist once zones are uploaded.
         return self.configured if self.zones else self.configured & ~_POLYGON
 
     @property
@@ -194,9 +192,9 @@ class ArduPilotFence(Generic[HostT]):
         return present, enforced, not (present and self.breached)
 
     def enable(self, on: bool, kinds: int = _ALL, *, by_command: bool = True) -> int:
-        """Enable (``on``) or disable those of ``kinds`` that are configured. Return the kinds that changed.
+        """Enable or disable those of ``kinds`` that are configured. Return the kinds that changed.
 
-        ``by_command`` is True for a command of a client, and False for an automatic change of the firmware.
+        ``by_command`` is False for an automatic change of the firmware.
         """
         kinds &= self.configured
         if by_command and kinds & _MIN_ALT:
@@ -210,31 +208,28 @@ class ArduPilotFence(Generic[HostT]):
         return previous ^ self.enabled
 
     def command(self, command: ReceivedCommand) -> int:
-        """Execute DO_FENCE_ENABLE. Param 1 is 0 to disable, 1 to enable, and 2 to disable only the lower limit."""
         kinds = to_int(command.param2) or _ALL  # The value 0 selects all kinds.
         if command.param1 == 1.0:
             if not self.present & kinds:
                 return MavResult.FAILED
             self.enable(True, kinds)
         elif command.param1 in (0.0, 2.0):
+            # The value 2 disables only the lower limit.
             self.enable(False, kinds if command.param1 == 0.0 else _MIN_ALT)
         else:
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
     def on_armed(self) -> None:
-        """Enable the fence if FENCE_AUTOENABLE is 3."""
         if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
             self._floor_enabled_by_command = None
             self.report("auto-enabled", self.enable(True, _ALL & ~_MIN_ALT, by_command=False))
 
     def on_disarmed(self) -> None:
-        """Disable the fence if FENCE_AUTOENABLE is 3."""
         if self._value("FENCE_AUTOENABLE") == _WHEN_ARMED:
             self.report("auto-disabled", self.enable(False, by_command=False))
 
     def _follow_parameters(self) -> None:
-        """Enable or disable the fence if its parameters have changed. Clear breaches of kinds no longer configured."""
         enable = int(self.vehicle.parameters["FENCE_ENABLE"])
         auto_enable = int(self._value("FENCE_AUTOENABLE"))
         if (enable, auto_enable) != self._enabling_parameters:
@@ -243,7 +238,6 @@ class ArduPilotFence(Generic[HostT]):
         self._clear(_ALL & ~self.configured)
 
     def update(self) -> None:
-        """Check the position and react to a new breach."""
         vehicle = self.vehicle
         self._follow_parameters()
         # If no kind is enabled, there is nothing to check, unless the lower limit (`_MIN_ALT`) is configured: `_check`
@@ -263,7 +257,7 @@ class ArduPilotFence(Generic[HostT]):
             self.act(new_breaches)
 
     def _check(self) -> int:
-        """Compare the position with all active limits, and return the kinds of fences with a new breach."""
+        """Return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
         is_floor_kept = self._floor_enabled_by_command is True  # A command has precedence over automatic disabling.
@@ -278,10 +272,7 @@ class ArduPilotFence(Generic[HostT]):
         return new_breaches
 
     def _update_breach(self, kind: int, beyond_m: float) -> bool:
-        """Record whether a limit is breached. Return True for a new breach.
-
-        At a circle or an altitude limit, a breach is new again when the vehicle is the backup distance farther outside.
-        """
+        """Record whether a limit is breached. Return True for a new breach."""
         is_on_border_of_polygon = kind == _POLYGON and beyond_m == 0.0  # The border is still allowed.
         if beyond_m < 0.0 or is_on_border_of_polygon:
             self._clear(kind)
@@ -294,7 +285,7 @@ class ArduPilotFence(Generic[HostT]):
         return True
 
     def _beyond(self, place: Ned) -> dict[int, float]:
-        """Return the distance in metres beyond the limit of each kind; negative values are within the limit."""
+        """Return the metres beyond the limit of each kind. They are negative within the limit."""
         parameters = self.vehicle.parameters
         home_north, home_east, home_down = self.vehicle.navigation.home or (0.0, 0.0, 0.0)
         north, east, down = place
@@ -308,7 +299,6 @@ class ArduPilotFence(Generic[HostT]):
         }
 
     def _enable_floor_above(self) -> None:
-        """Enable the lower limit once the vehicle is FENCE_MARGIN metres above the limit."""
         enable, auto_enable = self._enabling_parameters
         enables_floor = self.configured & _MIN_ALT and (enable or auto_enable > 1)
         is_disabled_by_command = self._floor_enabled_by_command is False
@@ -323,7 +313,6 @@ class ArduPilotFence(Generic[HostT]):
         return not any(self.active & kind and beyond > 0.0 for kind, beyond in self._beyond(place).items())
 
     def _record_breach(self, kind: int) -> None:
-        """Count a new breach of this kind. If none existed before, send FENCE_STATUS, at most once a second."""
         vehicle = self.vehicle
         self.breach_count += 1
         was_any_breached = self.breached != 0
@@ -338,32 +327,27 @@ class ArduPilotFence(Generic[HostT]):
                 vehicle.send(status)
 
     def _clear(self, kinds: int) -> None:
-        """End the breaches of these kinds."""
         self.breached &= ~kinds
         for kind in _NAMES:
             if kinds & kind:
                 self._new_breach_m.pop(kind, None)
 
-    def act(self, new_breaches: int) -> None:
-        """React to a new breach of these kinds while armed."""
+    def act(self, new_breaches: int) -> None: ...
 
     def enter_first(self, modes: Sequence[int]) -> None:
-        """Change to the first of these modes that the vehicle accepts, because of a breach."""
         self.caused_mode = any(self.vehicle.set_mode(mode) for mode in modes)  # stops at the first accepted mode
 
-    def on_cleared(self) -> None:
-        """Called when the last breach has ended."""
+    def on_cleared(self) -> None: ...
 
     def refusal(self, mode: ArduPilotMode) -> tuple[int, str] | None:
-        """Return the severity and the text of the refusal if the fence forbids the mode, otherwise None."""
+        """Return (severity, text) if the fence forbids the mode, otherwise None."""
         return None
 
     def on_mode_changed(self) -> None:
-        """Called after every mode change."""
         self.caused_mode = False
 
     def beyond_m(self, kinds: int) -> float:
-        """Return the distance in metres beyond the limit. Of several ``kinds``, the largest distance counts."""
+        """Return the largest distance beyond the limits of ``kinds``."""
         beyond = self._beyond(self.vehicle.motion.place)
         return max(beyond[kind] for kind in _NAMES if kinds & kind)
 
@@ -373,7 +357,7 @@ class ArduPilotFence(Generic[HostT]):
         return bool(forbidden and self.enabled and self.breached and self.caused_mode)
 
     def recover_by_hand(self) -> None:
-        """Do not react to breaches for ten seconds, because the mode was changed during a breach."""
+        """Suspend the reactions to breaches for ten seconds."""
         if self.breached:
             self._recovering_since = self.vehicle.now
             self.vehicle.info("Manual recovery started")
@@ -382,12 +366,10 @@ class ArduPilotFence(Generic[HostT]):
         return self.vehicle.parameters.get(name, _DEFAULTS[name])
 
     def report(self, event: str, kinds: int) -> None:
-        """Send a text with the names of the kinds and the event. Send nothing if ``kinds`` is 0."""
         if kinds:
             self.vehicle.send_text(MavSeverity.NOTICE, f"{_joined_names(kinds)} {event}")
 
     def reason_not_to_arm(self) -> str | None:
-        """Return the text of the first failing arming check, or None."""
         self._follow_parameters()
         if self.vehicle.parameters["FENCE_ENABLE"] and not self.present:
             return "Fences enabled, but none selected"
@@ -399,7 +381,7 @@ class ArduPilotFence(Generic[HostT]):
         return next((text for failed, text in self._arming_checks() if failed), None)
 
     def _arming_checks(self) -> tuple[tuple[bool, str], ...]:
-        """Return the arming checks in the order of the firmware, each as (True if it fails, text)."""
+        """Return (True if the check fails, text) for each check, in the order of the firmware."""
         parameters = self.vehicle.parameters
         radius, margin = parameters["FENCE_RADIUS"], parameters["FENCE_MARGIN"]
         high, low = self._value("FENCE_ALT_MAX"), self._value("FENCE_ALT_MIN")
@@ -419,7 +401,6 @@ class ArduPilotFence(Generic[HostT]):
         )
 
     def status(self) -> m.FenceStatus | None:
-        """Return FENCE_STATUS; None while the fence is disabled."""
         if not self.enabled:
             return None
         breach = FenceBreach.NONE

@@ -58,7 +58,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     @property
     def open_sessions(self) -> int:
-        """Number of open files; 0 from 3 s after the last reply, because the open file then blocks no other session."""
+        # From 3 s after the last reply, an open file blocks no other session.
         return 0 if self._is_idle() else super().open_sessions
 
     def _is_idle(self) -> bool:
@@ -72,7 +72,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
             self._host.call_later(_WORKER_PERIOD_S, self._work)
 
     def _work(self) -> None:
-        """Process the queued requests until one starts a burst. The end of the burst calls this method again."""
         while self._queue and not self._is_bursting:
             request, channel = self._queue.popleft()
             peer = self._peer(request, channel)
@@ -97,10 +96,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         """Do nothing. The firmware closes an idle session only when another client needs the session."""
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        """Answer a request. First close another session that is idle; refuse the request if that session is in use.
-
-        A request to close sessions is not refused.
-        """
+        # An idle session is closed for another session. A request to close sessions is never refused.
         is_close = request.opcode in (Op.TERMINATESESSION, Op.RESETSESSION)
         if peer.sessions and request.session not in peer.sessions and not is_close:
             if not self._is_idle():
@@ -110,7 +106,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         super()._answer(peer, request)
 
     def _adapted(self, peer: FtpPeer, request: FtpPacket, answer: FtpPacket) -> FtpPacket:
-        """Return the answer with the offset and the data that the firmware sends for this opcode."""
         is_acknowledged = answer.opcode == Op.ACK
         is_transfer = request.opcode in (Op.READFILE, Op.WRITEFILE) and is_acknowledged
         # Only file transfers and directory listings have an offset. In all other replies, the firmware sends 0.
@@ -138,8 +133,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return request.refuse(MavFtpErr.FAIL)
 
     def _path(self, request: FtpPacket) -> str:
-        """Return the path in the request. Its length, with or without the final NUL, must be the request's ``size``."""
         length = len(request.data.partition(b"\0")[0])
+        # The length, with or without the final NUL, must be the request's `size`.
         if request.size == 0 or request.size - length not in (0, 1):
             raise Refused(MavFtpErr.INVALIDDATASIZE)
         return path_in(request.data)
@@ -165,7 +160,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._terminate(peer, request)
 
     def _open(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Open a file. To read a file, first close an idle session. Refuse if a session is still open."""
         is_reading = request.opcode == Op.OPENFILERO
         is_idle = self._host.now - self._sent_at > _SESSION_TIMEOUT_S
         if is_reading and is_idle:  # The client may have missed the reply to its previous request to open a file.
@@ -187,10 +181,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._send_next(peer, session, request, 0)
 
     def _send_next(self, peer: FtpPeer, session: FtpSession, request: FtpPacket, block_number: int) -> None:
-        """Send a block of a burst, and schedule the next block. Other requests wait until the end of the burst.
-
-        The burst ends after `_BURST_BLOCKS` blocks, or earlier with a refusal if no more data can be read.
-        """
         block_size = request.size or DATA_SIZE
         offset = request.offset + block_number * block_size
         sequence = (request.sequence + 1 + block_number) & 0xFFFF
@@ -224,10 +214,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         self._work()
 
     def _entries(self, path: str) -> list[Entry]:
-        """Return the entries of a folder.
-
-        They include `.` and `..`, except in a mount, and in the root also the mounts that ``is_listed`` selects.
-        """
         entries = super()._entries(path)
         if self.files.mounted(path) is not None:
             return entries
@@ -253,7 +239,6 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         return self._unknown(request)
 
     def _rename(self, peer: FtpPeer, request: FtpPacket) -> FtpPacket:
-        """Rename a file. The request contains both names, separated by NUL."""
         old_name, _, remainder = request.data.partition(b"\0")
         new_name, _, _ = remainder.partition(b"\0")
         length = len(old_name) + len(new_name)

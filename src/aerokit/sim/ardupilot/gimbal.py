@@ -17,7 +17,6 @@ from aerokit.mavlink.enums import (
     MavFrame,
     MavMountMode,
     MavResult,
-    MavSeverity,
 )
 from aerokit.mavlink.messages import GlobalPositionInt
 from aerokit.sim.ardupilot.host import ArduPilotHost
@@ -85,9 +84,7 @@ class ArduPilotGimbal:
         return self._vehicle.parameters["MNT1_TYPE"] != 0
 
     def setting(self, name: str) -> float:
-        """Return a parameter, or its default if the parameter table lacks it."""
-        parameters = self._vehicle.parameters
-        return parameters[name] if name in parameters else DEFAULTS[name]
+        return self._vehicle.parameters.get(name, DEFAULTS[name])
 
     @property
     def angles(self) -> tuple[float, float, float]:
@@ -105,7 +102,6 @@ class ArduPilotGimbal:
 
     @property
     def target(self) -> MountTarget:
-        """The direction that the present mode commands."""
         if self.mode == MavMountMode.RC_TARGETING:  # The gimbal's sticks always rest in the middle.
             return MountTarget(self._middle("ROLL"), self._middle("PITCH"), 0.0, self.is_yaw_locked)
         if self.mode in _FIXED_ANGLE_MODES:
@@ -121,7 +117,6 @@ class ArduPilotGimbal:
         return self._moved_by_rates(self._target)
 
     def _moved_by_rates(self, target: MountTarget) -> MountTarget:
-        """Return the target, moved by its rates since it was set. Limit each angle except a yaw from north."""
         if not any(target.rates):
             return target
         seconds = self._vehicle.now - target.set_at
@@ -133,7 +128,7 @@ class ArduPilotGimbal:
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
     def _update_target_for(self, place: Ned | None) -> MountTarget:
-        """Set the target to the angles to a place, if this place and the vehicle's are known. Return the target."""
+        """Point the target at a place, if the place and the vehicle's position are known."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             place_north, place_east, place_down = place
@@ -161,7 +156,8 @@ class ArduPilotGimbal:
             self.mode = mode
 
     def point(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn to these angles in degrees. They are limited here, except a yaw from north, which `angles` limits."""
+        """Turn to these angles in degrees."""
+        # `angles` limits a yaw from north.
         if not from_north:
             yaw = self._limited("YAW", yaw - 360.0 if yaw > 180.0 else yaw)
         self._target = MountTarget(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
@@ -180,7 +176,7 @@ class ArduPilotGimbal:
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def look_at(self, place: Ned | None) -> None:
-        """Point at a place. None returns to the default mode, unless another mode was selected meanwhile."""
+        """Point at a place. None returns to the default mode."""
         self._region = place
         if place is not None:
             self.set_mode(MavMountMode.GPS_POINT)
@@ -188,7 +184,7 @@ class ArduPilotGimbal:
             self.set_mode(int(self.setting("MNT1_DEFLT_MODE")))
 
     def follow(self, system_id: int) -> None:
-        """Point at another vehicle as soon as a position of that vehicle is received."""
+        """Point at another vehicle once its position is received."""
         self._followed_id = system_id
         self._followed_place = None
         self.set_mode(MavMountMode.SYSID_TARGET)
@@ -223,7 +219,7 @@ class ArduPilotGimbal:
             self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
-        """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given. Return the MAV_RESULT."""
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         (_, pitch, yaw), (_, pitch_rate, yaw_rate) = angles, rates
         if flags & GimbalManagerFlags.RETRACT:
@@ -240,12 +236,7 @@ class ArduPilotGimbal:
             return MavResult.FAILED
         return MavResult.ACCEPTED
 
-    def warn(self) -> None:
-        """Send the text about invalid angles, for example to a client that sends hundredths of a degree."""
-        self._vehicle.send_text(MavSeverity.WARNING, "Mount: invalid angle targets")
-
     def attitude_status(self) -> m.GimbalDeviceAttitudeStatus | None:
-        """Return GIMBAL_DEVICE_ATTITUDE_STATUS; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         roll, pitch, yaw = map(math.radians, self.angles)
@@ -265,7 +256,6 @@ class ArduPilotGimbal:
         )
 
     def manager_information(self) -> m.GimbalManagerInformation | None:
-        """Return GIMBAL_MANAGER_INFORMATION; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         limits = (
@@ -276,7 +266,6 @@ class ArduPilotGimbal:
         return m.GimbalManagerInformation(self._vehicle.time_boot_ms, _CAPABILITIES, _DEVICE_ID, *limits)
 
     def manager_status(self) -> m.GimbalManagerStatus | None:
-        """Return GIMBAL_MANAGER_STATUS; None if no gimbal is fitted."""
         if not self.is_fitted:
             return None
         flags = GimbalManagerFlags.ROLL_LOCK | GimbalManagerFlags.PITCH_LOCK
@@ -291,7 +280,7 @@ class ArduPilotGimbal:
 
 
 def _device_flags(gimbal: ArduPilotGimbal) -> int:
-    """Return GIMBAL_DEVICE_FLAGS. They say that yaw is relative to the nose, even if it is locked to north."""
+    # Yaw is relative to the nose, even if it is locked to north.
     flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
     if gimbal.mode == MavMountMode.RETRACT:
         flags |= GimbalDeviceFlags.RETRACT

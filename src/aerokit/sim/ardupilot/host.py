@@ -59,14 +59,14 @@ class ArduPilotMode:
     def enter(self, *, force: bool) -> bool:
         """Send the entry texts and start the mode. Return False to refuse it.
 
-        With ``force``, as while disarmed, subclasses may accept a mode that cannot run yet.
+        With ``force``, a subclass may accept a mode that cannot run yet. The vehicle forces a mode while it is
+        disarmed.
         """
         for text in self.entry_texts:
             self.vehicle.send_text(self.entry_severity, text)
         return self.is_available
 
-    def leave(self) -> None:
-        """Called when another mode has been entered."""
+    def leave(self) -> None: ...
 
     def update(self, dt: float) -> None:
         """Set the targets of motors and motion for the next ``dt`` seconds."""
@@ -97,7 +97,7 @@ class ArduPilotMode:
 def variant(
     make_mode: Callable[[HostT], ArduPilotMode], number: int, name: str, **traits: Any
 ) -> Callable[[HostT], ArduPilotMode]:
-    """Return a function that makes a variant of a mode: with another number and name, and the attributes ``traits``."""
+    """Return a factory for a mode with another number and name. ``traits`` are attributes to set."""
 
     def make_variant(host: HostT) -> ArduPilotMode:
         mode = make_mode(host)
@@ -118,10 +118,7 @@ class ConditionTimer:
         self._since: float | None = None
 
     def seconds(self, condition: bool, now: float) -> float:
-        """Return the seconds since the condition became true, or 0 while the condition is false.
-
-        The first call with ``condition`` True returns 0.
-        """
+        """Return the seconds since ``condition`` became true, or 0 while it is false."""
         if not condition:
             self._since = None
         elif self._since is None:
@@ -163,18 +160,15 @@ class ArduPilotMotors:
 
     @property
     def is_idle(self) -> bool:
-        """True while the motors are stopped or turn at idle speed."""
         return self.spool <= 0.0
 
     @property
     def current_a(self) -> float:
-        """Current in amperes of motors and electronics; 0 while disarmed."""
         electronics_a = _ELECTRONICS_A if self.is_armed else 0.0
         return electronics_a + self.throttle * _AMPERES_AT_FULL
 
     @property
     def pwm(self) -> int:
-        """Pulse width of each motor in SERVO_OUTPUT_RAW (µs). It is minimal until the arming delay is over."""
         if not (self.is_armed and self.may_turn):
             return _STOPPED_PWM
         return round(_IDLE_PWM + 20 * self.spool + self.throttle * (_FULL_PWM - _IDLE_PWM) * 1.3)
@@ -188,7 +182,6 @@ class ArduPilotMotors:
         self.spool = self.throttle = 0.0
 
     def update(self, now: float, dt: float, motion: Any, *, landed: bool) -> None:
-        """Advance the spool-up and the throttle by ``dt`` seconds. ``motion`` is the vehicle's motion model."""
         self.may_turn = self.is_armed and now - self.armed_at >= _ARMING_DELAY_S
         if self.may_turn and self.spool_up_requested:
             if self.spool < 1.0:
@@ -262,7 +255,7 @@ class ArduPilotMissionHost(Protocol):
     def stop(self) -> None: ...
     def reset(self) -> None: ...
     def on_disarmed(self) -> None: ...
-    def clear(self) -> None: ...
+    def on_cleared(self) -> None: ...
     def message(self, seq: int | None = None) -> m.MissionCurrent: ...
 
 

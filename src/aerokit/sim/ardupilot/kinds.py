@@ -23,7 +23,7 @@ def parameters_of(kind: Kind, count: int | None = None) -> SimParameters:
 
 
 def rows_of(kind: Kind, file: str) -> Iterator[list[str]]:
-    """Yield the rows for ``kind`` of a table whose last column names the firmware. The last column is cut off."""
+    """Yield the rows for ``kind``, without their last column, which names the kinds."""
     for line in _read(file).splitlines():
         *row, kinds = line.split(",")
         if kinds == "all" or kind in kinds.split():

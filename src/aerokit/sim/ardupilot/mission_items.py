@@ -16,6 +16,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 
 _MAX_ALTITUDE_M = 83000.0
@@ -76,15 +77,12 @@ def command_name(command: int) -> str:
 
 
 def has_location(command: int) -> bool:
-    """Return True if ``x``, ``y`` and ``z`` of a command are a position."""
     return STORED_COMMANDS.get(command, _UNKNOWN).has_place
 
 
 def check_place(latitude_e7: float, longitude_e7: float) -> int:
-    """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate.
-
-    Like the firmware, the function compares in single precision.
-    """
+    """Return ACCEPTED, or the MAV_MISSION_RESULT of the invalid coordinate."""
+    # Like the firmware, compare in single precision.
     if not abs(float32(latitude_e7)) <= 900_000_000:  # `not <=` also refuses NaN.
         return MavMissionResult.INVALID_PARAM5_X
     in_range = abs(float32(longitude_e7)) <= 1_800_000_000
@@ -92,7 +90,7 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the MAV_FRAME that a download reports after an upload with ``frame``. None: ``frame`` is refused."""
+    """Return the MAV_FRAME that a download reports after an upload with ``frame``. None refuses the upload."""
     return _DOWNLOADED_FRAMES.get(frame)
 
 
@@ -148,10 +146,8 @@ def _stored_place(item: MissionItem) -> tuple[float, float, float, int] | int:
 
 
 def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
-    """Return params 1 to 4 of NAV_LOITER_TURNS as stored. The number of turns and the radius have one byte each.
-
-    A number of turns below 1 is stored in units of 1/256, a radius above 255 m in units of 10 m.
-    """
+    """Return params 1 to 4 of NAV_LOITER_TURNS as stored."""
+    # The number of turns and the radius have one byte each.
     turns, radius = item.param1, abs(item.param3)
     turn_unit = 1 / 256 if 0 < turns < 1 else 1
     turn_byte = int(min(255.0, turns / turn_unit)) & 0xFF  # The mask keeps only the lowest byte of a negative number.
@@ -160,11 +156,6 @@ def _stored_turns(item: MissionItem) -> tuple[float, float, float, float]:
     sign = -1.0 if item.param3 < 0 else 1.0
     exits_at_tangent = float(item.param4 > 0)
     return (turn_byte * float(turn_unit), 0.0, sign * radius_byte * radius_unit, exits_at_tangent)
-
-
-def to_int(value: float) -> int:
-    """Truncate a number towards zero, like C. Values beyond 32 bits become 0."""
-    return int(value) if abs(value) < 2**31 else 0
 
 
 def _whole_within(value: float, low: int, high: int) -> int:

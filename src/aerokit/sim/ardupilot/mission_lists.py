@@ -13,7 +13,8 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame, MavMissionResult
 from aerokit.missions import MissionItem
 from aerokit.sim.ardupilot.kinds import Kind
-from aerokit.sim.ardupilot.mission_items import altitude_frame, as_stored, check_place, to_int
+from aerokit.sim.ardupilot.mission_items import altitude_frame, as_stored, check_place
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 
 _MIN_RALLY_M, _MAX_RALLY_M = -32768, 32767
@@ -34,7 +35,6 @@ class ItemList:
         raise NotImplementedError
 
     def items(self) -> list[MissionItem]:
-        """Return all items that a download sends."""
         items_or_results = [self.item(seq) for seq in range(self.count)]
         return [item for item in items_or_results if not isinstance(item, int)]
 
@@ -49,15 +49,14 @@ class ItemList:
         """Start a partial upload."""
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Store an uploaded item and return the MAV_MISSION_RESULT. ``last`` is the upload's last sequence number."""
+        """Store an uploaded item. ``last`` is the upload's last sequence number."""
         raise NotImplementedError
 
     def finish(self, warn: Callable[[str], None]) -> int:
-        """Complete an upload and return the MAV_MISSION_RESULT. ``warn`` sends a status text."""
+        """Complete an upload. ``warn`` sends a status text."""
         return MavMissionResult.ACCEPTED
 
-    def abandon(self) -> None:
-        """Abort an upload."""
+    def abandon(self) -> None: ...
 
     def clear(self) -> bool:
         """Delete all items. Return False if this is not allowed at present."""
@@ -89,11 +88,10 @@ class CommandList(ItemList):
         return self._commands[seq] if seq < len(self._commands) else MavMissionResult.INVALID_SEQUENCE
 
     def command(self, index: int) -> MissionItem | None:
-        """Return the command at this index. Return None for home and for an index beyond the end."""
         return self._commands[index] if 0 < index < len(self._commands) else None
 
     def add_home(self) -> None:
-        """Add home as item 0 of an empty mission. Called when home is set."""
+        """Add home as item 0 of an empty mission."""
         if not self._commands:
             self._commands.append(self._home())
 
@@ -102,7 +100,6 @@ class CommandList(ItemList):
         self.version += 1
 
     def put(self, seq: int, item: MissionItem, last: int) -> int:
-        """Replace or append an item. Item 0 of a list that is not empty is checked, but not stored: it is home."""
         stored_item = as_stored(item, self._kind)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
@@ -114,7 +111,6 @@ class CommandList(ItemList):
         return target != 0 and (target < self.count or target <= last)
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
-        """Store an item at index ``seq``, or append it. Return a MAV_MISSION_RESULT."""
         count = len(self._commands)
         # A list with space only for home refuses every item, even item 0, although it would need no space.
         has_space = self.capacity > 1 and seq < self.capacity
@@ -124,7 +120,7 @@ class CommandList(ItemList):
             # Home comes first, so in an empty list, even item 0 is stored as item 1 (AP_Mission.cpp, add_cmd).
             self.add_home()
             self._commands.append(stored_item)
-        elif seq != _HOME_SEQ:
+        elif seq != _HOME_SEQ:  # Item 0 is home, which is not stored.
             self._commands[seq] = stored_item
         self.version += 1
         return MavMissionResult.ACCEPTED
@@ -136,7 +132,7 @@ class CommandList(ItemList):
         return True
 
     def write_file(self, items: list[MissionItem], start: int) -> int:
-        """Store the items of an uploaded file, and return the MAV_MISSION_RESULT. Stop at the first refused item."""
+        """Store the items of an uploaded file. Stop at the first refused item."""
         for seq, item in enumerate(items):
             stored_item = as_stored(item, self._kind)
             if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
@@ -165,10 +161,10 @@ class RallyList(ItemList):
         return len(self._points)
 
     def item(self, seq: int) -> MissionItem | int:
-        """Return a rally point. A point at latitude 0 and longitude 0 counts as missing."""
         if seq >= len(self._points):
             return MavMissionResult.INVALID_SEQUENCE
         point = self._points[seq]
+        # A point at latitude 0 and longitude 0 counts as missing.
         return MavMissionResult.INVALID_SEQUENCE if (point.x, point.y) == (0, 0) else point
 
     def begin(self, count: int) -> None:
@@ -189,7 +185,6 @@ class RallyList(ItemList):
 
 
 def _stored_rally_point(item: MissionItem) -> MissionItem | int:
-    """Return an item as the firmware stores it, or the MAV_MISSION_RESULT of its refusal."""
     if item.command != Cmd.NAV_RALLY_POINT:
         return MavMissionResult.UNSUPPORTED
     result = check_place(item.x, item.y)
@@ -269,7 +264,7 @@ class FenceList(ItemList):
         return True
 
     def store(self, items: Sequence[MissionItem], warn: Warn) -> int:
-        """Store a fence, or ``warn`` if it is invalid or too large. Return the MAV_MISSION_RESULT."""
+        """Store a fence, or ``warn`` if it is invalid or too large."""
         problem = _fence_problem(items)
         if problem is not None:
             warn(problem)
@@ -292,7 +287,6 @@ class FenceList(ItemList):
 
 
 def _stored_fence_item(item: MissionItem) -> MissionItem | int:
-    """Return an item as the firmware stores it, or the MAV_MISSION_RESULT of its refusal."""
     if item.frame == MavFrame.MISSION or altitude_frame(item.frame) is None:
         return MavMissionResult.UNSUPPORTED_FRAME
     size = 0.0
@@ -308,7 +302,7 @@ def _stored_fence_item(item: MissionItem) -> MissionItem | int:
 
 
 def _fence_problem(items: Sequence[MissionItem]) -> str | None:
-    """Return the text that the firmware sends about an invalid fence; None if the fence is valid."""
+    """Return the firmware's text about an invalid fence."""
     polygon_type = 0  # command of the vertices of the current polygon
     vertices = 0.0  # number of vertices of the current polygon
     missing = 0  # number of vertices that must still follow
@@ -344,7 +338,6 @@ def _number(command: int) -> int:
 
 
 def _storage_needed(items: Sequence[MissionItem]) -> int:
-    """Return the number of bytes that ArduPilot needs to store a fence."""
     size, vertices_left = 4, 0  # The header has four bytes.
     for item in items:
         size += _BYTES_PER_POINT

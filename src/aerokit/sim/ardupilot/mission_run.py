@@ -61,7 +61,6 @@ class MissionMode(ArduPilotMode):
         self.handlers: dict[int, Callable[[MissionItem], None]] = {}
 
     def on_disarmed(self) -> None:
-        """Called after the motors have stopped."""
         # Disarming has reset the progress. If the mission is unfinished, `update` starts its first command again, and
         # the disarmed vehicle waits on the ground.
         if self.vehicle.mode is self:
@@ -72,7 +71,7 @@ class MissionMode(ArduPilotMode):
         self.vehicle.mission.stop()
 
     def wait_for_origin(self) -> None:
-        """Start the mission as soon as the estimator has an origin, even while the vehicle is disarmed."""
+        """Start the mission as soon as the estimator has an origin."""
         self.is_waiting = True
         self.vehicle.call_later(0.0, self.start_if_waiting)
 
@@ -83,8 +82,7 @@ class MissionMode(ArduPilotMode):
             vehicle.mission.start_or_resume()
             self.on_mission_started()
 
-    def on_mission_started(self) -> None:
-        """Called after the mission has started or resumed in this mode."""
+    def on_mission_started(self) -> None: ...
 
     def is_complete(self, index: int, item: MissionItem) -> bool:
         """Return True as soon as the command is complete. Called at every tick."""
@@ -107,7 +105,6 @@ class MissionMode(ArduPilotMode):
 
 
 def is_navigation(item: MissionItem) -> bool:
-    """Return True for a navigation command. Only one navigation command runs at a time."""
     return item.command <= Cmd.NAV_LAST or item.command in _NAVIGATION_BEYOND
 
 
@@ -126,8 +123,7 @@ class MissionRun:
 
     @property
     def is_present(self) -> bool:
-        """True if the mission contains a command besides home."""
-        return self._list.count > 1
+        return self._list.count > 1  # Item 0 is home.
 
     @property
     def is_running(self) -> bool:
@@ -135,12 +131,10 @@ class MissionRun:
 
     @property
     def is_being_flown(self) -> bool:
-        """True while the mission runs with armed motors. The mission cannot be cleared meanwhile."""
         return self.is_running and self._vehicle.motors.is_armed
 
     @property
     def state(self) -> int:
-        """MISSION_STATE of MISSION_CURRENT."""
         if not self.is_present:
             return MissionState.NO_MISSION
         is_paused = self.is_running and self._mode.is_paused
@@ -152,7 +146,6 @@ class MissionRun:
         return max(0, self._list.count - 1)
 
     def message(self, seq: int | None = None) -> MissionCurrent:
-        """Build MISSION_CURRENT with the index of the current command, or with ``seq`` if given."""
         seq = self.nav_index if seq is None else seq
         return MissionCurrent(seq, self.count, self.state, int(self._vehicle.mode.needs_mission))
 
@@ -162,14 +155,14 @@ class MissionRun:
         return self.is_take_off(first_index)
 
     def is_take_off(self, index: int) -> bool:
-        """Return True if the first navigation command from ``index`` on, apart from delays, is a take-off."""
+        """Return True if the first navigation command from ``index`` on is a take-off. Delays are skipped."""
         for _, item in self.navigation_from(index):
             if item.command not in _BEFORE_TAKE_OFF:
                 return item.command in _TAKE_OFFS
         return False
 
     def navigation_from(self, index: int) -> Iterator[MissionCommand]:
-        """Yield the next navigation commands in the order of execution (with jumps), at most `_MAX_LOOK_AHEAD`."""
+        """Yield the next navigation commands in the order of execution, with jumps."""
         for _ in range(_MAX_LOOK_AHEAD):  # Jumps may form an endless loop.
             command = self._next_navigation(index)
             if command is None:
@@ -178,7 +171,7 @@ class MissionRun:
             index = command.seq + 1
 
     def _next_navigation(self, index: int) -> MissionCommand | None:
-        """Return the next navigation command from ``index`` on. None if there is none, or jumps form a loop."""
+        """Return the next navigation command from ``index`` on."""
         for _ in range(1 + _MAX_STEPS):
             command = self._next(index, count_jumps=False)
             if command is None or is_navigation(command.item):
@@ -191,7 +184,7 @@ class MissionRun:
         return self._vehicle.parameters["MIS_RESTART"] == 1
 
     def start_or_resume(self) -> None:
-        """Start the mission again or resume it, as MIS_RESTART selects. A complete mission starts again."""
+        """Start the mission again or resume it, as MIS_RESTART selects."""
         can_resume = self._state != MissionState.COMPLETE and self._list.command(self.nav_index) is not None
         if self._restarts or not can_resume:
             self._start()
@@ -202,19 +195,17 @@ class MissionRun:
             self.set_current(resume_index)
 
     def _start(self) -> None:
-        """Start the mission at its first command. A mission without a navigation command is complete at once."""
         self._state = MissionState.ACTIVE
         self.reset()
         if not self._start_next_navigation():
             self._complete()
 
     def stop(self) -> None:
-        """Set the state to NOT_STARTED after a mode change, but keep the progress for `start_or_resume`."""
+        """Stop the mission. `start_or_resume` can resume it."""
         if self.is_running:
             self._state = MissionState.NOT_STARTED
 
     def reset(self) -> None:
-        """Reset progress and jump counters, e.g. because the vehicle was disarmed."""
         self.nav_index = 0
         self._forget_running()
         self._jumps.clear()
@@ -227,8 +218,7 @@ class MissionRun:
         self.reset()
         self._vehicle.call_later(0.0, self._mode.on_disarmed)
 
-    def clear(self) -> None:
-        """Called when the mission has been cleared."""
+    def on_cleared(self) -> None:
         self.reset()
         self._state = MissionState.NOT_STARTED
 
@@ -249,10 +239,7 @@ class MissionRun:
         return self._set_resume_index(index)
 
     def _set_resume_index(self, index: int) -> bool:
-        """Let a stopped mission resume at the next navigation command from ``index`` on. Return False if there is none.
-
-        If "do" commands precede the navigation command, the mission resumes at the first of them.
-        """
+        """Let a stopped mission resume at the next navigation command. Return False if there is none."""
         for _ in range(_MAX_STEPS):
             command = self._next(index, count_jumps=True)
             if command is None:
@@ -263,6 +250,7 @@ class MissionRun:
                 self._state = MissionState.NOT_STARTED  # Only a COMPLETE mission would start again from its beginning.
                 return True
             if self._running_do is None:
+                # The mission resumes at the first "do" command in front of the navigation command.
                 self._running_do = command
                 self._last_do_index = command.seq
             index = command.seq + 1
@@ -270,7 +258,6 @@ class MissionRun:
         return False
 
     def update(self) -> None:
-        """Check whether the running commands are complete, and start the next commands."""
         if not self.is_running or not self._list.count:
             return
         if self._running_nav is None or self._is_complete(self.nav_index, self._running_nav):
@@ -284,10 +271,9 @@ class MissionRun:
             self._running_do = None
 
     def _start_next_navigation(self, start: int = 0) -> bool:
-        """Start the next navigation command. If "do" commands precede it, also start the first of them.
+        """Start the next navigation command. Return False if there is none.
 
-        The search begins at the index ``start`` or, if that is 0, after the current navigation command. Return False if
-        it finds no navigation command.
+        The search begins at the index ``start``. If that is 0, it begins after the current command.
         """
         index_after_current = self.nav_index + 1 if self.nav_index else _FIRST
         index = start or index_after_current
@@ -309,7 +295,6 @@ class MissionRun:
         return False
 
     def _start_next_do(self) -> None:
-        """Start the next "do" command, if one is left in front of the next navigation command."""
         if not self._last_do_index:
             return
         command = self._next(self._last_do_index + 1, count_jumps=False)
@@ -341,7 +326,7 @@ class MissionRun:
     def _next(self, index: int, *, count_jumps: bool) -> MissionCommand | None:
         """Return the first command at or after ``index``. Jump commands are followed, not returned.
 
-        With ``count_jumps``, each followed jump uses up one of its repetitions. Without, the call only looks ahead.
+        With ``count_jumps``, each followed jump uses up one of its repetitions.
         """
         first_jump = 0  # Index of the first jump command that was followed; 0 before that.
         for _ in range(_MAX_JUMPS):
@@ -361,7 +346,7 @@ class MissionRun:
         return None
 
     def _jump_target(self, item: MissionItem) -> int:
-        """Return the index to which a jump command leads; 0 if its tag does not exist."""
+        """Return the index to which a jump command leads, or 0 if its tag does not exist."""
         if item.command == Cmd.DO_JUMP:
             return int(item.param1)
         for index in range(_FIRST, self._list.count):
@@ -371,9 +356,9 @@ class MissionRun:
         return 0
 
     def _use_jump(self, index: int, *, times: int, count_jumps: bool) -> bool:
-        """Return True if the jump command at ``index``, which jumps ``times`` times, has repetitions left.
+        """Return True if the jump command at ``index`` has repetitions left.
 
-        With ``count_jumps``, use up one of the repetitions.
+        With ``count_jumps``, use up one of them.
         """
         jumps_done = self._jumps.get(index, 0)
         if times != _UNLIMITED and jumps_done >= times:
@@ -389,7 +374,7 @@ class MissionRun:
 
 
 def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
-    """Return the horizontal distance to a place in metres, or 0 if ``place`` is None."""
+    """Return the horizontal distance in metres, or 0 without a place."""
     if place is None:
         return 0.0
     north, east, _ = place
@@ -397,7 +382,7 @@ def horizontal_distance(vehicle: ArduPilotHost, place: Ned | None) -> float:
 
 
 def set_home_from(vehicle: ArduPilotHost, item: MissionItem) -> None:
-    """Execute DO_SET_HOME with the item's position, or the vehicle's if param 1 is 1 or the item has no position."""
+    """Execute DO_SET_HOME of a mission."""
     point: Ned | None = vehicle.motion.place
     if item.param1 != 1 and (item.x, item.y, item.z) != (0, 0, 0):
         point = vehicle.world_point(int(item.x), int(item.y), item.z, item.frame)

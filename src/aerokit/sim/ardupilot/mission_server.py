@@ -26,9 +26,10 @@ from aerokit.protocols.servers.missions import (
     item_message_int,
 )
 from aerokit.sim.ardupilot.host import ArduPilotHost
-from aerokit.sim.ardupilot.mission_items import as_stored, has_location, to_int
+from aerokit.sim.ardupilot.mission_items import as_stored, has_location
 from aerokit.sim.ardupilot.mission_lists import CommandList, FenceList, ItemList, RallyList
 from aerokit.sim.channel import Channel
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 from aerokit.sim.vehicle import sender_of
 
@@ -66,20 +67,15 @@ class ArduPilotMissionServer(MissionServer):
         self._vehicle.on(m.MissionWritePartialList, self._on_write_partial_list)
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """Return the items that a download sends. A mission begins with home. An unknown type has no items."""
         items = self._lists.get(mission_type)
         return [] if items is None else items.items()
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store a list of items that was uploaded as a file, and return the MAV_MISSION_RESULT.
-
-        A mission is stored from index ``start`` on. Without ``clear``, its other items are kept. A fence and rally
-        points are always replaced as a whole: ``start`` is ignored, and without ``clear`` the result is ERROR.
-        """
         if mission_type == MavMissionType.MISSION:
             if clear:  # Like the firmware, continue with a running mission, which cannot be cleared.
                 self._clear_list(self.commands)
             return self.commands.write_file(list(items), start)
+        # A fence and rally points are always replaced as a whole.
         if not clear:
             return Result.ERROR
         if mission_type == MavMissionType.FENCE:
@@ -92,7 +88,6 @@ class ArduPilotMissionServer(MissionServer):
         return Result.ACCEPTED
 
     def _home(self) -> MissionItem:
-        """Return home as item 0 of a download; zeros if home is unknown."""
         home = self._vehicle.navigation.home
         if home is None:
             return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
@@ -104,14 +99,13 @@ class ArduPilotMissionServer(MissionServer):
         self._vehicle.send_text(MavSeverity.WARNING, text)
 
     def _warn_once(self, message: AnyItem | m.MissionRequest, text: str) -> None:
-        """Send a warning about the class of ``message``, at most once for each transfer of a mission type."""
+        """Warn about the class of ``message``, at most once in a transfer."""
         warning = (type(message), message.mission_type)
         if warning not in self._warnings:
             self._warnings.add(warning)
             self._warn(text)
 
     def capacity(self, mission_type: int) -> int:
-        """Return the capacity of a list. The capacity of the mission is 0 until the vehicle is initialised."""
         if mission_type == MavMissionType.MISSION and not self._vehicle.is_initialised:
             return 0
         return self._lists[mission_type].capacity
@@ -123,7 +117,6 @@ class ArduPilotMissionServer(MissionServer):
         return mission_type
 
     def _refusal(self, message: AnyListMessage, channel: Channel) -> int | None:
-        """Return the MAV_MISSION_RESULT with which a message is refused; None if it is not."""
         kind = message.mission_type
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
@@ -148,7 +141,6 @@ class ArduPilotMissionServer(MissionServer):
         return self._lists[mission_type].item(seq)
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
-        """Return the message that answers a request: MISSION_ITEM_INT or MISSION_ITEM."""
         client, kind = sender_of(request), request.mission_type
         # This reproduces a bug of the firmware, which compares the command of the item, instead of its index, with the
         # index of the current item.
@@ -167,13 +159,11 @@ class ArduPilotMissionServer(MissionServer):
         self._warn(f"Only {self.capacity(message.mission_type)} items are supported")
 
     def _register_upload(self, message: AnyListMessage, channel: Channel, first: int, end: int) -> ListUpload:
-        """Prepare the list for an upload. ``first`` and ``end`` are the range of the uploaded items."""
         if isinstance(message, m.MissionCount):
             self._lists[message.mission_type].begin(message.count)
         return super()._register_upload(message, channel, first, end)
 
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
-        """Start the upload of some items of a list."""
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
         # `end` may be equal to the number of items, because the item with this index is appended to the list.
@@ -205,7 +195,6 @@ class ArduPilotMissionServer(MissionServer):
         super()._time_out(upload)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        """Handle an item of an upload, or one that is a target in GUIDED."""
         item = _with_integer_position(message)
         kind = message.mission_type
         if isinstance(item, int):  # The position is refused with this MAV_MISSION_RESULT.
@@ -238,7 +227,6 @@ class ArduPilotMissionServer(MissionServer):
         """Do nothing: ArduPilot ignores this message."""
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        """Handle MISSION_CLEAR_ALL. A list that another client uploads is not cleared."""
         kind, client = request.mission_type, sender_of(request)
         upload = self._uploads.get(kind)
         result: int = Result.UNSUPPORTED
@@ -253,18 +241,17 @@ class ArduPilotMissionServer(MissionServer):
         self._acknowledge(client, kind, result, channel)
 
     def _on_set_current(self, request: m.MissionSetCurrent, channel: Channel) -> None:
-        """Set the current item. Answer MISSION_CURRENT with the requested index, even if the mission skips it."""
         if self._vehicle.mission.set_current(request.seq):
+            # The firmware answers with the requested index, even if the mission skips it.
             self._vehicle.send(self._vehicle.mission.message(request.seq), channel)
 
     def _clear_list(self, items: ItemList) -> bool:
         is_cleared = items.clear()
         if is_cleared and items is self.commands:
-            self._vehicle.mission.clear()
+            self._vehicle.mission.on_cleared()
         return is_cleared
 
     def _guide(self, item: MissionItem, current: int) -> int:
-        """Handle an item that is a target for GUIDED, because of the special value of its field ``current``."""
         stored_item = as_stored(item, self._vehicle.KIND)
         if isinstance(stored_item, int):  # The item is refused with this MAV_MISSION_RESULT.
             return stored_item
@@ -280,10 +267,7 @@ class ArduPilotMissionServer(MissionServer):
 
 
 def _with_integer_position(message: AnyItem) -> MissionItem | int:
-    """Return the item with x and y as integers, or the MAV_MISSION_RESULT of an invalid position.
-
-    Like the firmware, convert the degrees of a MISSION_ITEM in single precision.
-    """
+    """Return the item with integers x and y, or the MAV_MISSION_RESULT of an invalid position."""
     item = item_from(message)
     if isinstance(message, m.MissionItemInt):
         return item
@@ -293,4 +277,5 @@ def _with_integer_position(message: AnyItem) -> MissionItem | int:
         return Result.INVALID_PARAM5_X
     if not abs(item.y) <= 180.0:
         return Result.INVALID_PARAM6_Y
+    # Like the firmware, convert the degrees in single precision.
     return item.replace(x=int(float32(item.x * _DEGREE)), y=int(float32(item.y * _DEGREE)))

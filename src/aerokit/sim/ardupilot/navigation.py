@@ -45,7 +45,6 @@ class ArduPilotNavigation:
         self._watches_gps = False  # True from the time at which the first fix is expected
 
     def start(self) -> None:
-        """Schedule the events of the boot timeline."""
         timeline, call_later = self._vehicle.timeline, self._vehicle.call_later
         # The estimator reports its flags as uninitialised for the second half of its start.
         uninitialized_at = timeline.ready + 0.5 * (timeline.estimator_active - timeline.ready)
@@ -79,7 +78,6 @@ class ArduPilotNavigation:
 
     @property
     def position(self) -> GlobalPoint | None:
-        """Estimated global position; None while there is neither a GPS fix nor an origin of the estimator."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX and self.origin is None:
             return None
         return self.frame.to_global(*self._vehicle.motion.place)
@@ -123,7 +121,6 @@ class ArduPilotNavigation:
 
     @property
     def uses_external(self) -> bool:
-        """True if EK3_SRC1_POSXY selects external navigation instead of GPS."""
         return self._vehicle.parameters.get("EK3_SRC1_POSXY", 0.0) == _EXTERNAL_NAVIGATION
 
     def _watch(self) -> None:
@@ -135,7 +132,6 @@ class ArduPilotNavigation:
             self._check_gps()
 
     def _check_external(self) -> None:
-        """Update the estimator flags from external navigation. Positions are relative until the origin is set."""
         if not self.uses_external or not self.has_attitude:
             return
         age = self._vehicle.external.navigation_age_s
@@ -174,7 +170,6 @@ class ArduPilotNavigation:
         self._vehicle.info("GPS 1: detected u-blox")
 
     def _acquire_fix(self) -> None:
-        """Get the first fix, unless GPS is missing, and watch GPS from now on."""
         if self.is_gps_detected and not self.gps_is_lost:
             self.fix_type = GpsFixType.RTK_FIXED
             if self._vehicle.timeline.uses_dcm_until_gps:
@@ -182,7 +177,6 @@ class ArduPilotNavigation:
         self._watches_gps = True
 
     def _set_origin_when_possible(self) -> None:
-        """Set the estimator's origin and home, or check again in a second if there is no fix yet."""
         if self.fix_type < GpsFixType.TYPE_3D_FIX:
             self._vehicle.call_later(1.0, self._set_origin_when_possible)
             return
@@ -199,7 +193,6 @@ class ArduPilotNavigation:
         self.is_healthy = True
 
     def _use_gps_when_possible(self) -> None:
-        """Let the estimator use GPS, or check again in a second if that is not possible yet."""
         if self.flags == _WITH_POSITION:  # `_check_gps` was first.
             return
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
@@ -211,7 +204,6 @@ class ArduPilotNavigation:
             self._vehicle.info("AHRS: EKF3 active")
 
     def _check_gps(self) -> None:
-        """Detect the loss of GPS, and use GPS again after its return."""
         if self.gps_is_lost or not self.is_gps_detected:
             self._follow_gps_loss()
         elif self.fix_type < GpsFixType.TYPE_3D_FIX:
@@ -221,7 +213,6 @@ class ArduPilotNavigation:
                 self._use_gps_when_possible()
 
     def _follow_gps_loss(self) -> None:
-        """Set the fix type to NO_FIX. After 7 s, the position is lost; after 15 s, GPS stops aiding the estimator."""
         if math.isnan(self._gps_lost_at):
             self._gps_lost_at = self._vehicle.now
             self.fix_type = GpsFixType.NO_FIX
@@ -239,11 +230,7 @@ class ArduPilotNavigation:
 
 
 def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable[[Ned], bool] = lambda _: True) -> Ned:
-    """Return the place where RTL ends: the nearest allowed rally point at its own height, or home.
-
-    Rally points farther away than RALLY_LIMIT_KM are ignored (0: no limit). With RALLY_INCL_HOME, home is chosen if
-    home is nearer than all rally points.
-    """
+    """Return the place where RTL ends: the nearest allowed rally point at its own height, or home."""
     current = (vehicle.motion.north, vehicle.motion.east)
     parameters = vehicle.parameters
     points = (
@@ -294,11 +281,10 @@ class SmartPath:
         return len(self._points)
 
     def start(self) -> None:
-        """Update the path regularly from now on."""
         self._vehicle.every(_PERIOD_S, self.update)
 
     def reset(self) -> None:
-        """Discard the path and start a new path at the vehicle. Without a position, the path stays inactive."""
+        """Start a new path at the vehicle. Without a position, the path stays inactive."""
         parameters = self._vehicle.parameters
         self._points.clear()
         self._cleaned_count = 0
@@ -322,12 +308,11 @@ class SmartPath:
         return path[::-1]
 
     def restore(self, way_back: Sequence[Ned]) -> None:
-        """Replace the recorded points by ``way_back``, the part of `take_way_back` that the vehicle has not flown."""
+        """Replace the recorded points by the part of `take_way_back` that was not flown."""
         self._points[:] = list(way_back)[::-1]
         self._cleaned_count = len(self._points)
 
     def update(self) -> None:
-        """Start the path, or add the current position. After 15 s without a position or space, deactivate the path."""
         vehicle = self._vehicle
         if not self.is_active:
             if not self._is_started and vehicle.navigation.has_position:
@@ -346,7 +331,7 @@ class SmartPath:
             self._deactivate("buffer full")
 
     def _add(self, place: Ned) -> bool:
-        """Record a place if it is far enough from the last point. Return False if there is no space for the place."""
+        """Record a place that is far enough from the last point. Return False if there is no space."""
         parameters = self._vehicle.parameters
         accuracy, maximum = parameters["SRTL_ACCURACY"], int(parameters["SRTL_POINTS"])
         if self._points and math.dist(self._points[-1], place) < accuracy:
@@ -388,10 +373,7 @@ def simplify(path: Sequence[Ned], tolerance: float) -> list[Ned]:
 
 
 def prune(path: Sequence[Ned], tolerance: float) -> list[Ned]:
-    """Return the path without loops. A loop ends where two segments are within ``tolerance`` metres of each other.
-
-    Loops are removed in the order of their starts. If several loops have the same start, only the longest is removed.
-    """
+    """Return the path without loops. A loop ends where two segments are within ``tolerance`` metres of each other."""
     points = list(path)
     first = 0
     while first < len(points) - 3:
@@ -420,7 +402,6 @@ def _dot(first: Ned, second: Ned) -> float:
 
 
 def _along(start: Ned, line: Ned, share: float) -> Ned:
-    """Return ``start`` plus this share (0 to 1) of the vector ``line``."""
     start_north, start_east, start_down = start
     north, east, down = line
     return (start_north + share * north, start_east + share * east, start_down + share * down)
@@ -436,7 +417,7 @@ def _distance_to_line(point: Ned, start: Ned, end: Ned) -> float:
 
 
 def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[float, Ned] | None:
-    """Return the distance of two line segments and the midpoint between them; None for parallel segments."""
+    """Return (distance, midpoint) of two line segments, or None if they are parallel."""
     line1, line2, between = _vector(start1, end1), _vector(start2, end2), _vector(start2, start1)
     dot11, dot12, dot22 = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     dot1, dot2 = _dot(line1, between), _dot(line2, between)

@@ -36,7 +36,6 @@ class PlaneArming(ArduPilotArming[PlaneHost]):
     """ArduPlane's arming checks: GPS in every mode; plausible angle limits, airspeed and time-outs; an armable mode."""
 
     def own_reasons(self) -> list[str]:
-        """Return the texts of the checks that fail."""
         parameters, mode = self.vehicle.parameters, self.vehicle.mode
         max_roll = parameters["ROLL_LIMIT_DEG"]
         max_pitch, min_pitch = parameters["PTCH_LIM_MAX_DEG"], parameters["PTCH_LIM_MIN_DEG"]
@@ -184,7 +183,6 @@ class SimulatedPlane(PlaneHost):
         return self.change_to(PlaneMode.AUTO)
 
     def _reposition(self, command: ReceivedCommand) -> int:
-        """Fly to a place and circle there. Param 3 is the radius. Any param 4 but 0 and NaN means anticlockwise."""
         if command.is_long:  # ArduPilot requires an altitude frame here, and COMMAND_LONG has none.
             return MavResult.UNSUPPORTED
         point = self.world_point(*command.place(), command.z, command.altitude_frame)
@@ -202,12 +200,12 @@ class SimulatedPlane(PlaneHost):
         return MavResult.ACCEPTED
 
     def _change_speed(self, command: ReceivedCommand) -> int:
-        """Set the airspeed of GUIDED or AUTO. A ground speed is accepted, but has no effect."""
         mode = self.mode
         if not isinstance(mode, PlaneNavigatingMode) or not mode.can_change_speed:
             return MavResult.FAILED
         if command.param1 == SpeedType.AIRSPEED and self.is_valid_airspeed(command.param2):
             mode.speed = command.param2
             return MavResult.ACCEPTED
+        # A ground speed is accepted, but has no effect.
         is_ground_speed = command.param1 == SpeedType.GROUNDSPEED
         return MavResult.ACCEPTED if is_ground_speed else MavResult.FAILED  # An invalid airspeed fails, too.

@@ -65,7 +65,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self._manoeuvre == _LAND
 
     def enter(self, *, force: bool) -> bool:
-        """Start or resume the mission. Without a mission, change to RTL."""
         plane = self.vehicle
         if plane.mode is self and plane.is_armed and plane.mission.is_running:
             return True  # Arming enters the current mode again, which must not restart the mission.
@@ -83,7 +82,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         """Do nothing, because disarming has already reset the progress."""
 
     def update(self, dt: float) -> None:
-        """Continue the mission, and fly the present manoeuvre for ``dt`` seconds."""
         plane = self.vehicle
         plane.mission.update()
         if plane.mode is not self:  # The mission has changed the mode.
@@ -100,7 +98,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self._count_turns()
 
     def _count_turns(self) -> None:
-        """Once the plane has reached the circle, add the angle by which it has moved around the center in this tick."""
         wing = self.vehicle.wing
         if self._place is None:
             return
@@ -135,7 +132,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
             self.vehicle.set_mode(PlaneMode.RTL)
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
-        """Return True if a running command is complete, and report that. Called at each tick."""
         plane, command = self.vehicle, item.command
         if command == Cmd.NAV_TAKEOFF:
             is_altitude_reached = plane.wing.down <= self._place_down
@@ -165,13 +161,11 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return down
 
     def _report_if(self, is_complete: bool, text: str) -> bool:
-        """Send a text if the command is complete, and return ``is_complete``."""
         if is_complete:
             self.vehicle.info(text)
         return is_complete
 
     def _has_passed(self, index: int) -> bool:
-        """Return True and send a text if the plane is within WP_RADIUS of the waypoint, or has passed it."""
         assert self._place is not None
         wing = self.vehicle.wing
         north, east, _ = self._place
@@ -185,7 +179,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         return self._report_if(dot_product > 0, f"Passed waypoint #{index} dist {int(distance)}m")
 
     def _go(self, item: MissionItem, manoeuvre: int) -> None:
-        """Start a leg to a command's position. If both coordinates are 0, use those of the plane."""
         self._leg_start = self.vehicle.wing.place
         own_north, own_east, own_down = self._leg_start
         point = self.vehicle.world_point(int(item.x), int(item.y), item.z, item.frame) or self._leg_start
@@ -208,7 +201,6 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         self.radius: float = item.param2 if item.command == Cmd.NAV_LOITER_TO_ALT else item.param3
 
     def _start_landing(self, item: MissionItem) -> None:
-        """Start a landing at the position of the command."""
         self._go(item, _LAND)
         wing, plane = self.vehicle.wing, self.vehicle
         point = plane.world_point(int(item.x), int(item.y), item.z, item.frame)
@@ -243,7 +235,7 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
 _ATTITUDE_TIMEOUT_S = 3.0
 _UNLIMITED_M_S = 1000.0
 _RATES = Mask.BODY_ROLL_RATE_IGNORE | Mask.BODY_PITCH_RATE_IGNORE | Mask.BODY_YAW_RATE_IGNORE
-_INVALID_ALTITUDES = (0.0, -1.0)
+_INVALID_ALTITUDES = (0.0, -1.0)  # The firmware refuses these.
 
 
 @dataclass(frozen=True)
@@ -272,7 +264,6 @@ class PlaneGuided(PlaneNavigatingMode):
         return super().enter(force=force)
 
     def go_to(self, position: Ned) -> None:
-        """Fly to a point of the world frame and circle there."""
         self._place = position
         self._course = None
         self._climb_limit = _UNLIMITED_M_S
@@ -288,10 +279,6 @@ class PlaneGuided(PlaneNavigatingMode):
         self._course = course
 
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
-        """Set the bank, the pitch and the throttle, except those that the mask excludes.
-
-        ArduPlane has no rate control here: if the mask excludes all but the roll rate, the bank angle is followed.
-        """
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
         # If the mask ignores all rates but not the attitude, roll and pitch are used. Otherwise, the firmware uses each
@@ -305,7 +292,6 @@ class PlaneGuided(PlaneNavigatingMode):
             self._throttle = _TimedValue(constrained(message.thrust, 0.0, 1.0), now)
 
     def update(self, dt: float) -> None:
-        """Follow the latest attitude or course that was commanded. Without one, circle the target."""
         wing, now = self.vehicle.wing, self.vehicle.now
         has_bank, has_pitch, has_throttle = (
             now - value.received_at < _ATTITUDE_TIMEOUT_S for value in (self._bank, self._pitch, self._throttle)
@@ -318,7 +304,7 @@ class PlaneGuided(PlaneNavigatingMode):
         # Half throttle flies at cruise speed.
         speed = 2.0 * self._throttle.value * self.vehicle.cruise_m_s if has_throttle else self.airspeed
         _, _, target_down = self._place or wing.place
-        climb = max(-self._climb_limit, min(self._climb_limit, wing.climb_to(target_down)))
+        climb = max(-self._climb_limit, min(self._climb_limit, wing.climb_rate_to(target_down)))
         if has_pitch:  # A commanded pitch replaces the altitude.
             climb = max(-limits.sink_m_s, min(limits.climb_m_s, speed * math.sin(self._pitch.value)))
         if not has_bank and self._course is not None:
@@ -346,7 +332,6 @@ class PlaneSetpoints:
         return self._plane.mode is self._guided
 
     def _on_local(self, message: m.SetPositionTargetLocalNed, _: Channel) -> None:
-        """Lower the altitude of the target by ``z`` metres. Other frames than LOCAL_OFFSET_NED are ignored."""
         plane, target = self._plane, self._guided.destination
         if not self._is_guided or message.coordinate_frame != MavFrame.LOCAL_OFFSET_NED or target is None:
             return
@@ -357,7 +342,6 @@ class PlaneSetpoints:
         plane.info(f"Change alt to {home_down - down:.1f}")
 
     def _on_global(self, message: m.SetPositionTargetGlobalInt, _: Channel) -> None:
-        """Handle SET_POSITION_TARGET_GLOBAL_INT, which changes only the altitude."""
         plane = self._plane
         if not self._is_guided:
             return
@@ -375,8 +359,6 @@ class PlaneSetpoints:
 
 
 def guided_commands(plane: PlaneHost) -> dict[int, CommandHandler]:
-    """Return handlers of the commands that change speed, altitude and course in GUIDED."""
-
     def in_guided(handler: Callable[[PlaneHost, PlaneGuided, ReceivedCommand], int]) -> CommandHandler:
         def handle(command: ReceivedCommand) -> int:
             guided = plane.mode_of(PlaneGuided)
@@ -402,17 +384,16 @@ def _change_speed(plane: PlaneHost, guided: PlaneGuided, command: ReceivedComman
 
 
 def _change_altitude(plane: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Change the altitude (the firmware refuses 0 and -1). Param 3 is the climb rate in m/s; 0 is the maximum."""
     point = plane.world_point(0, 0, command.z, command.altitude_frame)  # Only the altitude is used.
     if command.z in _INVALID_ALTITUDES or point is None:
         return MavResult.DENIED
     _, _, down = point
+    # Param 3 is the climb rate in m/s. 0 selects the maximum.
     guided.change_altitude(down, abs(command.param3) or _UNLIMITED_M_S)
     return MavResult.ACCEPTED
 
 
 def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand) -> int:
-    """Fly a course of param 2 degrees. The HEADING_TYPE (param 1) HEADING is treated like COURSE_OVER_GROUND."""
     if not 0.0 <= command.param2 < 360.0:
         return MavResult.DENIED
     if command.param1 == HeadingType.DEFAULT:
@@ -425,11 +406,11 @@ def _change_heading(_: PlaneHost, guided: PlaneGuided, command: ReceivedCommand)
 
 
 def _change_target_altitude(plane: PlaneHost, command: ReceivedCommand) -> int:
-    """Change the altitude to param 1 metres (MAV_FRAME param 2). Only GUIDED uses the altitude; all modes accept it."""
     point = plane.world_point(0, 0, command.param1, to_int(command.param2))  # Only the altitude is used.
     if point is None:
         return MavResult.DENIED
     guided = plane.mode_of(PlaneGuided)
+    # Only GUIDED uses the altitude. All modes accept the command.
     if plane.mode is guided:
         _, _, down = point
         guided.change_altitude(down)

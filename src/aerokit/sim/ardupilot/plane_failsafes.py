@@ -63,7 +63,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     @property
     def is_radio_healthy(self) -> bool:
-        """True while pulses are received and the throttle is above THR_FS_VALUE."""
         return not (self.is_radio_lost or self._is_radio_bad())
 
     def update(self) -> None:
@@ -80,7 +79,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         return is_throttle_low or plane.now - self.radio_received_at > _RADIO_TIMEOUT_S
 
     def _check_radio(self) -> None:
-        """Detect the loss of the radio: no pulses for 1 s, or a low throttle, and this for a further 0.2 s."""
         plane = self.vehicle
         if plane.rc.is_receiving:
             self.radio_received_at: float = plane.now
@@ -97,7 +95,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn(f"Throttle failsafe {'on' if is_lost else 'off'}")
 
     def _check_short(self) -> None:
-        """Start or end the short failsafe."""
         action = int(self.vehicle.parameters["FS_SHORT_ACTN"])
         is_needed = self.is_radio_lost and action != _SHORT_DISABLED
         is_landing = self.vehicle.mode.is_landing
@@ -107,7 +104,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._end_short()
 
     def _start_short(self, action: int) -> None:
-        """Start the short failsafe of the radio. With some values of ``action``, the plane stays in its mode."""
         plane = self.vehicle
         self.state = _SHORT
         self._short_since = plane.now
@@ -123,7 +119,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn("RC Short Failsafe On")
 
     def _end_short(self) -> None:
-        """End the short failsafe, and restore the mode unless another one was selected meanwhile."""
         plane = self.vehicle
         self.warn("Short Failsafe Cleared")
         self.state = _NONE
@@ -132,7 +127,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.warn(f"Flight mode {plane.mode.name} restored", MavSeverity.INFO)
 
     def _check_long(self) -> None:
-        """Start the long failsafe if the radio or the ground station is lost long enough, or end it."""
         if self.state in (_LONG, _GCS):
             self._check_end_of_long()
             return
@@ -153,7 +147,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self._start_long(_GCS)
 
     def _check_end_of_long(self) -> None:
-        """End the long failsafe if the link that caused it (radio or ground station) has returned."""
         parameters = self.vehicle.parameters
         # Like the firmware (system.cpp, check_long_failsafe).
         is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
@@ -170,7 +163,6 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         self.warn(text)
 
     def _start_long(self, state: int) -> None:
-        """Execute FS_LONG_ACTN. The effect of a value differs between piloted modes, RTL, and AUTO or GUIDED."""
         plane = self.vehicle
         # The ground station may hang while its overrides are active, so the firmware gives control to the radio
         # (events.cpp).
@@ -196,14 +188,13 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
         return self.vehicle.mode.number == PlaneMode.TAKEOFF and self.vehicle.mode.is_taking_off
 
     def _resume_pending(self) -> None:
-        """After a take-off, start the long failsafe that was postponed until then; if TAKEOFF was left, drop it."""
         if self._is_long_pending and not self._is_in_take_off:
             self._is_long_pending = False
+            # If the plane has left TAKEOFF, the failsafe is dropped.
             if self.vehicle.mode.number == PlaneMode.TAKEOFF:
                 self._start_long(_LONG)
 
     def act_on_battery(self, action: int) -> None:
-        """Execute BATT_FS_LOW_ACT or BATT_FS_CRT_ACT. A running landing continues."""
         is_landing = self.vehicle.mode.is_landing
         # The Q modes need lifting rotors. A plane without them executes all three actions as LAND.
         lands = action in (_LAND, _QLAND, _LOITER_QLAND)
@@ -216,14 +207,13 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             self.change_to(*preferred, PlaneMode.RTL)
 
     def refuse_termination(self) -> None:
-        """Report why the flight cannot be terminated: AFS_ENABLE is 0 or AFS_TERM_ACTION is not set."""
         text = "AFS not enabled, can't terminate the vehicle"
         if self.vehicle.parameters["AFS_ENABLE"]:
             text = "Unable to terminate, termination is not configured"
         self.warn(text, MavSeverity.INFO)
 
     def _land_by_mission(self) -> bool:
-        """Start the landing sequence of the mission. Return False without a DO_LAND_START, or if AUTO is refused."""
+        """Start the mission's landing sequence. Return False if there is none or AUTO is refused."""
         plane = self.vehicle
         stored_items = plane.missions.commands.items()
         land_starts = (seq for seq, item in enumerate(stored_items) if item.command == MavCmd.DO_LAND_START)
@@ -263,7 +253,6 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             self.caused_mode = False
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION after a new breach."""
         plane = self.vehicle
         if self.caused_mode:  # The plane already returns from an earlier breach.
             return
@@ -278,12 +267,7 @@ class PlaneFence(ArduPilotFence[PlaneHost]):
             plane.guided.go_to(self.return_place())
 
     def return_place(self) -> Ned:
-        """Return the place to which the plane returns after a breach.
-
-        With FENCE_RET_RALLY, this is where RTL would return. Otherwise it is above the uploaded return point or,
-        without one, above home. Its height above home is FENCE_RET_ALT. If that is not positive, the height is half-way
-        between the altitude limits or, if these leave no room, RTL_ALTITUDE.
-        """
+        """Return the place to which the plane returns after a breach."""
         plane, parameters = self.vehicle, self.vehicle.parameters
         home_north, home_east, home_down = plane.home_or_ground
         if parameters["FENCE_RET_RALLY"]:

@@ -96,7 +96,6 @@ class PlaneLanding:
         self._stopped_at = math.nan  # NaN until the plane has stopped after the landing
 
     def update(self, dt: float) -> None:
-        """Continue the landing for one tick."""
         plane, wing = self._plane, self._plane.wing
         if plane.is_landed:
             self._disarm_after_stop()
@@ -108,7 +107,6 @@ class PlaneLanding:
             self._approach()
 
     def _fly_to_start(self, start: Ned) -> None:
-        """Fly to the start of the approach, which begins when the plane is there."""
         wing = self._plane.wing
         north, east, down = start
         distance = math.hypot(north - wing.north, east - wing.east)
@@ -119,7 +117,6 @@ class PlaneLanding:
         wing.fly_to(*start, airspeed=self._plane.cruise_m_s)
 
     def _approach(self) -> None:
-        """Descend along the line from the start of the approach to the landing point, and flare above the ground."""
         plane, wing = self._plane, self._plane.wing
         north, east, down = self.point
         start_north, start_east, start_down = self._approach_start
@@ -141,7 +138,7 @@ class PlaneLanding:
             length = max(1.0, math.hypot(north - start_north, east - start_east))
             down_on_slope = down + (start_down - down) * max(0.0, remaining) / length
             slope_sink = (down - start_down) * wing.ground_speed_m_s / length
-            climb = -slope_sink + wing.climb_to(down_on_slope)
+            climb = -slope_sink + wing.climb_rate_to(down_on_slope)
             speed = _APPROACH_SHARE * plane.cruise_m_s
         # The course points to the approach line, more directly the farther the plane is from it.
         wing.head(course + math.atan2(aside, _CORRECTION_LENGTH_M), speed, climb)
@@ -155,7 +152,6 @@ class PlaneLanding:
         self._plane.info(f"Flare {height:.1f}m sink={sink:.2f} speed={speed:.1f} dist={remaining:.1f}")
 
     def _disarm_after_stop(self) -> None:
-        """Disarm LAND_DISARMDELAY seconds after the plane has stopped."""
         plane, wing = self._plane, self._plane.wing
         if math.isnan(self._stopped_at):
             self._stopped_at = plane.now
@@ -197,7 +193,6 @@ class PlanePilotedMode(PlaneModeBase):
     has_manual_throttle = True
 
     def update(self, dt: float) -> None:
-        """Follow the sticks. On the ground, the plane rolls to a stop while the throttle is low; else it takes off."""
         plane, wing = self.vehicle, self.vehicle.wing
         limits = wing.wing_limits
         throttle_pulse = plane.rc[RC_THROTTLE]
@@ -231,7 +226,7 @@ class PlaneAltitudeMode(PlaneModeBase):
             wing.roll_out()
             return
         self._down -= self.climb_rate() * dt
-        self.steer(wing.climb_to(self._down))
+        self.steer(wing.climb_rate_to(self._down))
 
     def climb_rate(self) -> float:
         """Return the climb rate in m/s that the pitch stick commands."""
@@ -251,7 +246,6 @@ class PlaneCruise(PlaneAltitudeMode):
         self._course: float | None = None  # course to hold, in radians from north; None while the pilot turns
 
     def steer(self, climb: float) -> None:
-        """Hold the course, unless the pilot turns."""
         wing = self.vehicle.wing
         if abs(self.stick(RC_ROLL)) > _CENTERED_STICK:  # The pilot turns, so no course is held.
             self._course = None
@@ -335,7 +329,6 @@ class PlaneTakeOff(PlaneNavigatingMode):
         return self._is_climbing
 
     def update(self, dt: float) -> None:
-        """Climb out, then circle at the place that `_start` has set."""
         plane = self.vehicle
         if self._place is None:
             self._start()
@@ -351,7 +344,6 @@ class PlaneTakeOff(PlaneNavigatingMode):
         return self.vehicle.wing.down - target_down
 
     def _start(self) -> None:
-        """Set the place to circle: TKOFF_DIST metres ahead of the nose, and TKOFF_ALT metres above home."""
         plane, wing = self.vehicle, self.vehicle.wing
         height, distance = plane.parameters["TKOFF_ALT"], plane.parameters["TKOFF_DIST"]
         north = wing.north + distance * math.cos(wing.yaw)
@@ -377,7 +369,6 @@ class PlaneAutoland(PlaneNavigatingMode):
     is_landing = True
 
     def enter(self, *, force: bool) -> bool:
-        """Plan the landing. Refused on the ground, or if the direction of the take-off is unknown."""
         plane = self.vehicle
         if plane.mode is self and plane.is_landed:  # Arming enters the current mode again.
             return True

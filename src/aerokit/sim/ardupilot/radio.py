@@ -64,14 +64,12 @@ class ArduPilotRadio:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Pulse widths of the 18 channels of RC_CHANNELS. A channel that the transmitter lacks is 0."""
         if not self._overrides and self._failure != _LOW_THROTTLE:
             return (*self._sticks, *(0,) * (_CHANNELS - len(self._sticks)))
         return tuple(self[index] for index in range(_CHANNELS))
 
     @property
     def is_receiving(self) -> bool:
-        """True while the transmitter or RC_CHANNELS_OVERRIDE provides pulses."""
         vehicle = self._vehicle
         if not (vehicle.faults.rc_lost or self._failure == _NO_PULSES):
             return True
@@ -79,7 +77,7 @@ class ArduPilotRadio:
         return any(value and received_at > expired_before for value, received_at in self._overrides.values())
 
     def override(self, pulses: Mapping[int, int]) -> None:
-        """Override channels for RC_OVERRIDE_TIME. ``pulses`` maps a channel index to µs; 0 releases the channel."""
+        """Override channels. ``pulses`` maps channel indices to microseconds. 0 releases a channel."""
         for index, value in pulses.items():
             self._overrides[index] = (value, self._vehicle.now)
 
@@ -88,19 +86,16 @@ class ArduPilotRadio:
         return self._vehicle.parameters.get("SIM_RC_FAIL", 0.0)
 
     def release_overrides(self) -> None:
-        """Drop all overrides, because of a reboot or the loss of the ground station."""
         self._overrides.clear()
 
     def listen(self) -> None:
         self._vehicle.on(m.RcChannelsOverride, self._on_override)
 
     def _override_time(self) -> float:
-        """Return the seconds for which an override is valid; infinity for a negative RC_OVERRIDE_TIME."""
         seconds = self._vehicle.parameters["RC_OVERRIDE_TIME"]
         return math.inf if seconds < 0 else seconds
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
-        """Apply overrides of the ground station MAV_GCS_SYSID. The value 0 releases only the channels 1 to 8."""
         vehicle = self._vehicle
         sender_system, _component = sender_of(override)
         if sender_system != vehicle.parameters["MAV_GCS_SYSID"]:
@@ -140,7 +135,7 @@ class ArduPilotJoystick:
         vehicle.failsafes.ground_station_seen_at = vehicle.now
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
-        """Return the pulses that the axes command, in microseconds by channel index; 0 releases a channel."""
+        """Return the commanded pulses in microseconds, by channel index. 0 releases a channel."""
         if axes.z < 0:  # Copter ignores a message with negative thrust (GCS_MAVLink_Copter.cpp).
             return {}
         return {
@@ -154,17 +149,14 @@ class ArduPilotJoystick:
         """Scale the value of an axis to RCn_MIN … RCn_MAX. Return 0 if the message has no value for the axis."""
         if value == _NO_VALUE:
             return 0
-        low = self.setting(f"RC{channel + 1}_MIN", 1100.0)
-        high = self.setting(f"RC{channel + 1}_MAX", 1900.0)
+        parameters = self._vehicle.parameters
+        low = parameters.get(f"RC{channel + 1}_MIN", 1100.0)
+        high = parameters.get(f"RC{channel + 1}_MAX", 1900.0)
         if reverse:
             value = -value
         share = (value - lowest) / (1000 - lowest)
         # Like the firmware, do not limit an axis that is out of range. The mask keeps the 16 bits of a pulse.
         return int(low + (high - low) * share) & 0xFFFF
-
-    def setting(self, name: str, default: float) -> float:
-        """Return a parameter, or the default if the parameter table lacks it."""
-        return self._vehicle.parameters.get(name, default)
 
 
 class RoverJoystick(ArduPilotJoystick):
@@ -181,10 +173,10 @@ class SubJoystick(ArduPilotJoystick):
     """
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
-        """Return the pulse of each RC channel that the joystick controls."""
-        gain = max(0.1, min(1.0, self.setting("JS_GAIN_DEFAULT", 0.5)))
+        parameters = self._vehicle.parameters
+        gain = max(0.1, min(1.0, parameters.get("JS_GAIN_DEFAULT", 0.5)))
         scale = _SUB_SCALE * gain
-        throttle_scale = 2 * scale * self.setting("JS_THR_GAIN", 1.0)
+        throttle_scale = 2 * scale * parameters.get("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTER - 500 * throttle_scale  # 500 is the middle of the axis z.
         # Like the firmware, do not scale pitch and roll, and use an axis without a value like any other (joystick.cpp).
         offsets = {
@@ -206,6 +198,7 @@ _REFUSED_FUNCTIONS: dict[Kind, tuple[int, ...]] = {
     "rover": (),
     "sub": (0, _SAVE_WAYPOINT),
 }
+# SERVOn_FUNCTIONs of free outputs: none, and those that pass an RC channel through.
 _FREE_FUNCTIONS = frozenset({0, 1, *range(51, 67)})
 _AUX_POSITIONS = (0.0, 1.0, 2.0)
 
@@ -224,11 +217,9 @@ class AuxiliaryOutputs:
         return _RELAYS.get(self._vehicle.KIND, 1)
 
     def is_free(self, output: int) -> bool:
-        """Return True if the output's SERVOn_FUNCTION is 0 (none) or passes an RC channel through."""
         return self._vehicle.parameters.get(f"SERVO{output}_FUNCTION", 0) in _FREE_FUNCTIONS
 
     def set_servo(self, command: ReceivedCommand) -> int:
-        """Set a servo output for DO_SET_SERVO, or for the first pulse of DO_REPEAT_SERVO."""
         output = to_int(command.param1)
         if not 1 <= output <= _SERVOS:
             return MavResult.FAILED
@@ -246,12 +237,11 @@ class AuxiliaryOutputs:
         return MavResult.ACCEPTED
 
     def repeat_relay(self, command: ReceivedCommand) -> int:
-        """Accept DO_REPEAT_RELAY. At the end of the repetitions, the relay has its previous state again."""
+        # At the end of the repetitions, the relay has its previous state again.
         is_valid = 0 <= command.param1 < self.relay_count
         return MavResult.ACCEPTED if is_valid else MavResult.FAILED
 
     def switch(self, command: ReceivedCommand) -> int:
-        """Record the switch position of DO_AUX_FUNCTION. The function itself is not simulated."""
         function = to_int(command.param1)
         if command.param2 not in _AUX_POSITIONS:
             return MavResult.DENIED

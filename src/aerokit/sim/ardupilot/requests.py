@@ -70,10 +70,6 @@ class ArduPilotMessageRequests:
             vehicle.on(m.RequestDataStream, self._on_group)
 
     def set_interval(self, command: ReceivedCommand) -> int:
-        """Set the interval of a message in microseconds. -1 turns the stream off.
-
-        0 selects the default, which is one second for HEARTBEAT and off for other messages.
-        """
         message_id, interval_us = to_int(command.param1), to_int(command.param2)
         if command.param3 != 0.0:
             return MavResult.DENIED
@@ -82,6 +78,7 @@ class ArduPilotMessageRequests:
             return MavResult.DENIED
         if interval_us < -1:
             return MavResult.DENIED
+        # -1 and 0 turn the stream off. For HEARTBEAT, 0 selects the default of one second.
         interval = max(0, interval_us) / 1e6
         if interval_us == 0 and message_id == m.Heartbeat.ID:
             interval = 1.0
@@ -92,11 +89,9 @@ class ArduPilotMessageRequests:
         return MavResult.ACCEPTED
 
     def get_interval(self, command: ReceivedCommand) -> int:
-        """Send MESSAGE_INTERVAL, before the acknowledgement."""
         return self._send_interval(to_int(command.param1), command.channel)
 
     def _send_interval(self, message_id: int, channel: Channel) -> int:
-        """Send MESSAGE_INTERVAL. Return a MAV_RESULT."""
         is_supported = message_id in self._supported
         interval_us = round(channel.streams.interval(message_id) * 1e6)
         if interval_us == 0:
@@ -106,8 +101,8 @@ class ArduPilotMessageRequests:
         return MavResult.ACCEPTED if is_supported else MavResult.FAILED
 
     def request_message(self, command: ReceivedCommand) -> int:
-        """Send a message once, after the acknowledgement. Only MESSAGE_INTERVAL is sent before the acknowledgement."""
         message_id = to_int(command.param1)
+        # Only MESSAGE_INTERVAL is sent before the acknowledgement.
         if message_id == m.MessageInterval.ID:
             return self._send_interval(to_int(command.param2), command.channel)
         if message_id not in self._supported:
@@ -131,10 +126,7 @@ class ArduPilotMessageRequests:
         self._vehicle.call_later(0.0, send)
 
     def _send_modes(self, index: int, channel: Channel) -> None:
-        """Send AVAILABLE_MODES of the mode with this index (1 is the first), or of all modes if the index is 0.
-
-        From then on, AVAILABLE_MODES_MONITOR is sent every 5 s.
-        """
+        """Send AVAILABLE_MODES of the mode with this index, or of all modes for 0."""
         vehicle = self._vehicle
         modes = vehicle.available_modes()
         if index != 0:
@@ -144,7 +136,6 @@ class ArduPilotMessageRequests:
         channel.streams.set_interval(m.AvailableModesMonitor.ID, _MODES_MONITOR_INTERVAL_S, vehicle.now)
 
     def _on_group(self, request: m.RequestDataStream, channel: Channel) -> None:
-        """Handle REQUEST_DATA_STREAM for one group of messages or for all groups."""
         if request.start_stop not in (0, 1):
             return
         rate = request.req_message_rate if request.start_stop else 0
@@ -168,7 +159,7 @@ class ArduPilotMessageRequests:
         return f"MAV{self._vehicle.channels.index(channel) + 1}_"
 
     def restart(self) -> None:
-        """After a reboot of the vehicle, restore the stream rates that REQUEST_DATA_STREAM has changed."""
+        """Restore the stream rates that REQUEST_DATA_STREAM has changed."""
         parameters = self._vehicle.parameters
         for name, (value_after_reboot, requested) in self._changed_rates.items():
             if parameters[name] == requested:  # False if PARAM_SET has set another value, which is kept.
@@ -176,7 +167,6 @@ class ArduPilotMessageRequests:
         self._changed_rates.clear()
 
     def _store_rate(self, name: str, rate: int) -> None:
-        """Store the rate of a group in the parameter that holds it."""
         vehicle, parameters = self._vehicle, self._vehicle.parameters
         if name not in parameters or parameters[name] == rate:
             return
@@ -189,7 +179,7 @@ class ArduPilotMessageRequests:
             self._changed_rates[name] = (value_after_reboot, rate)
 
     def _stream_group(self, stream: int, rate: float, channel: Channel, first: float) -> None:
-        """Stream the messages of a group at ``rate`` Hz from the time ``first`` on; 0 stops them."""
+        """Stream a group at ``rate`` Hz from the time ``first`` on. 0 stops it."""
         group_interval = max(1.0 / rate, _MIN_INTERVAL_S) if rate > 0 else 0.0
         for message_id in self._groups[stream]:
             interval = group_interval

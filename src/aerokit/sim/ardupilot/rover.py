@@ -31,7 +31,6 @@ class RoverArming(ArduPilotArming[RoverHost]):
         return ()  # `position_reasons` includes these checks, because ArduRover runs them after the GPS checks.
 
     def position_reasons(self) -> Sequence[str]:
-        """Return the failures of the GPS checks or, if there are none, those of the estimator checks."""
         rover = self.vehicle
         if not rover.mode.needs_position and rover.parameters["ARMING_NEED_LOC"] != _NEEDS_LOCATION:
             return ()
@@ -54,13 +53,11 @@ class RoverArming(ArduPilotArming[RoverHost]):
         self.vehicle.path.reset()
 
     def disarm(self, *, force: bool = True) -> bool:
-        """Disarm, even while driving; ``force`` has no effect.
-
-        The current place becomes home unless a command has set home.
-        """
         rover, was_armed = self.vehicle, self.vehicle.is_armed
+        # A rover disarms even while driving, so `force` has no effect.
         if not super().disarm(force=True):
             return False
+        # The current place becomes home if no command has set home.
         if was_armed and rover.navigation.home is not None and not rover.navigation.home_is_locked:
             rover.navigation.set_home(rover.motion.place, lock=False)
         return True
@@ -119,7 +116,6 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         super().update()
 
     def _check_radio(self) -> None:
-        """Detect the loss of the radio: silence, or a throttle below FS_THR_VALUE."""
         rover, parameters = self.vehicle, self.vehicle.parameters
         if rover.rc.is_receiving:
             self.radio_received_at: float = rover.now
@@ -138,14 +134,10 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         self._update_link(_GCS, is_lost=self.is_ground_station_lost)
 
     def _update_link(self, name: str, *, is_lost: bool) -> None:
-        """Record whether a link is lost, and start or end the failsafe that both links share.
-
-        The first call after the timeout starts the failsafe, with the text and the parameter of its ``name``, even if
-        only the other link is lost (as in failsafe.cpp, failsafe_trigger). If the check of a lost link is disabled,
-        this method is no longer called for it, so the link stays lost.
-        """
+        """Record whether a link is lost, and start or end the failsafe that both links share."""
         rover = self.vehicle
         was_any_link_lost = bool(self._lost)
+        # This method is not called for a link whose check is disabled, so such a link stays lost.
         self._lost = (self._lost | {name}) if is_lost else (self._lost - {name})
         if self._lost and not was_any_link_lost:
             self._lost_since = rover.now
@@ -155,6 +147,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
+        # The first call after the timeout uses the text and the parameter of its link, even if only the other link is
+        # lost (failsafe.cpp, failsafe_trigger).
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
         rover.rc.release_overrides()
@@ -172,14 +166,12 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         return rover.mode.number != RoverMode.RTL
 
     def act_on_battery(self, action: int) -> None:
-        """Execute an action of FS_ACTION or of the battery failsafe, which have the same numbers."""
         if action == _TERMINATE:
             self.vehicle.arming.disarm()
         else:
             self.change_to(*_MODES.get(action, ()))
 
     def _check_estimator(self) -> None:
-        """Act if an armed rover has had no position for a while, and report when the position is back."""
         rover = self.vehicle
         is_lost = rover.is_armed and not rover.navigation.has_position
         lost_for = self._position_lost.seconds(is_lost, rover.now)
@@ -199,7 +191,6 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
             self.warn("EKF failsafe", MavSeverity.CRITICAL)
 
     def _check_crash(self) -> None:
-        """Apply FS_CRASH_CHECK if the rover does not move although its mode drives."""
         rover, action = self.vehicle, int(self.vehicle.parameters["FS_CRASH_CHECK"])
         # The simulation has no obstacles: only a failed motor keeps the rover from driving.
         is_blocked = rover.is_armed and rover.mode.number in _DRIVES_ITSELF and rover.faults.motor_failed
@@ -226,7 +217,6 @@ class RoverFence(ArduPilotFence[RoverHost]):
     MITIGATION: ClassVar[int] = FenceMitigate.NONE
 
     def act(self, new_breaches: int) -> None:
-        """Execute FENCE_ACTION after a new breach. Far beyond the limit, hold instead, unless it only reports."""
         vehicle = self.vehicle
         action = int(vehicle.parameters["FENCE_ACTION"])
         if action == REPORT_ONLY:
@@ -259,7 +249,6 @@ class RoverSetpoints(GuidedSetpoints):
         return super().is_complete(target) or (target.yaw is None) != (target.yaw_rate is None)
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Drive at the speed that the thrust commands. A turn rate has precedence over the heading."""
         if message.type_mask & AttitudeMask.THROTTLE_IGNORE:
             return
         speed = self.vehicle.waypoint_speed * max(-1.0, min(1.0, message.thrust))

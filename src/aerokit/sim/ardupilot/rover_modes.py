@@ -106,7 +106,6 @@ class _Rtl(_Mode):
         return self._path[0] if self._path else None
 
     def update(self, dt: float) -> None:
-        """Drive to the next place, or stay at the last one."""
         rover = self.vehicle
         if not self._path:
             rover.motion.stop()
@@ -209,7 +208,6 @@ class RoverGuided(_Mode):
         self.speed = self.vehicle.waypoint_speed
 
     def set_target(self, target: GuidedTarget) -> None:
-        """Follow a target. A position has precedence over a velocity."""
         if target.position is not None:
             self.go_to(target.position)
             return
@@ -218,7 +216,6 @@ class RoverGuided(_Mode):
         self._target_at = self.vehicle.now
 
     def update(self, dt: float) -> None:
-        """Drive to the place or follow the velocity that was commanded last; otherwise stop."""
         rover, target = self.vehicle, self._target
         if self._place is not None:
             self._drive_to(self._place)
@@ -232,7 +229,6 @@ class RoverGuided(_Mode):
             rover.motion.stop()
 
     def _drive_to(self, place: Ned) -> None:
-        """Drive to a place and stop there. The arrival is reported once."""
         rover = self.vehicle
         if not self._has_arrived and rover.has_arrived(place):
             self._has_arrived = True
@@ -244,7 +240,6 @@ class RoverGuided(_Mode):
             rover.motion.drive_to(north, east, speed=self.speed)
 
     def _follow(self, target: GuidedTarget) -> None:
-        """Drive with the commanded speed and turn rate, or in the commanded direction."""
         north, east, _ = target.velocity or (0.0, 0.0, 0.0)
         motion = self.vehicle.motion
         speed = min(self.vehicle.waypoint_speed, math.hypot(north, east))

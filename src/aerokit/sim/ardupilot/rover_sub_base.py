@@ -66,14 +66,13 @@ class GuidedSetpoints:
         vehicle.on(SetPositionTargetGlobalInt, self._on_global)
         vehicle.on(SetAttitudeTarget, self._on_attitude)
 
-    def refuse_acceleration(self, message: PositionTarget) -> None:
-        """Called for a message that is ignored because it contains an acceleration."""
+    def refuse_acceleration(self, message: PositionTarget) -> None: ...
 
     def steer(self, message: SetAttitudeTarget) -> None:
         raise NotImplementedError
 
     def is_complete(self, target: GuidedTarget) -> bool:
-        """Return True if the firmware accepts this combination of values: at least a position or a velocity."""
+        """Return True if the firmware accepts this combination of values."""
         return target.position is not None or target.velocity is not None
 
     @property
@@ -95,11 +94,7 @@ class GuidedSetpoints:
             self._follow(message, point, uses_yaw=self.GLOBAL_YAW)
 
     def _follow(self, message: PositionTarget, point: Ned | None, *, uses_yaw: bool) -> None:
-        """Follow a set-point in GUIDED. ``point`` is the position of the set-point in the world frame.
-
-        A set-point is ignored if it has an acceleration, if its position or velocity is not finite, or if `is_complete`
-        rejects it.
-        """
+        """Follow a set-point in GUIDED. ``point`` is its position in the world frame."""
         setpoint, frame = Setpoint.of(message), message.coordinate_frame
         if not self._is_guided:
             return
@@ -168,7 +163,6 @@ class RoverSubVehicle(ArduPilotVehicle):
         return {**common_commands(self), Cmd.DO_CHANGE_SPEED: self._change_speed}
 
     def _change_speed(self, command: ReceivedCommand) -> int:
-        """Handle DO_CHANGE_SPEED, which sets the speed at which the present mode moves to a place."""
         if command.param1 in (SpeedType.CLIMB_SPEED, SpeedType.DESCENT_SPEED):
             return MavResult.DENIED
         is_horizontal = command.param1 in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED)
@@ -207,11 +201,11 @@ class RoverSubAuto(MissionMode):
         }
 
     def default_speed(self) -> float:
-        """Return the speed that the parameters define, in m/s."""
+        """Return the speed in m/s that the parameters define."""
         raise NotImplementedError
 
     def refuse(self) -> None:
-        """Report that there is no mission, if the firmware sends a text for this case."""
+        """Report that there is no mission."""
 
     def travel(self, place: Ned, *, stops: bool) -> None:
         raise NotImplementedError
@@ -225,15 +219,13 @@ class RoverSubAuto(MissionMode):
     def reached_text(self, index: int, seconds: float) -> str:
         raise NotImplementedError
 
-    def finish(self) -> None:
-        """Called at the end of the mission."""
+    def finish(self) -> None: ...
 
     @property
     def destination(self) -> Ned | None:
         return self._place
 
     def enter(self, *, force: bool) -> bool:
-        """Start the mission. Refused without a mission."""
         if self.vehicle.mode is self:  # Arming enters the current mode again, which must not restart the mission.
             return True
         if not self.vehicle.mission.is_present:
@@ -245,7 +237,6 @@ class RoverSubAuto(MissionMode):
         return True
 
     def update(self, dt: float) -> None:
-        """Continue the mission, and travel to the place of the current command."""
         self.start_if_waiting()
         if not self.is_waiting:
             self.vehicle.mission.update()
@@ -267,7 +258,6 @@ class RoverSubAuto(MissionMode):
         self.finish()
 
     def _is_done(self, index: int, item: MissionItem) -> bool:
-        """Return True if a running command is complete. Called at each tick."""
         command, now = item.command, self.vehicle.now
         if command in _WAYPOINTS:
             # NAV_LOITER_UNLIM never ends, but its arrival is reported.
@@ -282,7 +272,6 @@ class RoverSubAuto(MissionMode):
         return True
 
     def _has_stayed(self, index: int, item: MissionItem) -> bool:
-        """Return True if the vehicle has reached a waypoint and has waited there for the seconds in param 1."""
         if self._place is None:
             return False
         now = self.vehicle.now
@@ -295,7 +284,6 @@ class RoverSubAuto(MissionMode):
         return now - self._reached_at >= delay_s
 
     def _go(self, item: MissionItem) -> None:
-        """Travel to the position of a command. The vehicle stops there if it must wait or if no waypoint is next."""
         vehicle = self.vehicle
         current: Ned = self._place or vehicle.motion.place
         self._reached_at = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
@@ -73,7 +74,6 @@ class ArduPilotStorage:
             self.parameters.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions because of a reboot. Files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -90,7 +90,8 @@ class ArduPilotStorage:
     def _apply(self, name: str, value: float) -> None:
         """Set a parameter that an uploaded file contains."""
         parameters = self._vehicle.parameters
-        if name not in self._vehicle.faults.read_only_parameters:
+        # The firmware ignores a value that is not finite (AP_Param.cpp, set_float).
+        if name not in self._vehicle.faults.read_only_parameters and math.isfinite(value):
             parameters[name] = rounded(self.parameters.clamped(name, value), parameters.type(name))
 
 
@@ -138,7 +139,6 @@ class ArduPilotSigning(VehicleSigning):
         self._ardupilot.call_later(self._ardupilot.timeline.gps_fix, self._on_gps_time)
 
     def _on_gps_time(self) -> None:
-        """Advance the time stamps to GPS time."""
         stamp = timestamp_at(int(self._ardupilot.unix_time))
         for channel in self._ardupilot.channels:
             if channel.signing is not None:

@@ -96,7 +96,6 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
         super().update()
 
     def _check_radio(self) -> None:
-        """Detect the loss of the radio and apply FS_THR_ENABLE: 1 warns, 2 surfaces."""
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_THR_ENABLE"])
         is_receiving = sub.rc.is_receiving
         if is_receiving:
@@ -115,7 +114,6 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             sub.set_mode(SubMode.SURFACE)
 
     def _check_pilot(self) -> None:
-        """Detect the loss of the pilot's input and apply FS_PILOT_INPUT: 1 warns, 2 disarms."""
         sub, enabled = self.vehicle, int(self.vehicle.parameters["FS_PILOT_INPUT"])
         silence = sub.now - self.radio_received_at
         is_silent = silence >= sub.parameters["FS_PILOT_TIMEOUT"]  # `silence` is NaN before the first input.
@@ -132,7 +130,6 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             sub.arming.disarm()
 
     def _check_ground_station(self) -> None:
-        """Detect the loss of the ground station. The loss is reported repeatedly, but FS_GCS_ENABLE acts only once."""
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_GCS_ENABLE"])
         if not action or math.isnan(self.ground_station_seen_at):
             return
@@ -158,7 +155,6 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
             self.vehicle.arming.disarm()
 
     def _check_leak(self) -> None:
-        """Report a leak repeatedly, and apply FS_LEAK_ENABLE once: 1 warns, 2 surfaces."""
         sub, action = self.vehicle, int(self.vehicle.parameters["FS_LEAK_ENABLE"])
         if not sub.faults.leak or not action:
             self.is_leak_detected = False
@@ -185,7 +181,6 @@ class _HullLimit:
         self._reported_at = 0.0
 
     def update(self, sub: SubHost, value: float) -> None:
-        """Check a measured value. Warn repeatedly if it has reached or exceeded its maximum for `_HULL_TIMEOUT_S`."""
         if not sub.parameters[f"{self._prefix}_ENABLE"]:
             return
         if value < sub.parameters[f"{self._prefix}_MAX"]:
@@ -211,7 +206,6 @@ class SubSetpoints(GuidedSetpoints):
     GLOBAL_YAW: ClassVar[bool] = False
 
     def steer(self, message: SetAttitudeTarget) -> None:
-        """Follow the yaw and the thrust for one second. The message must have both an attitude and a thrust."""
         if message.type_mask & (AttitudeMask.ATTITUDE_IGNORE | AttitudeMask.THROTTLE_IGNORE):
             return
         climb_share = 2.0 * (max(0.0, min(1.0, message.thrust)) - 0.5)  # A thrust of 0.5 holds the depth.
@@ -319,9 +313,9 @@ class SimulatedSub(SubHost):
         }
 
     def _change_speed_at_any_time(self, command: ReceivedCommand) -> int:
-        """Accept a speed in every mode, although only GUIDED and AUTO use the speed."""
         if not command.param2 > 0 or command.param1 not in (SpeedType.AIRSPEED, SpeedType.GROUNDSPEED):
             return MavResult.DENIED
+        # Every mode accepts a speed, although only GUIDED and AUTO use it.
         if isinstance(self.mode, SubGuided | SubAuto):
             self.mode.speed = command.param2
         return MavResult.ACCEPTED

@@ -75,7 +75,7 @@ class _Mode(ArduPilotMode):
         return 0.0 if abs(share) < _DEADZONE else share
 
     def horizontal_velocity_from_sticks(self) -> tuple[float, float]:
-        """Turn by the yaw stick; return the velocity north and east (m/s) by the forward and lateral sticks."""
+        """Return the velocity (north, east) in m/s. Also turn by the yaw stick."""
         motion = self.vehicle.motion
         motion.turn(self.stick(RC_YAW) * _FULL_STICK_TURN_RAD_S)
         forward = self.stick(SUB_FORWARD) * _FULL_STICK_M_S
@@ -173,14 +173,13 @@ class SubGuided(_Mode):
         return True
 
     def go_to(self, position: Ned) -> None:
-        """Go to a place and stay there. A place above the surface is lowered to the surface."""
         self._place = position
         self._target = self._heading = None
 
     def set_target(self, target: GuidedTarget) -> None:
-        """Follow a target. A position has precedence over a velocity. As in SITL, a new position starts from rest."""
         if target.position is not None:
             motion = self.vehicle.motion
+            # As in SITL, a new position starts from rest.
             motion.velocity_north = motion.velocity_east = motion.velocity_down = 0.0
             self.go_to(target.position)
         else:
@@ -194,7 +193,6 @@ class SubGuided(_Mode):
         self._heading = wrap_pi(heading)
 
     def update(self, dt: float) -> None:
-        """Follow the last command: move to its place, or with its velocity. Without a valid command, stop."""
         motion, target = self.vehicle.motion, self._target
         if target is not None and self.vehicle.now - self._target_at > target.timeout_s:
             target = None  # An expired target stops the vehicle.

@@ -106,7 +106,7 @@ _UNCONTROLLED: dict[Kind, tuple[tuple[int, tuple[int, ...]], ...]] = {
 
 
 def _sensor_status(vehicle: ArduPilotVehicle) -> tuple[int, int, int]:
-    """Return the present, enabled and healthy sensors of SYS_STATUS."""
+    """Return (present, enabled, healthy) of SYS_STATUS."""
     sensors, nav, kind = _SENSORS[vehicle.KIND], vehicle.navigation, vehicle.KIND
     # The kinds of control that are off in the present mode.
     uncontrolled = next((bits for bits, modes in _UNCONTROLLED[kind] if vehicle.mode.number in modes), 0)
@@ -165,7 +165,6 @@ _BOOT_MODE: dict[str, tuple[int, int]] = {
 
 
 def heartbeat(vehicle: ArduPilotVehicle) -> m.Heartbeat:
-    """Build HEARTBEAT. During the boot, the state is BOOT, or CALIBRATING if the firmware reports a boot mode."""
     base_mode, mode = vehicle.base_mode, vehicle.mode.number
     state = MavState.BOOT
     if not vehicle.is_initialised and vehicle.KIND in _BOOT_MODE:
@@ -190,7 +189,6 @@ def _sys_status(vehicle: ArduPilotVehicle) -> m.SysStatus:
 
 
 def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
-    """Build EXTENDED_SYS_STATE. ArduPilot reports a copter as a VTOL that is in multicopter state."""
     state = MavLandedState.IN_AIR
     if vehicle.is_landed:
         state = MavLandedState.ON_GROUND
@@ -198,12 +196,12 @@ def _extended_sys_state(vehicle: ArduPilotVehicle) -> m.ExtendedSysState:
         state = MavLandedState.LANDING
     elif vehicle.mode.is_taking_off:
         state = MavLandedState.TAKEOFF
+    # ArduPilot reports a copter as a VTOL in multicopter state.
     vtol_state = MavVtolState.MC if vehicle.KIND == "copter" else MavVtolState.UNDEFINED
     return m.ExtendedSysState(vtol_state, state)
 
 
 def _battery_status(vehicle: ArduPilotVehicle) -> m.BatteryStatus:
-    """Build BATTERY_STATUS."""
     battery = vehicle.battery
     voltages = (round(battery.voltage_v * 1000), *(_UNKNOWN_CELL,) * 9)  # The first cell has the whole voltage.
     charge = MavBatteryChargeState.LOW if vehicle.failsafes.battery_is_low else MavBatteryChargeState.OK
@@ -249,7 +247,6 @@ _FULL_THROTTLE_RPM, _ESC_PACKETS_PER_S, _ESC_TEMPERATURE_C = 15000, 100, 32
 
 
 def _esc_telemetry(vehicle: ArduPilotVehicle) -> m.EscTelemetry1To4:
-    """Build ESC_TELEMETRY_1_TO_4. Outputs without a motor report zeros."""
     has_motor = [index in _MOTORS[vehicle.KIND] for index in range(4)]
 
     def per_motor(value: int) -> list[int]:
@@ -320,7 +317,6 @@ def _copter_outputs(vehicle: ArduPilotVehicle) -> m.ServoOutputRaw:
 
 
 def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
-    """Build SERVO_OUTPUT_RAW with aileron, elevator, throttle and rudder. In MANUAL they follow the sticks."""
     wing, is_armed = plane.wing, plane.motors.is_armed
     throttle = 1000 + (round(1000 * plane.motors.throttle) if is_armed else 0)
     if plane.mode.number == PlaneMode.MANUAL:
@@ -336,7 +332,6 @@ def _plane_outputs(plane: PlaneHost) -> m.ServoOutputRaw:
 
 
 def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
-    """Build SERVO_OUTPUT_RAW with the steering on output 1, even while disarmed, and the motor on output 3."""
     if rover.mode.has_manual_throttle:
         deflection = rover.rc[RC_ROLL] - _MIDDLE  # The roll stick steers.
         beyond_deadzone = max(0, abs(deflection) - _ROVER_DEADZONE)
@@ -350,7 +345,6 @@ def _rover_outputs(rover: RoverHost) -> m.ServoOutputRaw:
 
 
 def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
-    """Build SERVO_OUTPUT_RAW with four vectored and two vertical thrusters, and camera axes on outputs 8 and 10."""
     thrusters = [_MIDDLE] * 6
     if sub.motors.is_armed:
         yaw, forward, lateral, roll = (
@@ -364,6 +358,7 @@ def _sub_outputs(sub: SubHost) -> m.ServoOutputRaw:
             vertical + roll, vertical - roll,
         )  # fmt: skip
         thrusters = [_pulse(thrust) for thrust in thrusts]
+    # The outputs 8 and 10 are camera axes.
     return _servo_outputs(sub, *thrusters, 0, _MIDDLE, 0, _MIDDLE)
 
 
@@ -380,7 +375,7 @@ def _stick(pwm: int) -> float:
 
 
 def _pulse(share: float) -> int:
-    """Return the pulse in µs of a control surface or a thruster, for a share from -1 to 1 of the full range."""
+    """Return a pulse in microseconds for a share from -1 to 1 of the full range."""
     return _MIDDLE + round(_SURFACE_RANGE * max(-1.0, min(1.0, share)))
 
 

@@ -88,7 +88,7 @@ def _vfr_hud(vehicle: ArduPilotVehicle) -> m.VfrHud:
 
 
 def _acceleration(vehicle: ArduPilotVehicle) -> Three:
-    """Return the acceleration that the accelerometers measure, in milli-g."""
+    """Return the measured acceleration in milli-g."""
     motion = vehicle.motion
     acceleration_down = 0.0 if vehicle.is_landed else motion.acceleration_down
     x = 1000 * math.sin(motion.pitch)
@@ -113,7 +113,6 @@ def _int16(value: float) -> int:
 
 
 def _highres_imu(vehicle: ArduPilotVehicle) -> m.HighresImu:
-    """Build HIGHRES_IMU."""
     motion = vehicle.motion
     x, y, z = (value * (GRAVITY_M_S2 / 1000.0) for value in _acceleration(vehicle))
     # The firmware multiplies milligauss by 1000, although the fields are in gauss (GCS_Common.cpp).
@@ -158,9 +157,9 @@ _RANGEFINDER_HEIGHT_M = 0.2  # Height of the sensor above the ground on which th
 
 
 def _global_position(vehicle: ArduPilotVehicle) -> m.GlobalPositionInt:
-    """Build GLOBAL_POSITION_INT. Latitude and longitude are 0 before the first position, as in the firmware."""
     motion, nav = vehicle.motion, vehicle.navigation
     time = vehicle.time_boot_ms
+    # As in the firmware, latitude and longitude are 0 before the first position.
     place = nav.position  # None until the estimator knows the position
     relative = round(nav.altitude_above_home * 1000)
     heading = centidegrees(motion.yaw) if nav.has_attitude else 0
@@ -184,7 +183,6 @@ def _local_position(vehicle: ArduPilotVehicle) -> m.LocalPositionNed | None:
 
 
 def _gps_raw(vehicle: ArduPilotVehicle) -> m.GpsRawInt:
-    """Build GPS_RAW_INT."""
     motion, nav = vehicle.motion, vehicle.navigation
     if not nav.is_gps_detected:
         return _gps_without_fix(GpsFixType.NO_GPS, dilution=65535, satellites=0)  # 65535 means unknown.
@@ -208,7 +206,6 @@ def _gps_without_fix(fix_type: int, *, dilution: int, satellites: int) -> m.GpsR
 
 
 def _ekf_status(vehicle: ArduPilotVehicle) -> m.EkfStatusReport | None:
-    """Build EKF_STATUS_REPORT; None before the estimator runs."""
     flags = vehicle.navigation.flags
     if flags is None:
         return None
@@ -242,7 +239,6 @@ def _global_origin(vehicle: ArduPilotVehicle) -> m.GpsGlobalOrigin | None:
 
 
 def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | None:
-    """Build POSITION_TARGET_GLOBAL_INT; None without a destination, or while disarmed."""
     target = vehicle.mode.destination
     if target is None or not vehicle.motors.is_armed:
         return None
@@ -253,7 +249,6 @@ def _target_global(vehicle: ArduPilotVehicle) -> m.PositionTargetGlobalInt | Non
 
 
 def _target_local(vehicle: ArduPilotVehicle) -> m.PositionTargetLocalNed | None:
-    """Build POSITION_TARGET_LOCAL_NED of GUIDED; None in other modes."""
     guided, time = vehicle.mode, vehicle.time_boot_ms
     if not isinstance(guided, CopterGuided):
         return None
@@ -274,7 +269,6 @@ def _is_navigating(vehicle: ArduPilotVehicle) -> bool:
 
 
 def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
-    """Build NAV_CONTROLLER_OUTPUT, which is sent only in modes that navigate."""
     if not _is_navigating(vehicle):
         return None
     motion, target = vehicle.motion, vehicle.mode.destination
@@ -293,7 +287,6 @@ def _nav_controller(vehicle: ArduPilotVehicle) -> m.NavControllerOutput | None:
 
 
 def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
-    """Build TERRAIN_REPORT of a vehicle that receives no terrain data."""
     place = vehicle.navigation.position
     if place is None:
         return m.TerrainReport(
@@ -308,11 +301,11 @@ def _terrain_report(vehicle: ArduPilotVehicle) -> m.TerrainReport:
 
 
 def _terrain_request(vehicle: ArduPilotVehicle) -> m.TerrainRequest | None:
-    """Build TERRAIN_REQUEST for all data around the vehicle, because the simulated vehicle stores no terrain data."""
     place = vehicle.navigation.position
     if place is None:
         return None
     south_offset_e7, west_offset_e7 = (round(1e7 * degrees) for degrees in _GRID_CORNER)
+    # All grids are requested, because the vehicle stores no terrain data.
     all_grids = (1 << _GRIDS_PER_BLOCK) - 1
     return m.TerrainRequest(
         place.latitude_e7 - south_offset_e7, place.longitude_e7 - west_offset_e7, _GRID_M, all_grids

@@ -28,7 +28,6 @@ class CameraParameters(ExtendedParameters):
         super().__init__(camera, camera.definition)
 
     def refresh(self) -> None:
-        """Update the mode, the values of the automatic exposure, and the ISO, which is limited in video mode."""
         values, camera = self.values, self._camera
         if MODE in values:
             values[MODE] = int(camera.mode)
@@ -54,7 +53,6 @@ _FORMAT_INTERVAL_S, _FORMAT_PERCENTS = 0.5, (0, 25, 50, 75)
 
 
 def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgress:
-    """Format the card, which takes two seconds. Param 2 is 1 to format, param 3 is 1 to reset the image log."""
     captures = camera.captures
     is_card_known = command.param1 in (0.0, 1.0)  # 0 selects all cards, and the camera has one card.
     if not is_card_known or not camera.card.is_inserted:
@@ -73,7 +71,7 @@ def _format(camera: CameraBody, command: ReceivedCommand) -> int | CommandProgre
 
 
 def _synchronous(handler: AsyncHandler) -> CommandHandler:
-    """Return a synchronous version of an ``async`` handler, which works because the handler never has to wait."""
+    """Return a synchronous version of a handler that never has to wait."""
 
     def execute(command: ReceivedCommand) -> int:
         try:

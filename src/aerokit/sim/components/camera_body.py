@@ -189,10 +189,7 @@ class CameraBody(SimulatedComponent, CameraDevice):
         self.call_later(self.shutter_s, lambda: done(shot))
 
     def _shoot(self) -> Shot:
-        """Return a function that makes CAMERA_IMAGE_CAPTURED with the present time, position and attitude.
-
-        The index and the result of the image are arguments of that function.
-        """
+        """Return a function that makes CAMERA_IMAGE_CAPTURED with the present time, position and attitude."""
         pose, angles = pose_of(self.vehicle), self.angles()
         place = None if pose is None else pose.place
         return partial(

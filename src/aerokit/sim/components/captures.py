@@ -34,7 +34,6 @@ class MemoryCard:
 
     @property
     def free_mib(self) -> float:
-        """Free space; 0 without a card."""
         return max(0.0, self.capacity_mib - self.used_mib) if self.is_inserted else 0.0
 
     def store(self, size_mib: float) -> bool:
@@ -48,7 +47,6 @@ class MemoryCard:
         self.used_mib = 0.0
 
     def information(self, camera: SimulatedComponent, number: int) -> list[StorageInformation]:
-        """Return STORAGE_INFORMATION of the card with this number; 0 selects all cards."""
         if number not in (0, _STORAGE_ID):
             return []
         is_inserted = self.is_inserted
@@ -110,7 +108,6 @@ class Lens:
 
     @property
     def focal_length_mm(self) -> float:
-        """Focal length at the current zoom."""
         return FOCAL_LENGTH_MM * (1.0 + (_ZOOM_FACTOR - 1.0) * self.zoom.percent / 100.0)
 
     def set_zoom(self, kind: int, value: float) -> bool:
@@ -151,16 +148,14 @@ _UNKNOWN, _ACCURACY_M = math.nan, 1.0
 
 
 def tracked_place(component: SimulatedComponent, flags: int, angles: Angles | None) -> list[m.CameraTrackingGeoStatus]:
-    """Return CAMERA_TRACKING_GEO_STATUS with the point where the optical axis meets the ground.
-
-    The ground is level, at the altitude of home. The list is empty if the point is unknown or too far away.
-    """
+    """Return CAMERA_TRACKING_GEO_STATUS for the point where the optical axis meets the ground."""
     pose = pose_of(component.vehicle)
     if pose is None or angles is None:
         return []
     _, pitch, yaw = angles
     if pitch > _MAX_GROUND_PITCH_RAD:
         return []
+    # The ground is level, at the altitude of home.
     distance = pose.height_m / math.tan(-pitch)
     place = LocalFrame(pose.place).to_global(distance * math.cos(yaw), distance * math.sin(yaw), pose.height_m)
     return [

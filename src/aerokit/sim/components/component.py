@@ -34,7 +34,7 @@ class Pose(NamedTuple):
 
 
 def pose_of(vehicle: SimulatedVehicle) -> Pose | None:
-    """Return the true pose of a vehicle; None for a vehicle without a pose, such as a recording."""
+    """Return the true pose of a vehicle, or None for a vehicle without a pose, such as a recording."""
     try:
         place = true_place(vehicle)
     except InvalidArgument:

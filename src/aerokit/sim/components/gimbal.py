@@ -68,7 +68,6 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         self._reset()
 
     def _reset(self) -> None:
-        """Set the state after a power-on: no component is in control, and the gimbal points forward."""
         self.primary: tuple[int, int] = (0, 0)
         self.secondary: tuple[int, int] = (0, 0)
         self.flags: int = 0
@@ -133,7 +132,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         return 0.0 if pose is None else pose.yaw
 
     def _wanted_angles(self) -> Angles:
-        """Return the angles towards which the gimbal turns now: roll, pitch, and yaw from the nose."""
+        """Return the angles towards which the gimbal turns now, with yaw from the nose."""
         target = self._target if self.region is None else self._angles_to(self.region)
         seconds = self.now - self._start_at
         roll, pitch, yaw = (angle + rate * seconds for angle, rate in zip(target, self._rates, strict=True))
@@ -143,7 +142,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
         return (_clamped(roll, roll_limits), _clamped(pitch, pitch_limits), _clamped(yaw, yaw_limits))
 
     def _angles_to(self, region: GlobalPoint) -> Angles:
-        """Return the angles to a position (yaw from north), or the present target if the vehicle has no position."""
+        """Return the angles to a position, with yaw from north."""
         pose = pose_of(self.vehicle)
         if pose is None:
             return self._target
@@ -189,7 +188,7 @@ class SimulatedGimbal(SimulatedComponent, GimbalMount):
             self.region = GlobalPoint(*place)
 
     def _begin(self, flags: int) -> None:
-        """Start a movement at the present angles. Forget the previous target, which the caller then replaces."""
+        """Start a movement at the present angles, without a target."""
         self._start_angles = self.angles()
         self._start_at = self.now
         self._target = _ZERO

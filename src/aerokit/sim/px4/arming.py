@@ -27,7 +27,7 @@ _PERCENT_PER_SIDE = 17
 
 
 def _side_texts(sensor: str, sides_done: int) -> list[str]:
-    """Return the texts that PX4 sends before it measures the next side. ``sides_done`` sides are already measured."""
+    """Return the texts that PX4 sends before it measures the next side."""
     side = _SIDES[-1 - sides_done]  # The simulated user rotates the vehicle to the last side first.
     return [
         f"pending: {' '.join(_SIDES[: len(_SIDES) - sides_done])}",
@@ -54,11 +54,9 @@ class Px4Calibration:
 
     @property
     def is_running(self) -> bool:
-        """True during a calibration. Meanwhile, HEARTBEAT reports CALIBRATING and arming is denied."""
         return bool(self._sensor)
 
     def command(self, command: ReceivedCommand) -> int:
-        """Handle PREFLIGHT_CALIBRATION and return the MAV_RESULT."""
         sensor = _sensor_of(command)
         if self._px4.is_armed:
             return MavResult.TEMPORARILY_REJECTED
@@ -107,7 +105,6 @@ class Px4Calibration:
             self._px4.info(f"[cal] {text}")
 
     def _begin_side(self, sides_done: int, run_number: int) -> None:
-        """Measure the next side, or end the calibration after the last one."""
         if not self.is_running or run_number != self._run_number:  # The calibration was cancelled.
             return
         if sides_done == len(_SIDES):
@@ -137,7 +134,7 @@ class Px4Calibration:
 
 
 def _sensor_of(command: ReceivedCommand) -> str:
-    """Return the sensor whose calibration a PREFLIGHT_CALIBRATION requests; empty if there is none."""
+    """Return the sensor to calibrate, or an empty string."""
     requests = {
         "gyro": command.param1 == 1,
         "mag": command.param2 == 1,
@@ -184,7 +181,7 @@ class Px4Arming:
             self._px4.send_text(MavSeverity.CRITICAL, reason)
 
     def report_changes(self) -> None:
-        """Report the failed checks of a disarmed vehicle if ``prearm_failures`` of `Faults` has changed."""
+        """Report the failed checks if ``prearm_failures`` of `Faults` has changed."""
         failures = list(self._px4.faults.prearm_failures)
         if self._px4.is_ready and not self._px4.is_armed and failures != self._reported_failures:
             self._reported_failures = failures
@@ -192,17 +189,15 @@ class Px4Arming:
 
     @property
     def is_possible(self) -> bool:
-        """True if all checks pass. HEARTBEAT then reports STANDBY, and SYS_STATUS the pre-arm bit."""
         return self._px4.is_ready and self._mode_allows and not self.reasons()
 
     @property
     def _mode_allows(self) -> bool:
-        """False in a mode in which PX4 never arms, such as RETURN or LAND, and in a mode that `can_run` refuses."""
         mode = self._px4.mode
         return modes.MODES[mode].can_arm and self._px4.can_run(mode)
 
     def arm(self, by: str = "external command") -> bool:
-        """Arm and return True. If a check fails, report the failure (except while booting) and return False."""
+        """Arm and return True, or report the failed checks and return False."""
         px4 = self._px4
         if px4.is_armed:
             return True
@@ -223,7 +218,7 @@ class Px4Arming:
         self.armed_at = px4.now
         px4.info(f"Armed by {by}")
         px4.on_armed()
-        self._start_log()
+        self.start_log()
         return True
 
     @property
@@ -236,7 +231,7 @@ class Px4Arming:
         return px4.sticks.throttle < _LOW_THROTTLE
 
     def disarm(self, by: str, *, force: bool = False) -> bool:
-        """Stop the motors and return True. Without ``force``, a flying vehicle stays armed (False)."""
+        """Stop the motors and return True. Without ``force``, a flying vehicle stays armed."""
         px4 = self._px4
         if not px4.is_armed:
             return True
@@ -264,11 +259,7 @@ class Px4Arming:
             )
         )
 
-    def start_first_log(self) -> None:
-        """Start a log at the boot. This log also records the first flight."""
-        self._start_log()
-
-    def _start_log(self) -> None:
+    def start_log(self) -> None:
         if self._is_logging:
             return
         self._is_logging = True

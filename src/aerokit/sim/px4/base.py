@@ -161,7 +161,7 @@ class Px4Vehicle(Px4Host):
         return Px4Signing(self, key, timestamp)
 
     def _listen(self) -> None:
-        """Create the parts that receive messages. A reboot does not replace them."""
+        # A reboot does not replace these parts.
         self.offboard: Px4Offboard = Px4Offboard(self)
         self.sticks: Px4Sticks = Px4Sticks(self)
         self.external: Px4External = Px4External(self)
@@ -213,7 +213,7 @@ class Px4Vehicle(Px4Host):
 
     def _warn_while_booting(self) -> None:
         self.arming.report_reasons()
-        self.arming.start_first_log()
+        self.arming.start_log()  # also records the first flight
 
     def _set_ready(self) -> None:
         self.is_ready = True
@@ -371,7 +371,6 @@ class Px4Vehicle(Px4Host):
         self.battery.drain(self.throttle * _AMPERES_AT_FULL, dt)
 
     def _detect_landing(self) -> None:
-        """Detect the landing `_LAND_DETECTOR_S` after the touchdown or, without running motors, at once."""
         is_lifting_off = self.is_armed and self.flight.lifts_off
         if not self._has_touched_down() or is_lifting_off or self.arming.is_terminated:
             self._touchdown_at = math.nan
@@ -385,7 +384,6 @@ class Px4Vehicle(Px4Host):
             self.mission.on_landed()
 
     def _auto_disarm(self) -> None:
-        """Disarm COM_DISARM_LAND s after a landing, or COM_DISARM_PRFLT s after arming without take-off (0: never)."""
         if not self.is_armed or not self.is_landed or self.flight.lifts_off:
             return
         if self._has_flown:
@@ -395,6 +393,6 @@ class Px4Vehicle(Px4Host):
             self.arming.disarm("auto preflight disarming")
 
     def _on_ping(self, ping: m.Ping, channel: Channel) -> None:
-        """Answer a broadcast PING. A PING with an address is an answer itself, so it is not answered."""
+        # A PING with an address is an answer itself, so it is not answered.
         if ping.target_system == ping.target_component == 0:
             self.send(m.Ping(ping.time_usec, ping.seq, *sender_of(ping)), channel)

@@ -49,7 +49,6 @@ _MOTORS, _SERVOS, _FIRST_OUTPUT_FUNCTION = range(1, 13), range(33, 41), 1000  # 
 
 
 def other_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    """Return the handlers for failures, logs, the gripper, actuators and storage, and those with a fixed answer."""
     handlers: dict[int, CommandHandler] = dict.fromkeys(_ACCEPTED, lambda _: MavResult.ACCEPTED)
     handlers |= dict.fromkeys(_UNANSWERED, lambda _: None)  # None sends no acknowledgement.
     handlers[Cmd.DO_LAND_START] = lambda _: MavResult.CANCELLED
@@ -72,9 +71,9 @@ _FAILURES = {
 
 
 def _inject_failure(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Handle INJECT_FAILURE. The answers are those of SIH, but the failures have no effect."""
     if not px4.parameters.get("SYS_FAILURE_EN", 0):
         return MavResult.DENIED
+    # The answers are those of SIH. The failures have no effect.
     unit, failure_type = to_int(command.param1), to_int(command.param2)
     if unit not in _FAILURES:
         return None
@@ -87,7 +86,6 @@ def _refuse_high_latency(px4: Px4Vehicle) -> int:
 
 
 def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Handle ACTUATOR_TEST, without a visible effect. No answer is sent for an unknown function (param 5)."""
     if px4.is_armed:
         return MavResult.DENIED
     function = to_int(command.x)
@@ -96,7 +94,6 @@ def _test_actuator(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
 
 
 def _store(px4: Px4Vehicle, command: ReceivedCommand) -> int | None:
-    """Handle PREFLIGHT_STORAGE, without a visible effect. While disarmed, unknown actions are not answered."""
     if px4.is_armed:
         return MavResult.TEMPORARILY_REJECTED
     return MavResult.ACCEPTED if to_int(command.param1) in _STORAGE_ACTIONS else None
@@ -113,7 +110,6 @@ _BEFORE_INT32_MAX, _AFTER_INT32_MAX = 2.0**31 - 128, 2.0**31 + 256
 
 
 def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
-    """Return the handlers of all commands."""
     flight = _Flight(px4)
     return {
         **message_requests(px4),
@@ -144,7 +140,7 @@ def px4_commands(px4: Px4Vehicle) -> dict[int, CommandHandler]:
 
 
 def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | None:
-    """Return the MAV_RESULT with which an invalid position or frame is refused; None for a valid command."""
+    """Return the MAV_RESULT that refuses an invalid position or frame, or None."""
     if command.is_long:
         is_int32_max = all(_BEFORE_INT32_MAX <= value <= _AFTER_INT32_MAX for value in (command.x, command.y))
         return MavResult.DENIED if is_int32_max else None
@@ -155,7 +151,6 @@ def refusal_by_place(command: ReceivedCommand, *, checks_frame: bool) -> int | N
 
 
 def set_mode(px4: Px4Vehicle, base_mode: int, mode: Px4Mode) -> int:
-    """Enter a mode, given as MAV_MODE_FLAG bits and PX4's main and sub mode. Return a MAV_RESULT."""
     if not base_mode & MavModeFlag.CUSTOM_MODE_ENABLED:
         px4.send_text(MavSeverity.CRITICAL, "Unsupported base mode")
         return MavResult.TEMPORARILY_REJECTED
@@ -184,7 +179,6 @@ class _Flight:
         self._tuning_since = math.nan  # start of the autotuning; NaN while it does not run
 
     def arm_or_disarm(self, command: ReceivedCommand) -> int | None:
-        """Handle COMPONENT_ARM_DISARM. A param 1 other than 0 and 1 is not acknowledged."""
         force = command.param2 == _FORCE_MAGIC
         arm = round(command.param1) if math.isfinite(command.param1) else None
         if arm == 1:
@@ -197,7 +191,7 @@ class _Flight:
         return MavResult.ACCEPTED if is_done else MavResult.TEMPORARILY_REJECTED
 
     def set_mode(self, command: ReceivedCommand) -> int:
-        """Set a mode and acknowledge twice. PX4's link module always accepts. Then the commander sends the result."""
+        # PX4's link module always accepts. Then the commander sends the result.
         self._px4.commands.answer(command, MavResult.ACCEPTED)
         return set_mode(self._px4, to_int(command.param1), (to_int(command.param2), to_int(command.param3)))
 
@@ -214,9 +208,9 @@ class _Flight:
         return result
 
     def take_off(self, command: ReceivedCommand) -> int:
-        """Take off to the altitude in param 7 (AMSL), or to MIS_TAKEOFF_ALT above home if param 7 is NaN."""
         px4 = self._px4
         result = self._change(modes.TAKEOFF)
+        # Without an altitude, the mode TAKEOFF climbs to MIS_TAKEOFF_ALT.
         if result == MavResult.ACCEPTED and math.isfinite(command.z):
             down = px4.frame.origin.altitude_m - command.z
             if px4.is_armed and down > px4.motion.down and not px4.is_landed:
@@ -235,7 +229,6 @@ class _Flight:
         return self._change(modes.RTL, "Returning to launch")
 
     def start_mission(self, command: ReceivedCommand) -> int:
-        """Handle MISSION_START: select the item in param 1 (-1: no change), enter MISSION, and arm."""
         px4 = self._px4
         if not px4.mission.is_valid:
             px4.send_text(MavSeverity.CRITICAL, "Mission start denied! No valid mission")
@@ -250,10 +243,6 @@ class _Flight:
         return result
 
     def reposition(self, command: ReceivedCommand) -> int:
-        """Go to a position.
-
-        A latitude or longitude that is NaN or INT32_MAX keeps the place, and an altitude that is NaN keeps the height.
-        """
         if to_int(command.param2) != MavDoRepositionFlags.CHANGE_MODE:  # PX4 requires this flag, and no other flag.
             return MavResult.UNSUPPORTED
         result = self._change(modes.HOLD)
@@ -266,10 +255,7 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def _destination(self, command: ReceivedCommand) -> tuple[float, float, float]:
-        """Return the position in a command.
-
-        If latitude or longitude is NaN or INT32_MAX, use the vehicle's place; if the altitude is NaN, use its height.
-        """
+        """Return the position in a command. Values that it omits are those of the vehicle."""
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
         has_place = math.isfinite(command.x) and math.isfinite(command.y) and _INT32_MAX not in (command.x, command.y)
@@ -287,13 +273,10 @@ class _Flight:
             px4.flight.speed_m_s = command.param1
 
     def orbit(self, command: ReceivedCommand) -> int:
-        """Circle a position. Params that are NaN keep the previous radius and speed.
-
-        A plane has no ORBIT, but circles its target in HOLD. It ignores the speed, and NaN selects its default radius.
-        """
         px4, orbit = self._px4, self._px4.flight.orbit
         north, east, down = self._destination(command)
         has_radius = math.isfinite(command.param1)
+        # A plane has no ORBIT, but circles its target in HOLD. It ignores the speed.
         if px4.VEHICLE_TYPE == MavType.FIXED_WING:
             result = self._change(modes.HOLD)  # sets the target to the current position
             if result == MavResult.ACCEPTED:
@@ -308,7 +291,6 @@ class _Flight:
         return self._change(modes.ORBIT)
 
     def tune(self, command: ReceivedCommand) -> int | None:
-        """Start the autotuning, or report its progress. The last step waits for disarming (MC_AT_APPLY 1)."""
         px4 = self._px4
         if command.param1 != 1.0 or command.param2 != 0.0:
             return MavResult.DENIED
@@ -316,13 +298,13 @@ class _Flight:
             self._tuning_since = math.nan
         elif not self._tuning_since >= px4.arming.armed_at:  # not started (NaN), or before the last arming
             self._tuning_since = px4.now
+        # The last step waits for disarming (MC_AT_APPLY 1).
         steps = (px4.now - self._tuning_since) / _TUNING_STEP_S  # NaN while disarmed
         progress = 0 if math.isnan(steps) else _TUNING_PROGRESS[min(int(steps), len(_TUNING_PROGRESS) - 1)]
         px4.commands.answer(command, MavResult.IN_PROGRESS, progress)
         return None
 
     def transition(self, command: ReceivedCommand) -> int | None:
-        """Start the transition to the VTOL state in param 1. Send no answer (None) if the vehicle is not a VTOL."""
         px4 = self._px4
         requested_state = to_int(command.param1)
         if not px4.vtol_state:
@@ -342,7 +324,6 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def change_altitude(self, command: ReceivedCommand) -> int:
-        """Change the altitude to param 1 (AMSL)."""
         result = self._change(modes.HOLD)
         if result == MavResult.ACCEPTED and math.isfinite(command.param1):
             flight = self._px4.flight
@@ -362,7 +343,6 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def set_home(self, command: ReceivedCommand) -> int:
-        """Handle DO_SET_HOME, for the current place or the place in the command."""
         px4, motion = self._px4, self._px4.motion
         uses_current_place = command.param1 > 0.5
         if uses_current_place:
@@ -380,7 +360,6 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def reboot(self, command: ReceivedCommand) -> int:
-        """Handle PREFLIGHT_REBOOT_SHUTDOWN. The reboot follows a moment after the acknowledgement."""
         if command.param1 == 0.0:
             return MavResult.ACCEPTED
         if self._px4.is_armed or command.param1 not in (1.0, 2.0):
@@ -423,7 +402,7 @@ class _Requests:
         self._px4 = px4
 
     def send_now(self, message_id: int, command: ReceivedCommand) -> int:
-        """Send a message before the acknowledgement. Return DENIED if the message cannot be sent."""
+        """Send a message before the acknowledgement."""
         message = None if message_id in _NOT_ON_REQUEST else self._px4.build(message_id)
         self._px4.rates.on_requested(command.channel, message_id)
         if message is None:
@@ -433,7 +412,6 @@ class _Requests:
         return MavResult.ACCEPTED
 
     def request_message(self, command: ReceivedCommand) -> int:
-        """Handle REQUEST_MESSAGE. Param 2 is the id for MESSAGE_INTERVAL and the mode index for AVAILABLE_MODES."""
         message_id = _number(command.param1)
         if message_id == m.MessageInterval.ID:
             return self._send_interval(_number(command.param2), command)

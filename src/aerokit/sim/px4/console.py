@@ -30,7 +30,6 @@ class Px4Shell:
         px4.on(m.SerialControl, self._on_input)
 
     def _on_input(self, message: m.SerialControl, channel: Channel) -> None:
-        """Collect the characters of a line. Answer the complete line in pieces that fit SERIAL_CONTROL."""
         if message.device != SerialControlDev.DEV_SHELL or message.flags & SerialControlFlag.REPLY:
             return
         self.is_open = bool(message.flags & SerialControlFlag.RESPOND)
@@ -74,7 +73,6 @@ class Px4LogStream:
         px4.on(m.LoggingAck, self._on_ack)
 
     def start(self, command: ReceivedCommand) -> int:
-        """Handle LOGGING_START."""
         if self._station is not None:
             return MavResult.TEMPORARILY_REJECTED
         log_format = command.param1
@@ -105,7 +103,6 @@ class Px4LogStream:
         self._px4.call_later(_BLOCK_INTERVAL_S, lambda: self._run(stream))
 
     def _run(self, stream: int) -> None:
-        """Send the next block, or repeat a definition block that was not acknowledged."""
         if self._station is None or stream != self._stream_number:
             return
         self._tries += 1

@@ -50,18 +50,17 @@ class Px4External:
 
     @property
     def has_vision(self) -> bool:
-        """True if the estimator uses external vision, and the latest measurement is at most five seconds old."""
         is_used = int(self._px4.parameters["EKF2_EV_CTRL"]) & _HORIZONTAL
         return bool(is_used) and self._px4.now - self._vision_at <= _VISION_TIMEOUT_S
 
     @property
     def target(self) -> tuple[float, float] | None:
-        """Landing target (north, east) in the world frame; None if it was not seen for PLD_BTOUT seconds."""
+        """Landing target (north, east) in the world frame."""
         is_fresh = self._px4.now - self._target_at <= self._px4.parameters["PLD_BTOUT"]
         return self._target if is_fresh else None
 
     def set_wind(self, command: ReceivedCommand) -> int:
-        """Record the wind of EXTERNAL_WIND_ESTIMATE. It has no effect on the flight."""
+        # The wind has no effect on the flight.
         self.wind = (command.param1, command.param3)
         return MavResult.ACCEPTED
 
@@ -106,12 +105,9 @@ class PrecisionLanding:
         self._has_given_up = False
 
     def update(self) -> None:
-        """Approach the target, and descend while the vehicle is above it. Search for it if it is lost.
-
-        After too many or too long searches, land without the target, even if it becomes visible again.
-        """
         px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         target = px4.external.target
+        # After too many or too long searches, the vehicle lands without the target, even if it becomes visible again.
         if self._has_given_up:
             px4.flight.descend()
             return
@@ -127,7 +123,6 @@ class PrecisionLanding:
         motion.seek_velocity(*velocity_to_landing_target(north, east), descent)
 
     def _search(self) -> None:
-        """Climb and wait for the target, or give up and begin to land."""
         px4, motion, parameters = self._px4, self._px4.motion, self._px4.parameters
         if self._search_began_at is None:
             self._search_began_at = px4.now

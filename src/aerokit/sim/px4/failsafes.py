@@ -39,7 +39,6 @@ class Px4Fence:
         self._is_valid = True
 
     def on_uploaded(self) -> None:
-        """Use the uploaded areas. If they exclude home, send a text and ignore them."""
         home_north, home_east, _ = self._px4.home
         self._is_valid = self._areas_allow(home_north, home_east)
         if not self._is_valid:
@@ -47,19 +46,18 @@ class Px4Fence:
 
     @property
     def breaches(self) -> list[str]:
-        """Texts of the current breaches; empty while GF_ACTION is 0."""
+        """Texts of the current breaches."""
         motion = self._px4.motion
         if round(self._px4.parameters["GF_ACTION"]) == _NO_ACTION:
             return []
         return self.breaches_at(motion.place)
 
     def allows(self, place: Ned) -> bool:
-        """Return True if GF_ACTION only warns or does nothing, or if the point breaches no limit."""
         action = round(self._px4.parameters["GF_ACTION"])
         return action in (_NO_ACTION, _WARNING) or not self.breaches_at(place)
 
     def breaches_at(self, place: Ned) -> list[str]:
-        """Return the texts of breaches at a point (metres north, east, down)."""
+        """Return the texts of the breaches at a point."""
         px4 = self._px4
         north, east, down = place
         home_north, home_east, home_down = px4.home
@@ -80,7 +78,6 @@ class Px4Fence:
         return self._areas_allow(north, east)
 
     def _areas_allow(self, north: float, east: float) -> bool:
-        """Return True for a place outside all exclusions, and inside one of the inclusions if there are any."""
         areas = list(self._areas(north, east))
         is_inside_inclusions = [is_inside for is_inclusion, is_inside in areas if is_inclusion]
         is_inside_exclusions = [is_inside for is_inclusion, is_inside in areas if not is_inclusion]
@@ -89,7 +86,7 @@ class Px4Fence:
         return not is_inside_inclusions or any(is_inside_inclusions)
 
     def _areas(self, north: float, east: float) -> Iterator[tuple[bool, bool]]:
-        """Yield for each area whether it is an inclusion area, and whether the point is inside the area."""
+        """Yield (is an inclusion area, contains the point) for each area."""
         items, index = self._items(), 0
         while index < len(items):
             item = items[index]
@@ -187,7 +184,6 @@ class Px4Failsafes:
 
     @property
     def acts(self) -> bool:
-        """True if the current action is more than a warning."""
         return self.action > Action.WARN
 
     def _on_heartbeat(self, beat: m.Heartbeat, channel: Channel) -> None:
@@ -223,10 +219,6 @@ class Px4Failsafes:
         return MavBatteryChargeState.LOW if share < limits["BAT_LOW_THR"] else MavBatteryChargeState.OK
 
     def _battery_action(self) -> FailsafeAction:
-        """Return the action for the state of the battery.
-
-        COM_LOW_BAT_ACT selects it: 0 warns, 2 lands, and 3 returns or, if the state is EMERGENCY, lands.
-        """
         state, action = self.battery_state, round(self._px4.parameters["COM_LOW_BAT_ACT"])
         if state == MavBatteryChargeState.OK:
             return Action.NONE
@@ -249,7 +241,7 @@ class Px4Failsafes:
         return reasons
 
     def on_armed(self) -> None:
-        """Reset all actions. A failure that exists at arming does not trigger a failsafe."""
+        # A failure that exists at arming does not trigger a failsafe.
         self._had_manual_control = self._px4.sticks.are_fresh
         self._position_at = self._px4.now
         level = self._battery_level()
@@ -282,7 +274,6 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_DLL_ACT"]), Action.NONE)
 
     def _sticks_action(self) -> FailsafeAction:
-        """Return the action for the loss of stick input; NONE if no stick input was received since arming."""
         sticks = self._px4.sticks
         self._had_manual_control = self._had_manual_control or sticks.are_fresh
         is_lost = self._had_manual_control and not sticks.are_fresh
@@ -291,7 +282,6 @@ class Px4Failsafes:
         return _LINK_ACTIONS.get(round(self._px4.parameters["NAV_RCL_ACT"]), Action.NONE)
 
     def _position_action(self) -> FailsafeAction:
-        """Return LAND if the intended mode needs a position and there was none for 5 s; otherwise NONE."""
         px4 = self._px4
         if px4.has_position:
             self._position_at = px4.now
@@ -313,10 +303,7 @@ class Px4Failsafes:
         return is_allowed and moved * 100 >= parameters["COM_RC_STICK_OV"]
 
     def _is_excepted(self, parameter: str) -> bool:
-        """Return True if a bit of the parameter excludes the intended mode from the failsafe.
-
-        The bits are 1 for MISSION, 2 for other automatic modes and 4 for OFFBOARD.
-        """
+        """Return True if the parameter excludes the intended mode from the failsafe."""
         mode = self._px4.intended_mode
         main_mode, _ = mode
         mode_bit = 0
@@ -329,7 +316,6 @@ class Px4Failsafes:
         return bool(round(self._px4.parameters[parameter]) & mode_bit)
 
     def _fence_action(self) -> FailsafeAction:
-        """Return the action for a breach of the fence. Each new breach is also reported by a text."""
         breaches = self.fence.breaches
         for text in breaches:
             if text not in self._breaches:
@@ -340,7 +326,6 @@ class Px4Failsafes:
         return _FENCE_ACTIONS.get(round(self._px4.parameters["GF_ACTION"]), Action.WARN)  # Other values only warn.
 
     def check(self) -> None:
-        """Check for failures and execute the action. After a flight termination, do nothing."""
         if self._px4.arming.is_terminated:
             return
         self._watch_station()
@@ -353,28 +338,23 @@ class Px4Failsafes:
         self._execute(self._choose())
 
     def _update(self, failing: dict[str, FailsafeAction]) -> None:
-        """Update the active failures. ``failing`` maps the present failures to their actions.
-
-        The rules apply to actions more severe than WARN. A new failure, or a more severe action for an old one, starts
-        the delay COM_FAIL_ACT_T. A new failure also ends an override by the user. A failure that has ended stays active
-        until the user changes the mode.
-        """
+        """Update the active failures. ``failing`` maps the present failures to their actions."""
         for cause, action in failing.items():
+            # A new failure ends an override by the user.
             if cause not in self._active and action >= Action.HOLD:
                 self._is_overridden = False
+            # A new failure, or a more severe action for an old one, starts the delay COM_FAIL_ACT_T.
             is_worse = action > self._active.get(cause, Action.WARN)
             has_delay_ended = self._holds_until < self._px4.now
             if is_worse and self.action <= Action.HOLD and has_delay_ended:
                 self._holds_until = self._px4.now + self._px4.parameters["COM_FAIL_ACT_T"]
+        # A failure that has ended stays active until the user changes the mode.
         still_acting = {cause: action for cause, action in self._active.items() if action >= Action.HOLD}
         self._active = {**still_acting, **failing}
         self._failing = frozenset(failing)
 
     def _choose(self) -> FailsafeAction:
-        """Return the action to execute: the most severe one of the active failures, or a milder action.
-
-        After an override by the user, only warn. In LAND and RTL, warn instead of returning. During the delay, hold.
-        """
+        """Return the action to execute, which may be milder than that of the worst failure."""
         worst = max(self._active.values(), default=Action.NONE)
         can_hold = self._px4.has_position
         if worst in (Action.HOLD, Action.RETURN) and not can_hold:
@@ -391,7 +371,6 @@ class Px4Failsafes:
         return worst
 
     def _execute(self, action: FailsafeAction) -> None:
-        """Start an action, unless it is the present one. NONE and WARN end the failsafe."""
         if action == self.action:
             return
         px4, previous = self._px4, self.action
@@ -417,7 +396,7 @@ class Px4Failsafes:
         self._px4.send_text(MavSeverity.CRITICAL, text)
 
     def override(self) -> None:
-        """Handle a mode change by the user: forget failures that have ended, and reduce the action to a warning."""
+        """Handle a mode change by the user."""
         self._active = {cause: action for cause, action in self._active.items() if cause in self._failing}
         if self.action > Action.WARN:
             self._is_overridden = bool(self._active)

@@ -30,7 +30,7 @@ class Px4Orbit:
         self.speed_m_s: float = 1.0
 
     def plan(self, radius_m: float, speed_m_s: float, place: tuple[float, float], down: float) -> bool:
-        """Set a new circle. If the radius is out of range, keep the old circle and return False."""
+        """Set a new circle. Return False, and keep the old one, if the radius is out of range."""
         if not _MIN_RADIUS_M <= abs(radius_m) <= _MAX_RADIUS_M:
             return False
         self.radius_m = radius_m
@@ -40,7 +40,6 @@ class Px4Orbit:
         return True
 
     def update(self) -> None:
-        """Fly along the circle for one tick, and back to it if the vehicle is off the circle."""
         motion = self._px4.motion
         middle_north, middle_east = self.middle
         north, east = motion.north - middle_north, motion.east - middle_east
@@ -77,7 +76,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return the destination of RTL: north, east, and the down coordinate to which the heights of RTL are relative."""
+    """Return the destination of RTL, whose down coordinate is the reference for the heights of RTL."""
     rtl_type = round(px4.parameters["RTL_TYPE"])
     rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
@@ -119,16 +118,13 @@ class Px4Flight:
 
     @property
     def cruise_speed_m_s(self) -> float:
-        """Horizontal speed in m/s with which a mode flies until another speed is commanded."""
         return self._vehicle.parameters["MPC_XY_CRUISE"]
 
     @property
     def top_speed_m_s(self) -> float:
-        """Maximum horizontal speed in m/s that can be commanded."""
         return self._vehicle.parameters["MPC_XY_VEL_MAX"]
 
     def enter(self, mode: Px4Mode) -> None:
-        """Prepare the flight in a new mode."""
         self.speed_m_s = self.cruise_speed_m_s
         self.heading = None
         self._phase = "climb"
@@ -146,7 +142,6 @@ class Px4Flight:
         self.target = self._vehicle.motion.stopping_place
 
     def update(self) -> None:
-        """Fly for one tick as the present mode commands."""
         vehicle = self._vehicle
         mode = vehicle.mode
         self.lifts_off = (
@@ -181,14 +176,12 @@ class Px4Flight:
             self.go()
 
     def _lift_off(self) -> None:
-        """Leave the ground once the motors have reached their speed."""
         vehicle = self._vehicle
         if vehicle.now - vehicle.arming.armed_at >= _SPOOL_UP_S:
             self._ramp_began_at = vehicle.now
             vehicle.leave_ground()
 
     def _take_off(self) -> None:
-        """Climb to the target, with a rate that grows at first. Afterwards, hold there."""
         vehicle = self._vehicle
         ramp_duration_s = max(0.1, vehicle.parameters["MPC_TKO_RAMP_T"])  # The parameter may be 0.
         ramp = (vehicle.now - self._ramp_began_at) / ramp_duration_s
@@ -202,7 +195,7 @@ class Px4Flight:
             self.target = target
 
     def plan_take_off(self, down: float | None = None) -> None:
-        """Plan a vertical climb to ``down``; None: to MIS_TAKEOFF_ALT above home, or no climb if already higher."""
+        """Plan a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         self._is_default_height = down is None
         if down is None:
@@ -214,7 +207,6 @@ class Px4Flight:
             vehicle.call_later(0.0, self.announce_take_off)
 
     def announce_take_off(self) -> None:
-        """If the take-off uses the default height, send the text that says so."""
         if self._is_default_height:
             altitude = self._vehicle.parameters["MIS_TAKEOFF_ALT"]
             self._vehicle.info(f"Using default takeoff altitude: {altitude:.1f} m")
@@ -237,7 +229,6 @@ class Px4Flight:
 
     @property
     def descent_speed_m_s(self) -> float:
-        """Speed of a landing: MPC_Z_V_AUTO_DN above MPC_LAND_ALT1, MPC_LAND_SPEED below MPC_LAND_ALT2."""
         vehicle, limits = self._vehicle, self._vehicle.parameters
         fast, slow = limits["MPC_Z_V_AUTO_DN"], limits["MPC_LAND_SPEED"]
         high, low = limits["MPC_LAND_ALT1"], limits["MPC_LAND_ALT2"]
@@ -245,10 +236,6 @@ class Px4Flight:
         return slow + (fast - slow) * share
 
     def _plan_return(self) -> None:
-        """Plan a return to the landing point.
-
-        The minimum height above the point is RTL_RETURN_ALT, or RTL_DESCEND_ALT if the point is within RTL_MIN_DIST.
-        """
         vehicle = self._vehicle
         self.destination = return_destination(vehicle)
         north, east, down = vehicle.motion.place
@@ -266,7 +253,6 @@ class Px4Flight:
         vehicle.call_later(0.0, lambda: vehicle.info(text))  # PX4 sends this text after the text of the command.
 
     def _return(self) -> None:
-        """Continue the phase of the return: climb, fly to the destination, land."""
         vehicle, motion = self._vehicle, self._vehicle.motion
         if self._phase == "land":
             self.descend()

@@ -48,7 +48,7 @@ class Px4Events:
         return CurrentEventSequence((self._next_sequence - 1) & 0xFFFF, 0)
 
     def send_for(self, text: str) -> None:
-        """Send the event that says the same as a status text. Send nothing if PX4 has no such event."""
+        """Send the event with the content of a status text, if PX4 has one."""
         event = _event_of(text)
         if event is None:
             return
@@ -64,7 +64,7 @@ class Px4Events:
 
 
 def _event_of(text: str) -> tuple[int, bytes] | None:
-    """Return the id and arguments of the event that says the same as a status text; None if PX4 has no such event."""
+    """Return (event id, arguments) for a status text, or None if PX4 has no such event."""
     if text in _EVENT_IDS:
         return _EVENT_IDS[text], b""
     if text.startswith("Armed by "):
@@ -113,14 +113,12 @@ class Px4TextLinks:
         self._waiting: dict[Channel, deque[tuple[float, list[Statustext]]]] = {}
 
     def on_station_heartbeat(self, channel: Channel) -> None:
-        """Handle the HEARTBEAT of a ground station: send the texts that were queued in the last 5 s."""
         self._station_at[channel] = self._px4.now
         for sent_at, chunks in self._waiting.pop(channel, ()):
             if self._px4.now - sent_at < _MAX_AGE_S * self.speedup:
                 self._send(chunks, channel)
 
     def send(self, chunks: list[Statustext]) -> None:
-        """Send a text on the links with a ground station, and queue the text on the other links."""
         now, timeout_s = self._px4.now, _STATION_TIMEOUT_S * self.speedup
         for channel in self._px4.channels:
             if now - self._station_at.get(channel, -math.inf) <= timeout_s:
@@ -194,7 +192,7 @@ class Px4StreamRates:
         return {**rates, **fast, **_SIMULATION_RATES_HZ}
 
     def interval_us(self, channel: Channel, message_id: int) -> int:
-        """Return the interval to report in MESSAGE_INTERVAL: -1 means off or unknown, 0 means sent on change."""
+        """Return the interval for MESSAGE_INTERVAL. -1 is off or unknown, 0 is sent on change."""
         if message_id == m.Heartbeat.ID:
             return 1_000_000
         return self._intervals_us.get(channel, {}).get(message_id, _OFF)
@@ -213,8 +211,8 @@ class Px4StreamRates:
         return MavResult.ACCEPTED
 
     def on_requested(self, channel: Channel, message_id: int) -> None:
-        """Called for REQUEST_MESSAGE. A message that is off is then reported as sent on change in MESSAGE_INTERVAL."""
         intervals_us = self._intervals_us.get(channel, {})
+        # A message that is off is then reported as sent on change.
         if intervals_us.get(message_id) == _OFF:
             intervals_us[message_id] = _ON_CHANGE
 

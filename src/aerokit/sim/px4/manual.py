@@ -33,17 +33,14 @@ class Px4Sticks:
 
     @property
     def are_fresh(self) -> bool:
-        """True if manual control is enabled and was received within COM_RC_LOSS_T seconds."""
         return self.are_wanted and self._px4.now - self._moved_at <= self._px4.parameters["COM_RC_LOSS_T"]
 
     @property
     def are_wanted(self) -> bool:
-        """True if manual control is enabled (COM_RC_IN_MODE is not 4)."""
         return round(self._px4.parameters["COM_RC_IN_MODE"]) != _NO_MANUAL_CONTROL
 
     @property
     def has_channels(self) -> bool:
-        """True if RC_CHANNELS_OVERRIDE was received within COM_RC_LOSS_T seconds."""
         return self._px4.now - self._channels_at <= self._px4.parameters["COM_RC_LOSS_T"]
 
     def _on_manual_control(self, control: m.ManualControl, _: Channel) -> None:
@@ -55,7 +52,6 @@ class Px4Sticks:
         self._move(roll=control.y / 1000, pitch=control.x / 1000, yaw=control.r / 1000, throttle=control.z / 500 - 1.0)
 
     def _on_override(self, override: m.RcChannelsOverride, _: Channel) -> None:
-        """Handle RC_CHANNELS_OVERRIDE. Parameters map the channels to sticks."""
         values = [getattr(override, f"chan{number}_raw") for number in range(1, _CHANNELS + 1)]
         self.channels = tuple(values)
         self._channels_at = self._px4.now
@@ -65,7 +61,6 @@ class Px4Sticks:
             self._move(roll, pitch, yaw, throttle)
 
     def _move(self, roll: float, pitch: float, yaw: float, throttle: float) -> None:
-        """Store new stick positions, and report how far the sticks have moved."""
         previous = (self.roll, self.pitch, self.yaw, self.throttle)
         were_fresh = self.are_fresh
         self.roll = roll
@@ -80,7 +75,7 @@ class Px4Sticks:
 
 
 def _stick_position(pulse_us: int) -> float:
-    """Scale a pulse of 1000 to 2000 µs to the range from -1 to 1. Return 0 for an unused channel."""
+    """Scale a pulse in microseconds to the range from -1 to 1."""
     if pulse_us in (0, _UNUSED):
         return 0.0
     return max(-1.0, min(1.0, (pulse_us - 1500) / 500))
@@ -115,8 +110,8 @@ class Px4ManualFlight:
         self._turn_rate_rad_s = px4.motion.limits.turn_rate_rad_s
 
     def enter(self) -> None:
-        """Forget the held position and height, and restore the turn rate limit that `update` changes."""
         self._place = self._down = None
+        # `update` changes this limit.
         self._px4.motion.limits.turn_rate_rad_s = self._turn_rate_rad_s
 
     @property
@@ -129,7 +124,6 @@ class Px4ManualFlight:
         return self._thrust > 1.0
 
     def update(self) -> None:
-        """Follow the sticks for one tick, as the present manual mode interprets them."""
         px4, sticks = self._px4, self._px4.sticks
         max_rate = math.radians(px4.parameters["MPC_MAN_Y_MAX"])
         px4.motion.limits.turn_rate_rad_s = max_rate
@@ -143,7 +137,6 @@ class Px4ManualFlight:
         px4.motion.seek_attitude(tilt * sticks.roll, pitch, down)
 
     def _fly_velocity(self) -> None:
-        """Fly with the velocity that the sticks command, or hold the place while they are centered."""
         px4, sticks, motion = self._px4, self._px4.sticks, self._px4.motion
         max_speed = px4.parameters["MPC_VEL_MANUAL"] * (_SLOW_SHARE if px4.mode == POSITION_SLOW else 1.0)
         forward = max_speed * curved(sticks.pitch, _EXPO, _DEAD_ZONE)
@@ -167,7 +160,7 @@ class Px4ManualFlight:
         motion.seek_velocity(north - motion.north, east - motion.east, down)  # 1 m/s for each metre of distance
 
     def _height_velocity(self) -> float:
-        """Return the vertical velocity (m/s down) that the throttle stick commands. The center holds the height."""
+        """Return the vertical velocity in m/s (down) that the throttle stick commands."""
         px4, motion = self._px4, self._px4.motion
         throttle = curved(px4.sticks.throttle, _EXPO, _DEAD_ZONE)
         if throttle > 0:
@@ -184,7 +177,7 @@ class Px4ManualFlight:
 
     @property
     def _thrust(self) -> float:
-        """Thrust divided by the hover thrust. The stick sets a thrust from MPC_MANTHR_MIN to 1; its center hovers."""
+        """Thrust divided by the hover thrust."""
         parameters, throttle = self._px4.parameters, self._px4.sticks.throttle
         hover, min_thrust = parameters["MPC_THR_HOVER"], parameters["MPC_MANTHR_MIN"]
         thrust_range = 1.0 - hover if throttle > 0 else hover - min_thrust

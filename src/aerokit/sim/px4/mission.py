@@ -33,7 +33,7 @@ _MAX_FIRST_DISTANCE_M = 10_000.0
 
 
 def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return the text with which PX4 rejects a mission; None if it is accepted. Glide slopes are not checked."""
+    """Return the text with which PX4 rejects a mission, or None."""
     if px4.VEHICLE_TYPE == MavType.QUADROTOR and any(item.command in _VTOL for item in items):
         return "Mission contains VTOL items but vehicle is not a VTOL"
     has_place = False
@@ -48,18 +48,16 @@ def rejection(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
             if has_place:
                 return "takeoff not first waypoint item"
         has_place = has_place or item.command in _WITH_PLACE
+    # Glide slopes are not checked.
     return _missing_landing(px4, items) or _landing_problem(items)
 
 
 def _missing_landing(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about a missing take-off or landing; None if nothing is missing.
-
-    MIS_TKO_LAND_REQ is 0 to require nothing, 1 a take-off, 2 (the default of planes) a landing, 3 both, 4 both or none.
-    """
     if "MIS_TKO_LAND_REQ" not in px4.parameters or not items:  # A multicopter has no MIS_TKO_LAND_REQ.
         return None
     takes_off = any(item.command in _TAKE_OFFS for item in items)
     lands = any(item.command in _LANDINGS for item in items)
+    # The default of planes is 2.
     required = round(px4.parameters["MIS_TKO_LAND_REQ"])
     if required == 1 and not takes_off:
         return "Takeoff waypoint required."
@@ -81,7 +79,7 @@ def _height_above_home(px4: Px4Host, item: MissionItem) -> float:
 
 
 def _landing_problem(items: Sequence[MissionItem]) -> str | None:
-    """Return PX4's text about an invalid order of DO_LAND_START, landing and return; None if it is valid."""
+    """Return PX4's text about an invalid order of DO_LAND_START, landing and return."""
     # Indices of DO_LAND_START (`land_start`) and of the item before the landing (`approach`); -1 without such an item.
     land_start = approach = -1
     for index, item in enumerate(items):
@@ -100,7 +98,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
 
 
 def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
-    """Return the number of the first item outside the geofence, or None. The first item has the number 1."""
+    """Return the number of the first item outside the geofence. The first item has the number 1."""
     _, _, home_down = px4.home
     for number, item in enumerate(items, start=1):
         if item.command in _WITH_PLACE:
@@ -111,8 +109,7 @@ def outside_fence(px4: Px4Host, items: Sequence[MissionItem]) -> int | None:
     return None
 
 
-def warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
-    """Return a warning if the first waypoint of a mission is far away, otherwise None."""
+def distance_warning(px4: Px4Host, items: Sequence[MissionItem]) -> str | None:
     home_north, home_east, _ = px4.home
     for item in items:
         if item.command in _WITH_PLACE:
@@ -149,7 +146,6 @@ class Px4Mission:
         self._is_report_scheduled = False  # True while a repetition is due
 
     def start(self) -> None:
-        """Called at boot. Check the mission, and from then on report the last reached item once a second."""
         self.is_valid = bool(self.count) and rejection(self._px4, self._px4.missions.commands) is None
         self._px4.every(1.0, self._repeat_reached)
 
@@ -168,7 +164,6 @@ class Px4Mission:
 
     @property
     def state(self) -> int:
-        """``mission_state`` of MISSION_CURRENT: a MISSION_STATE."""
         if not self.is_valid:
             self._state = MissionState.NO_MISSION
         elif self.is_finished:
@@ -187,7 +182,6 @@ class Px4Mission:
         return self._item is not None and not self.is_finished and self._phase != "land"
 
     def on_replaced(self, current: int) -> None:
-        """Handle the upload of a mission. In mission mode, start the new mission at once."""
         self.current = max(0, current)
         self.is_finished = False
         self.forget_reached()
@@ -202,21 +196,20 @@ class Px4Mission:
             self._px4.change_mode(HOLD)
 
     def _check(self) -> None:
-        """Check the stored mission and report its problems. An invalid mission stays stored, but is not flown."""
         items = self._px4.missions.commands
         problem = rejection(self._px4, items)
-        warning_text = warning(self._px4, items)
+        warning = distance_warning(self._px4, items)
         outside_number = outside_fence(self._px4, items)
+        # An invalid mission stays stored, but is not flown.
         self.is_valid = bool(items) and problem is None and outside_number is None
         if outside_number is not None:
             self._px4.send_text(MavSeverity.CRITICAL, f"Geofence violation for waypoint {outside_number}")
         if problem is not None:
             self._px4.send_text(MavSeverity.CRITICAL, f"Mission rejected: {problem}")
-        if warning_text is not None:
-            self._px4.send_text(MavSeverity.CRITICAL, warning_text)
+        if warning is not None:
+            self._px4.send_text(MavSeverity.CRITICAL, warning)
 
     def forget_reached(self) -> None:
-        """Forget which item was reached last, and stop the repetition of MISSION_ITEM_REACHED."""
         self.reached = -1
         self._repeats_left = 0
 
@@ -228,7 +221,6 @@ class Px4Mission:
             self._begin_item()
 
     def enter(self) -> None:
-        """Enter mission mode. A finished mission starts again, unless another item was selected in the meantime."""
         if not self.is_valid:
             return
         # A finished mission stays at its last item. If `current` is another item, that item was selected later.
@@ -243,7 +235,7 @@ class Px4Mission:
         self._begin_item()
 
     def _begin_item(self) -> None:
-        """Make the current item the target. Execute commands without a position, until an item has a position."""
+        """Execute commands up to the next item with a position, and make it the target."""
         for _ in range(_MAX_JUMPS + self.count):  # The number of steps is limited, because DO_JUMPs can form a loop.
             item = self._item
             self._arrived_at = math.nan
@@ -269,28 +261,25 @@ class Px4Mission:
             px4.call_later(0.0, self._return)
 
     def _return(self) -> None:
-        """Change to HOLD, then to RTL, so that the mission is not resumed after the landing."""
         self._px4.change_mode(HOLD)
+        # HOLD comes first, so that the mission is not resumed after the landing.
         if self._px4.change_mode(RTL):
             self._px4.info("Returning to launch")
 
     def _index_after_jump(self, item: MissionItem) -> int:
-        """Return the index at which the mission continues after a DO_JUMP.
-
-        PX4 stores in the DO_JUMP item how often it has jumped, and sends the changed item to the last client.
-        """
+        """Return the index at which the mission continues after a DO_JUMP."""
         index = self.current
         jumps_done = self._jumps.get(index, 0)
         if jumps_done >= item.param2:
             self._jumps.pop(index, None)  # The next execution of this DO_JUMP counts again from 0.
             return index + 1
         self._jumps[index] = jumps_done + 1
+        # PX4 stores in the item how often it has jumped, and sends the changed item to the last client.
         self._px4.missions.on_item_changed(index)
         is_target_valid = 0 <= item.param1 < self.count
         return int(item.param1) if is_target_valid else index + 1
 
     def _set_target_for(self, item: MissionItem) -> None:
-        """Set the flight's target for an item that begins."""
         px4, motion = self._px4, self._px4.motion
         self._phase = "go"
         if item.command == Cmd.NAV_DELAY:
@@ -308,7 +297,7 @@ class Px4Mission:
             px4.flight.target = target
 
     def _climb(self, down: float | None) -> None:
-        """Start a vertical climb to ``down``. A higher vehicle stays there. None selects MIS_TAKEOFF_ALT above home."""
+        """Start a vertical climb to ``down``. None selects MIS_TAKEOFF_ALT above home."""
         px4, motion = self._px4, self._px4.motion
         _, _, home_down = px4.home
         if down is None:
@@ -322,9 +311,9 @@ class Px4Mission:
         return item.command == Cmd.NAV_WAYPOINT and math.isfinite(item.param4)
 
     def _place(self, item: MissionItem) -> tuple[float, float, float]:
-        """Return the position of an item. For PX4, latitude and longitude 0 are an ordinary position."""
         px4, motion = self._px4, self._px4.motion
         north, east = px4.frame.to_local(round(item.x), round(item.y))
+        # For PX4, latitude and longitude 0 are an ordinary position.
         if not math.isfinite(item.z):
             return (north, east, motion.down)
         _, _, home_down = px4.home
@@ -332,7 +321,6 @@ class Px4Mission:
         return (north, east, (home_down if is_relative else px4.frame.origin.altitude_m) - item.z)
 
     def update(self) -> None:
-        """Run one tick in flight: set the motion target and check if the item is reached."""
         item, flight = self._item, self._px4.flight
         if item is None or self.is_finished:
             flight.go()
@@ -358,7 +346,6 @@ class Px4Mission:
                 self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
-        """Return True if the vehicle is within the acceptance radius of an item, and at its height."""
         if item.command == Cmd.NAV_DELAY:
             return True
         motion = self._px4.motion
@@ -379,7 +366,6 @@ class Px4Mission:
         return self._px4.now - self._arrived_at >= item.param1
 
     def on_landed(self) -> None:
-        """Handle a landing, which completes a landing item."""
         if self._px4.mode == MISSION and self._phase == "land" and not self.is_finished:
             self._mark_reached()
             if self._advance():
@@ -405,16 +391,15 @@ class Px4Mission:
         px4.call_later(0.0, self._hold)
 
     def _hold(self) -> None:
-        """Change to HOLD if the mission is still finished, and the vehicle still flies in the mode MISSION."""
         if self.is_finished and self._px4.mode == MISSION and self._px4.is_armed and not self._px4.is_landed:
             self._px4.change_mode(HOLD)
 
     def _mark_reached(self) -> None:
-        """Report the current item as reached. Of several items in the same tick, only the last is reported."""
         if self.reached == self.current:
             return
         self.reached = self.current
         self._repeats_left = _REPEATS
+        # Of several items in the same tick, only the last is reported.
         if not self._is_report_scheduled:
             self._is_report_scheduled = True
             self._px4.call_later(0.0, self._send_reached)

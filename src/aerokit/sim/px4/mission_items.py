@@ -13,6 +13,7 @@ from aerokit.mavlink.enums import MavCmd as Cmd
 from aerokit.mavlink.enums import MavFrame as Frame
 from aerokit.mavlink.enums import MavMissionResult, MavMissionType, MavRoi
 from aerokit.missions import MissionItem
+from aerokit.sim.commands import to_int
 from aerokit.sim.missions import float32
 
 _DATA = pkgutil.get_data(__name__, "mission_commands.csv")
@@ -65,7 +66,7 @@ def as_stored(item: MissionItem, mission_type: int, *, is_int: bool = True) -> M
 
 
 def as_downloaded(item: MissionItem, *, as_int: bool) -> MissionItem:
-    """Return an item as downloaded: as stored, except for global frames, which become _INT frames with ``as_int``."""
+    """Return an item as downloaded. With ``as_int``, global frames become _INT frames."""
     return item.replace(frame=_AS_INT.get(item.frame, item.frame)) if as_int else item
 
 
@@ -86,7 +87,6 @@ def checksum(items: Sequence[MissionItem], previous: int = 0) -> int:
 
 
 def _as_fence_point(item: MissionItem) -> MissionItem:
-    """Return a fence item as stored: param 1, z and, in a global frame, x and y. Every global frame becomes GLOBAL."""
     if item.frame == Frame.MISSION:
         return MissionItem(item.command, item.frame, item.param1, z=item.z, autocontinue=False)
     place = {"x": item.x, "y": item.y, "z": item.z}
@@ -94,13 +94,12 @@ def _as_fence_point(item: MissionItem) -> MissionItem:
 
 
 def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
-    """Return an item of a global frame as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
     layout = _COMMANDS_WITH_PLACE.get(item.command)
     if layout is None:
         return MavMissionResult.UNSUPPORTED
     command = item.command
     if command in _ROI_COMMANDS:
-        if _to_int(item.param1) not in _ROI_WITH_PLACE:
+        if to_int(item.param1) not in _ROI_WITH_PLACE:
             return MavMissionResult.INVALID_PARAM1
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     params = (item.param1, item.param2, item.param3, item.param4)
@@ -109,17 +108,16 @@ def _with_place(item: MissionItem, frame: int) -> MissionItem | int:
 
 
 def _without_place(item: MissionItem) -> MissionItem | int:
-    """Return an item of MAV_FRAME_MISSION as PX4 stores it, or the MAV_MISSION_RESULT of a refusal."""
     if item.command not in _COMMANDS_WITHOUT_PLACE:
         return MavMissionResult.UNSUPPORTED
     p1, p2, command = item.param1, item.param2, item.command
     if command == Cmd.DO_JUMP:  # PX4 stores the target as int16 and the number of repetitions as uint16.
-        target = _to_int(p1) & 0xFFFF
+        target = to_int(p1) & 0xFFFF
         if target & 0x8000:  # The highest bit of an int16 is its sign.
             target -= 0x10000
-        p1, p2 = float(target), float(_to_int(p2) & 0xFFFF)
+        p1, p2 = float(target), float(to_int(p2) & 0xFFFF)
     if command in _ROI_COMMANDS:
-        if _to_int(p1) not in _ROI_WITHOUT_PLACE:
+        if to_int(p1) not in _ROI_WITHOUT_PLACE:
             return MavMissionResult.INVALID_PARAM1
         command = Cmd.DO_SET_ROI  # PX4 stores both commands as DO_SET_ROI (mavlink_mission.cpp).
     # PX4 stores x and y as floats, and rounds them to integers for a download (mavlink_mission.cpp).
@@ -127,16 +125,12 @@ def _without_place(item: MissionItem) -> MissionItem | int:
     return item.replace(command=command, frame=Frame.MISSION, param1=p1, param2=p2, x=x, y=y)
 
 
-def _to_int(value: float) -> int:
-    return int(value) if abs(value) < 2**31 else 0
-
-
 def _rounded(value: float) -> int:
     return round(value) if abs(value) < 2**31 else _INT_MIN
 
 
 def _heading(degrees: float) -> float:
-    """Return a heading in degrees, from 0 to 360, with the rounding errors of PX4, which stores it in radians."""
+    """Return a heading in degrees with the rounding errors of PX4, which stores radians."""
     if not math.isfinite(degrees):
         return math.nan
     radians = float32(degrees * _RADIANS_PER_DEGREE)
@@ -150,8 +144,8 @@ def _heading(degrees: float) -> float:
 _CONVERSIONS: dict[str, Callable[[float], float]] = {
     "-": lambda _: 0.0,
     "f": float32,
-    "u": lambda value: float(_to_int(value) & 0xFFFF),
-    "v": lambda value: float(_to_int(value + 0.5) & 0xFFFF),
+    "u": lambda value: float(to_int(value) & 0xFFFF),
+    "v": lambda value: float(to_int(value + 0.5) & 0xFFFF),
     "?": lambda value: 1.0 if value > 0 else 0.0,
     "y": _heading,
 }

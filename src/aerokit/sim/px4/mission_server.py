@@ -50,7 +50,7 @@ class _Link(ListUpload):
 
     @property
     def is_retried(self) -> bool:
-        """True if the firmware repeats its last message (MISSION_REQUEST or MISSION_COUNT) until it is answered."""
+        """True if the firmware repeats its last message until it is answered."""
         return self.state is TransferState.GETTING or self.next == 0
 
 
@@ -66,7 +66,6 @@ class Px4MissionServer(MissionServer):
         self.requests_int: bool = not px4.version.startswith("1.16")
 
     def _link(self, channel: Channel) -> _Link:
-        """Return the state of a link; idle if the link has had no transfer yet."""
         if channel not in self._links:
             self._links[channel] = _Link(
                 _NO_PARTNER, channel, mission_type=0, next=0, end=0, received_at=0.0, requested_at=0.0,
@@ -80,15 +79,13 @@ class Px4MissionServer(MissionServer):
 
     @property
     def transfer_is_open(self) -> bool:
-        """True during an upload or download on any link."""
         return super().transfer_is_open or any(link.state is not TransferState.IDLE for link in self._links.values())
 
     def items(self, mission_type: int) -> list[MissionItem]:
-        """Return the items that a download sends; empty for an unknown type."""
         return [as_downloaded(item, as_int=True) for item in self.lists.get(mission_type, ())]
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
-        """Store a whole list at once, and return the MAV_MISSION_RESULT. PX4 itself has no such operation."""
+        # PX4 itself has no such operation.
         if mission_type not in _CAPACITIES or start or not clear:
             return Result.ERROR
         stored_items: list[MissionItem] = []
@@ -101,7 +98,6 @@ class Px4MissionServer(MissionServer):
         return Result.ACCEPTED
 
     def capacity(self, mission_type: int) -> int:
-        """Return the capacity; 0 for an unknown type."""
         return _CAPACITIES.get(mission_type, 0)
 
     def item(self, mission_type: int, seq: int) -> MissionItem | None:
@@ -110,11 +106,9 @@ class Px4MissionServer(MissionServer):
 
     @property
     def commands(self) -> Sequence[MissionItem]:
-        """The mission."""
         return self.lists[MavMissionType.MISSION]
 
     def _store_if_changed(self, mission_type: int, items: list[MissionItem], opaque_id: int, current: int = -1) -> None:
-        """Store a list of a known type. Do nothing if it has items and the stored list has the same opaque id."""
         if mission_type not in self.lists or (items and opaque_id == self.id(mission_type)):
             return
         self.store(mission_type, items)
@@ -125,7 +119,6 @@ class Px4MissionServer(MissionServer):
             self._px4.failsafes.fence.on_uploaded()
 
     def on_item_changed(self, seq: int) -> None:
-        """Send a changed item to the last client of each link, except during a transfer."""
         for link in self._links.values():
             if link.state is TransferState.IDLE and link.client != _NO_PARTNER:
                 link.mission_type = 0
@@ -138,7 +131,6 @@ class Px4MissionServer(MissionServer):
         self._acknowledge(to or link.client, link.mission_type, result, link.channel)
 
     def _begin_transfer(self, state: TransferState, message: AnyListMessage, channel: Channel, count: int) -> _Link:
-        """Start a transfer, which replaces the previous transfer of the link. The previous one is no longer retried."""
         client, kind, now = sender_of(message), message.mission_type, self._px4.now
         link = replace(
             self._link(channel), state=state, client=client, mission_type=kind, next=0, end=count, received_at=now
@@ -157,7 +149,6 @@ class Px4MissionServer(MissionServer):
         self._px4.send(m.MissionCount(*link.client, link.end, kind, self.id(kind)), link.channel)
 
     def _send_item(self, link: _Link, seq: int) -> None:
-        """Send the item ``seq`` to the client of a link, in the kind of message that it requested."""
         item = self.item(link.mission_type, seq)
         assert item is not None
         link.requested_at = self._px4.now
@@ -174,19 +165,16 @@ class Px4MissionServer(MissionServer):
         self._px4.send(message, link.channel)
 
     def _watch(self, upload: ListUpload) -> None:
-        """Check a transfer later: whether it has timed out, or its last message must be repeated."""
         due = upload.received_at + self.timeout_s
         if self._link(upload.channel).is_retried:
             due = min(due, self._px4.now + self.retry_interval_s)
         self._px4.call_at(due, lambda: self._check(upload))
 
     def _may_time_out(self, upload: ListUpload) -> bool:
-        """Return True unless the transfer has ended, or another transfer of its link has replaced it."""
         link = self._link(upload.channel)
         return link is upload and link.state is not TransferState.IDLE
 
     def _repeat(self, upload: ListUpload) -> None:
-        """Repeat the last message of a transfer, if the firmware would."""
         link = self._link(upload.channel)
         if link.state is TransferState.GETTING:
             self._request_item(link)
@@ -198,13 +186,10 @@ class Px4MissionServer(MissionServer):
         self._drop(upload)
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
-        """Start or restart a download.
-
-        A transfer that is open on this link is ended first if the number of items it has transferred equals the number
-        of stored items, as in PX4 (mavlink_mission.cpp, handle_mission_request_list). This may end an unfinished
-        upload. PX4 then refuses other uploads until a download times out.
-        """
         link = self._link(channel)
+        # PX4 first ends an open transfer that has reached the number of stored items (mavlink_mission.cpp,
+        # handle_mission_request_list). This may end an unfinished upload. PX4 then refuses other uploads until a
+        # download times out.
         if link.next == self.count(link.mission_type):
             link.state = TransferState.IDLE
         is_same_transfer = link.client == sender_of(request) and link.mission_type == request.mission_type
@@ -215,7 +200,6 @@ class Px4MissionServer(MissionServer):
         self._send_count(self._begin_transfer(TransferState.SENDING, request, channel, count))
 
     def _on_request(self, request: AnyRequest, channel: Channel) -> None:
-        """Send the next item, or the previous item again. A request for any other index ends the download."""
         link = self._link(channel)
         link.uses_int = isinstance(request, m.MissionRequestInt)  # even if another client sends it, as in PX4
         if sender_of(request) != link.client:
@@ -236,10 +220,6 @@ class Px4MissionServer(MissionServer):
             self._warn("WPM: REJ. CMD: Req. WP was unexpected")
 
     def _on_ack(self, ack: m.MissionAck, channel: Channel) -> None:
-        """End a download, or cancel an upload.
-
-        After UNSUPPORTED, an upload goes on with MISSION_REQUEST instead of MISSION_REQUEST_INT, or the reverse.
-        """
         link = self._link(channel)
         if sender_of(ack) != link.client:
             self._warn("REJ. WP CMD: partner id mismatch")
@@ -247,13 +227,13 @@ class Px4MissionServer(MissionServer):
             link.received_at = self._px4.now
             link.state = TransferState.IDLE
         elif link.state is TransferState.GETTING and ack.type == Result.UNSUPPORTED:
+            # The upload goes on with the other kind of request.
             link.uses_int = not link.uses_int
             self._request_item(link)
         elif link.state is TransferState.GETTING and ack.type == Result.OPERATION_CANCELLED:
             self._drop(link)
 
     def _on_count(self, message: m.MissionCount, channel: Channel) -> None:
-        """Start an upload. A repeated MISSION_COUNT is answered with the request of the first item again."""
         link, sender = self._link(channel), sender_of(message)
         if link.state is TransferState.SENDING:
             self._warn("WPM: IGN MISSION_COUNT: Busy")
@@ -271,7 +251,6 @@ class Px4MissionServer(MissionServer):
             self._request_item(link)
 
     def _accept(self, link: _Link, count: m.MissionCount) -> None:
-        """Start an upload or refuse it. An upload of no items stores an empty list at once."""
         if self._uploads:  # PX4 has one upload at a time, on all links.
             self._answer(link, Result.ERROR, sender_of(count))
             return
@@ -292,7 +271,6 @@ class Px4MissionServer(MissionServer):
             self._request_item(link)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        """Handle an item of an upload. An unexpected item is not stored."""
         link = self._link(channel)
         link.uses_int = isinstance(message, m.MissionItemInt)  # even if another client sends it, as in PX4
         if sender_of(message) != link.client:
@@ -311,7 +289,6 @@ class Px4MissionServer(MissionServer):
             self._answer(link, Result.ERROR)
 
     def _store_item(self, upload: ListUpload, message: AnyItem) -> int:
-        """Store an item of an upload. Return a MAV_MISSION_RESULT."""
         link = self._link(upload.channel)
         item = item_from(message)
         is_int = isinstance(message, m.MissionItemInt)
@@ -338,15 +315,12 @@ class Px4MissionServer(MissionServer):
         self._end(link, Result.ACCEPTED)
 
     def _on_clear(self, request: m.MissionClearAll, channel: Channel) -> None:
-        """Clear a list, or all lists for MAV_MISSION_TYPE_ALL. During a transfer, send a text instead.
-
-        PX4 accepts an unknown type, too (mavlink_mission.cpp, handle_mission_clear_all).
-        """
         link = self._link(channel)
         if link.state is not TransferState.IDLE:
             self._warn("WPM: IGN CLEAR CMD: Busy")
             return
         link.mission_type = request.mission_type
+        # PX4 accepts an unknown type, too (mavlink_mission.cpp, handle_mission_clear_all).
         for kind in _CAPACITIES:
             if request.mission_type in (kind, MavMissionType.ALL):
                 self._store_if_changed(kind, [], opaque_id=0, current=0)

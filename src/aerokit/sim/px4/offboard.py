@@ -59,17 +59,14 @@ class Px4Offboard:
 
     @property
     def is_fresh(self) -> bool:
-        """True if a set-point was received within COM_OF_LOSS_T seconds."""
         return self._vehicle.now - self.updated_at <= self._vehicle.parameters["COM_OF_LOSS_T"]
 
     @property
     def position(self) -> Ned:
-        """Target position; NaN for unset axes."""
         return self._position
 
     @property
     def wants_up(self) -> bool:
-        """True if the set-point leads upwards, so that a landed vehicle takes off."""
         if self._attitude is not None:
             return self._thrust > 0.5
         _, _, position_down = self._position
@@ -79,7 +76,6 @@ class Px4Offboard:
         return any(down < -_UPWARDS for down in components)  # False for components that are NaN
 
     def _on_local(self, target: SetPositionTargetLocalNed, _: Channel) -> None:
-        """Handle SET_POSITION_TARGET_LOCAL_NED."""
         frame = target.coordinate_frame
         if frame not in (MavFrame.LOCAL_NED, MavFrame.BODY_NED):
             self._warn(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {frame} unsupported")
@@ -91,7 +87,6 @@ class Px4Offboard:
             self._warn("SET_POSITION_TARGET_LOCAL_NED invalid")
 
     def _on_global(self, target: SetPositionTargetGlobalInt, _: Channel) -> None:
-        """Handle SET_POSITION_TARGET_GLOBAL_INT."""
         if target.coordinate_frame not in _GLOBAL_FRAMES:
             frame = target.coordinate_frame
             self._warn(f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {frame}")
@@ -108,7 +103,6 @@ class Px4Offboard:
         self._vehicle.send_text(MavSeverity.CRITICAL, text)
 
     def _store(self, target: PositionTarget, position: Ned, *, is_body: bool) -> bool:
-        """Store a set-point. Return False if it has no position, velocity or acceleration on any axis."""
         setpoint = Setpoint.of(target)
         position, velocity, acceleration = setpoint.axes(position)
         if all(map(math.isnan, (*position, *velocity, *acceleration))):
@@ -124,7 +118,6 @@ class Px4Offboard:
         return True
 
     def _on_attitude(self, target: SetAttitudeTarget, _: Channel) -> None:
-        """Handle SET_ATTITUDE_TARGET, which contains an attitude or body rates."""
         motion = self._vehicle.motion
         if target.type_mask & AttitudeTargetTypemask.ATTITUDE_IGNORE:
             if self._attitude is None or self._body_rates is None:  # Rates start from the present attitude.
@@ -138,10 +131,7 @@ class Px4Offboard:
         self.updated_at = self._vehicle.now
 
     def _on_actuators(self, target: SetActuatorControlTarget, _: Channel) -> None:
-        """Hold the attitude, with the thrust of actuator group 0. A message for another group keeps the old thrust.
-
-        PX4 1.14 and later ignore the message.
-        """
+        # PX4 1.14 and later ignore the message.
         if self._vehicle.version_number >= _VERSION_1_14:
             return
         motion = self._vehicle.motion
@@ -153,7 +143,7 @@ class Px4Offboard:
         self.updated_at = self._vehicle.now
 
     def watch(self) -> None:
-        """Switch to RTL (in version 1.16, to POSITION) when the set-points stop, and back when they resume."""
+        """Change the mode when the set-points stop, and back when they resume."""
         vehicle = self._vehicle
         if vehicle.intended_mode != OFFBOARD or vehicle.failsafes.acts:
             return
@@ -166,7 +156,6 @@ class Px4Offboard:
             vehicle.switch_to(OFFBOARD)
 
     def fly(self) -> None:
-        """Follow the latest set-point for one tick."""
         motion = self._vehicle.motion
         # `fly` is called only in OFFBOARD. Without the limit, the first call after another mode would count the whole
         # time in that mode.
@@ -185,7 +174,6 @@ class Px4Offboard:
             motion.turn(self._yaw_rate if math.isfinite(self._yaw_rate) else 0.0)
 
     def _fly_attitude(self, attitude: tuple[float, float, float], elapsed: float) -> None:
-        """Turn the target attitude at the body rates for ``elapsed`` seconds, and then follow it."""
         motion = self._vehicle.motion
         if self._body_rates is not None:
             angles_and_rates = zip(attitude, self._body_rates, strict=True)
@@ -198,7 +186,6 @@ class Px4Offboard:
         motion.face(yaw)
 
     def _wanted_velocity(self) -> Ned:
-        """Return the target velocity. On axes with a target position, add the velocity towards that position."""
         motion, limits = self._vehicle.motion, self._vehicle.parameters
         place = motion.place
         max_horizontal = limits["MPC_XY_VEL_MAX"]

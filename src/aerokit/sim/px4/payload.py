@@ -59,7 +59,6 @@ class Px4Gimbal:
         px4.on(m.GimbalManagerSetAttitude, self._on_attitude)
 
     def start(self) -> None:
-        """Called at power-on. Check if a gimbal is fitted, center it, and release control of it."""
         parameters = self._px4.parameters
         self.is_fitted = "MNT_MODE_IN" in parameters and parameters["MNT_MODE_IN"] in _FITTED_BY
         self.rest()
@@ -69,7 +68,6 @@ class Px4Gimbal:
 
     @property
     def own_ids(self) -> tuple[int, int]:
-        """System and component id of the vehicle."""
         return self._px4.system_id, self._px4.component_id
 
     @property
@@ -84,7 +82,7 @@ class Px4Gimbal:
         return locks | yaw_flag
 
     def angles(self) -> Angles:
-        """Return roll, pitch and yaw (radians) to which the gimbal is set at present."""
+        """Return the present set-point: roll, pitch and yaw in radians."""
         if self._place is not None:
             return self._angles_to(self._place)
         # The gimbal turns at only `_RATE_FACTOR` of the commanded rates, for at most `_RATE_TIMEOUT_S`.
@@ -97,9 +95,9 @@ class Px4Gimbal:
         return (roll, pitch, yaw)
 
     def _angles_to(self, place: tuple[int, int, float]) -> Angles:
-        """Return the angles (yaw from north) with which the gimbal points at a place.
+        """Return the angles that point at a place, with yaw from north.
 
-        ``place`` contains latitude and longitude (degrees times 1e7) and altitude AMSL.
+        ``place`` has latitude and longitude in degrees times 1e7, and the altitude AMSL.
         """
         latitude_e7, longitude_e7, altitude_m = place
         motion = self._px4.motion
@@ -112,10 +110,7 @@ class Px4Gimbal:
         return (0.0, pitch, math.atan2(east, north))
 
     def apply(self, flags: int, angles: Angles, rates: Angles) -> None:
-        """Set the angles and the rates at which they change.
-
-        If any angle is NaN, all three angles stay. NEUTRAL centers the gimbal, RETRACT changes nothing.
-        """
+        """Set the angles, and the rates at which they change. If any angle is NaN, all angles stay."""
         if flags & Flags.RETRACT:
             return
         current = self.angles()
@@ -135,7 +130,7 @@ class Px4Gimbal:
         self._target = self._rates = _NEUTRAL
 
     def look_at(self, latitude_e7: int, longitude_e7: int, altitude_m: float) -> None:
-        """Point at a position (altitude AMSL)."""
+        """Point at a position. The altitude is AMSL."""
         self._place = (latitude_e7, longitude_e7, altitude_m)
 
     def _poll_return(self) -> None:
@@ -176,13 +171,13 @@ class Px4Gimbal:
         return m.GimbalManagerStatus(self._px4.time_boot_ms, self.flags, _DEVICE_ID, *self.in_control, *no_secondary)
 
 
+# In PX4, unlike in the standard, -2 gives control to the autopilot instead of the sender.
 _SELF, _RELEASE = -2, -3
 
 
 def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
-    """Return the handlers of gimbal commands by MAV_CMD. Without a gimbal, most commands are not answered."""
-
     def if_fitted(handler: Callable[[Px4Gimbal, ReceivedCommand], int]) -> CommandHandler:
+        # Without a gimbal, most commands are not answered.
         return lambda command: handler(gimbal, command) if gimbal.is_fitted else None
 
     return {
@@ -196,10 +191,6 @@ def gimbal_commands(gimbal: Px4Gimbal) -> dict[int, CommandHandler]:
 
 
 def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    """Set the system id and the component id that are in control.
-
-    In PX4, unlike in the standard, -2 gives control to the autopilot instead of the sender. -3 releases control.
-    """
     # The firmware applies special values to the system id (param 1) and to the component id (param 2) separately.
     requested = (to_int(command.param1), to_int(command.param2))
     system, component = map(_id_in_control, requested, gimbal.in_control, gimbal.own_ids, command.sender)
@@ -208,7 +199,6 @@ def _configure(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _id_in_control(requested: int, present: int, own: int, sender: int) -> int:
-    """Return the new id in control. -2 selects ``own``, -3 releases control if ``sender`` has it, -1 keeps it."""
     if requested == _SELF:
         return own
     if requested == _RELEASE:
@@ -226,7 +216,7 @@ def _pitch_and_yaw(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
-    """Handle DO_MOUNT_CONTROL. Modes other than these three are accepted, but have no effect."""
+    # Modes other than these three are accepted, but have no effect.
     mode = to_int(command.z)
     if mode in (MavMountMode.RETRACT, MavMountMode.NEUTRAL):
         gimbal.rest()
@@ -238,7 +228,7 @@ def _control_mount(gimbal: Px4Gimbal, command: ReceivedCommand) -> int:
 
 
 def _set_roi(gimbal: Px4Gimbal, command: ReceivedCommand | None) -> int:
-    """Point at the position of a command, whose altitude counts as AMSL in every frame. None resets the gimbal."""
+    # The altitude of the command counts as AMSL in every frame.
     if command is None:
         gimbal.rest()
     elif math.isfinite(command.z):
@@ -271,7 +261,6 @@ class Px4CameraTrigger:
 
     @property
     def is_fitted(self) -> bool:
-        """True while TRIG_MODE is not 0."""
         return int(self._px4.parameters.get("TRIG_MODE", 0)) != 0
 
     @property
@@ -291,7 +280,6 @@ class Px4CameraTrigger:
         }
 
     def _digicam_control(self, command: ReceivedCommand) -> int | None:
-        """Handle DO_DIGICAM_CONTROL. If no trigger is fitted, return None, which sends no answer."""
         if not self.is_fitted:
             return None
         if self._px4.now - self._last_at < _MIN_INTERVAL_S:  # The camera is not ready for another image.
@@ -302,13 +290,10 @@ class Px4CameraTrigger:
         return MavResult.ACCEPTED
 
     def _enable_or_pause(self, command: ReceivedCommand) -> int | None:
-        """Handle DO_TRIGGER_CONTROL. Param 1 enables (1) or disables (0) triggering, param 3 pauses (1) or resumes (0).
-
-        Param 2 is 1 to reset the sequence number of the images. A param of -1 changes nothing.
-        """
         if not self.is_fitted:
             return None
         was_running = self.is_running
+        # A param of -1 changes nothing.
         enable, reset, pause = to_int(command.param1), to_int(command.param2), to_int(command.param3)
         if pause in (0, 1):
             self._is_paused = pause == 1
@@ -342,7 +327,6 @@ class Px4CameraTrigger:
             px4.call_later(_GEOTAG_DELAY_S, lambda: self._send_captured(number))
 
     def _send_captured(self, number: int) -> None:
-        """Send CAMERA_IMAGE_CAPTURED for an image, with the true position."""
         px4, pose = self._px4, pose_of(self._px4)
         if pose is None:
             return

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import pkgutil
 from collections.abc import Callable, Sequence
 
 from aerokit.errors import RemoteProtocolError
-from aerokit.mavlink.enums import MavSeverity
+from aerokit.mavlink.enums import MavParamType, MavSeverity
 from aerokit.mavlink.frame import Frame
 from aerokit.mavlink.messages import AdsbVehicle, Collision, Heartbeat
 from aerokit.mavlink.signing import SigningKey
@@ -39,10 +40,7 @@ RTL_LOITER_RAD RTL_MIN_DIST RTL_RETURN_ALT RTL_TYPE RWTO_RAMP_TIME SDLOG_MODE SY
 
 
 def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimParameters:
-    """Return the 910 parameters of a "quadrotor" or the 978 parameters of an "airplane".
-
-    ``count`` limits the number of parameters, but all parameters that the simulation reads are kept.
-    """
+    """Return the parameters of a "quadrotor" or an "airplane". ``count`` limits their number."""
     data = pkgutil.get_data(__name__, f"{table}.param.csv")
     assert data is not None
     return SimParameters.from_text(data.decode(), used=_USED_PARAMETERS.split(), count=count)
@@ -84,7 +82,6 @@ class _Writer(FileHandle):
         raise FileFault(EINVAL)
 
     def write(self, offset: int, data: bytes) -> None:
-        """Receive bytes at a position of the file, and apply the entries that are complete."""
         new_bytes = data[max(0, self._written - offset) :]  # A repeated write contains bytes that were received before.
         has_gap = offset > self._written
         if self._is_rejected or has_gap:
@@ -108,7 +105,7 @@ class _Writer(FileHandle):
         return FileFault(EINVAL)
 
     def _parse(self) -> None:
-        """Apply the entries of which all bytes were received."""
+        """Apply the entries that are complete."""
         if self._announced is None:
             if len(self._pending) < HEADER.size:
                 return
@@ -121,7 +118,7 @@ class _Writer(FileHandle):
             pass
 
     def _apply_next_entry(self) -> bool:
-        """Apply the next entry. Return False if not all of its bytes were received yet."""
+        """Apply the next entry. Return False if it is incomplete."""
         pending = self._pending = self._pending.lstrip(b"\0")  # Zero bytes between two entries are padding.
         try:
             entry = read_entry(pending, 0, self._previous_name) if pending else None
@@ -178,7 +175,6 @@ class Px4Storage:
             self.parameters.burst = self.ftp.burst = self.logs.burst = 1
 
     def restart(self) -> None:
-        """Drop transfers and sessions because of a reboot. Files stay."""
         self.parameters.restart()
         self.ftp.restart()
         self.logs.restart()
@@ -198,8 +194,10 @@ class Px4Storage:
 
     def _apply(self, name: str, value: float) -> None:
         """Apply a parameter of an uploaded file."""
-        if name not in self._px4.faults.read_only_parameters:
-            self._px4.parameters[name] = self.parameters.clamped(name, value)
+        parameters = self._px4.parameters
+        can_store = math.isfinite(value) or parameters.type(name) == MavParamType.REAL32
+        if name not in self._px4.faults.read_only_parameters and can_store:
+            parameters[name] = self.parameters.clamped(name, value)
 
 
 def _log_path(number: int) -> str:

@@ -54,7 +54,6 @@ _POSITION_FLAGS = Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_HORIZ_ABS | E
 
 
 def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
-    """Build HEARTBEAT."""
     mode = modes.TERMINATION if px4.arming.is_terminated else px4.mode
     base_mode = modes.MODES[mode].base_mode
     if px4.is_armed:
@@ -66,7 +65,6 @@ def _heartbeat(px4: Px4Vehicle) -> m.Heartbeat:
 
 
 def _state(px4: Px4Vehicle) -> MavState:
-    """Return the field system_status of HEARTBEAT."""
     if px4.arming.is_terminated:
         return MavState.FLIGHT_TERMINATION
     if px4.is_in_failsafe:
@@ -80,7 +78,6 @@ def _state(px4: Px4Vehicle) -> MavState:
 
 
 def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
-    """Build SYS_STATUS."""
     health = _HEALTHY if px4.is_ready else _BOOTING
     if not px4.is_armed and not px4.arming.is_possible:
         health &= ~_PREARM_BIT
@@ -104,7 +101,6 @@ def _sys_status(px4: Px4Vehicle) -> m.SysStatus:
 
 
 def _estimator_status(px4: Px4Vehicle) -> m.EstimatorStatus:
-    """Build ESTIMATOR_STATUS."""
     flags = _FLIGHT_FLAGS
     if not px4.is_armed:
         flags |= Ekf.CONST_POS_MODE
@@ -133,7 +129,6 @@ def _extended_sys_state(px4: Px4Vehicle) -> m.ExtendedSysState:
 
 
 def _battery_status(px4: Px4Vehicle) -> m.BatteryStatus:
-    """Build BATTERY_STATUS."""
     battery = px4.battery
     voltages = (round(battery.voltage_v * 1000), *(0xFFFF,) * 9)  # 0xFFFF means that there is no such cell.
     return m.BatteryStatus(
@@ -174,10 +169,8 @@ def _attitude_target(px4: Px4Vehicle) -> m.AttitudeTarget:
 
 
 def _global_position(px4: Px4Vehicle) -> m.GlobalPositionInt | None:
-    """Build GLOBAL_POSITION_INT. Without a position, PX4 does not send the message, whereas ArduPilot sends zeros.
-
-    If the position is lost in flight, PX4 continues with dead reckoning.
-    """
+    # Without a position, PX4 does not send the message, whereas ArduPilot sends zeros. If the position is lost in
+    # flight, PX4 continues with dead reckoning.
     if not px4.has_position and not px4.is_armed:
         return None
     motion = px4.motion
@@ -215,7 +208,6 @@ def _vfr_hud(px4: Px4Vehicle) -> m.VfrHud:
 
 
 def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
-    """Build GPS_RAW_INT."""
     motion = px4.motion
     if px4.faults.gps_lost:
         worst, unknown = 9999, 65535
@@ -234,7 +226,6 @@ def _gps_raw(px4: Px4Vehicle) -> m.GpsRawInt:
 
 
 def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
-    """Build HOME_POSITION; None while the vehicle boots."""
     if not px4.is_ready:
         return None
     place = px4.frame.to_global(*px4.home)
@@ -248,7 +239,6 @@ def _home_position(px4: Px4Vehicle) -> m.HomePosition | None:
 
 
 def global_origin(px4: Px4Vehicle) -> m.GpsGlobalOrigin | None:
-    """Return GPS_GLOBAL_ORIGIN with the origin of the local frame; None without an origin."""
     if not px4.has_origin:
         return None
     origin = px4.external.origin or px4.frame.origin
@@ -260,7 +250,6 @@ _IGNORE_POSITION_AND_VELOCITY = 0b111111
 
 
 def _target_local(px4: Px4Vehicle) -> m.PositionTargetLocalNed:
-    """Build POSITION_TARGET_LOCAL_NED. While disarmed, PX4 sends only a downward acceleration of 100 m/s²."""
     motion = px4.motion
     yaw = motion.yaw
     if not px4.is_armed:
@@ -311,11 +300,11 @@ def _ping(px4: Px4Vehicle) -> m.Ping:
 
 
 def available_modes(_: Px4Vehicle) -> list[m.AvailableModes]:
-    """Return the messages AVAILABLE_MODES. PX4 sends no name for a standard mode (RETURN, LAND …)."""
     count = len(_AVAILABLE_MODES) + _EXTERNAL_MODES
     messages = []
     for index, mode in enumerate(_AVAILABLE_MODES, start=1):
         standard_mode = _STANDARD.get(mode, 0)
+        # PX4 sends no name for a standard mode (RETURN, LAND …).
         name = "" if standard_mode else modes.MODES[mode].name
         properties = _MODE_PROPERTIES.get(mode, MavModeProperty.ADVANCED)
         messages.append(m.AvailableModes(count, index, standard_mode, modes.custom_mode(mode), properties, name))

@@ -71,7 +71,6 @@ _BROADCAST_ID = bytes(20)
 
 
 def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
-    """Build OPEN_DRONE_ID_LOCATION; None while the position is unknown."""
     if not px4.has_position:
         return None
     motion = px4.motion
@@ -90,7 +89,6 @@ def _remote_location(px4: Px4Vehicle) -> m.OpenDroneIdLocation | None:
 
 
 def _remote_system(px4: Px4Vehicle) -> m.OpenDroneIdSystem | None:
-    """Build OPEN_DRONE_ID_SYSTEM; None while the vehicle boots."""
     if not px4.is_ready:
         return None
     home = px4.frame.to_global(*px4.home)
@@ -151,7 +149,7 @@ def _distance_sensor(px4: Px4Vehicle) -> m.DistanceSensor:
 
 
 def _measured_acceleration(px4: Px4Vehicle) -> tuple[float, float, float]:
-    """Return the acceleration that the accelerometers measure, in m/s² forward, right and down."""
+    """Return the measured acceleration in m/s² forward, right and down."""
     motion = px4.motion
     # At rest, accelerometers measure the force of the ground: 1 g upwards.
     north, east = motion.acceleration_north, motion.acceleration_east
@@ -183,7 +181,6 @@ def _highres_imu(px4: Px4Vehicle) -> m.HighresImu:
 
 
 def _scaled_imu(px4: Px4Vehicle) -> m.ScaledImu:
-    """Build SCALED_IMU."""
     motion = px4.motion
     # The fields of SCALED_IMU are in milli-g, mrad/s and milligauss.
     force_x, force_y, force_z = (round(axis / GRAVITY_M_S2 * 1000) for axis in _measured_acceleration(px4))
@@ -208,9 +205,9 @@ def _odometry(px4: Px4Vehicle) -> m.Odometry:
 
 
 def _rc_channels(px4: Px4Vehicle) -> m.RcChannels | None:
-    """Build RC_CHANNELS from RC_CHANNELS_OVERRIDE, because the vehicle has no RC receiver."""
     if not px4.sticks.has_channels:
         return None
+    # The vehicle has no RC receiver, so the channels are those of RC_CHANNELS_OVERRIDE.
     channels = px4.sticks.channels
     used_count = len(channels) if any(channels[8:]) else 8  # Many clients send only the first eight channels.
     used = {f"chan{number}_raw": pulse for number, pulse in enumerate(channels[:used_count], start=1)}
@@ -230,7 +227,6 @@ def _timesync(px4: Px4Vehicle) -> m.Timesync:
 
 
 def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None:
-    """Build POSITION_TARGET_GLOBAL_INT, which PX4 sends only while armed."""
     if not px4.is_armed or not px4.has_position:
         return None
     place, motion = px4.frame.to_global(*px4.flight.target), px4.motion
@@ -244,7 +240,6 @@ def _position_target_global(px4: Px4Vehicle) -> m.PositionTargetGlobalInt | None
 
 
 def _time_estimate(px4: Px4Vehicle) -> m.TimeEstimateToTarget:
-    """Build TIME_ESTIMATE_TO_TARGET with the duration of a return: the climb, the flight home and the descent."""
     return_s = _UNKNOWN_TIME
     if not px4.is_landed:
         height = max(px4.parameters["RTL_RETURN_ALT"], px4.altitude_m)

@@ -62,20 +62,20 @@ class SimulatedPx4(Px4Vehicle):
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
-        """Handle SET_MODE, which PX4 acknowledges like DO_SET_MODE."""
         mode = modes.mode_from_custom(request.custom_mode)
         main_mode, sub_mode = mode
         command = ReceivedCommand(
             Cmd.DO_SET_MODE, param1=request.base_mode, param2=main_mode, param3=sub_mode, param4=0, x=0, y=0, z=0,
             frame=None, channel=channel, sender=sender_of(request),
         )  # fmt: skip
+        # PX4 acknowledges SET_MODE like DO_SET_MODE.
         self.commands.answer(command, set_mode(self, request.base_mode, mode))
 
 
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
 # In a descent, the target altitude is below the plane by this time multiplied by the wanted sink rate. For such a
-# target, `FixedWing.climb_to` returns the wanted sink rate.
+# target, `FixedWing.climb_rate_to` returns the wanted sink rate.
 _SINK_TARGET_LEAD_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
@@ -111,7 +111,6 @@ class Px4PlaneFlight(Px4Flight):
         super().enter(mode)
 
     def update(self) -> None:
-        """Fly for one tick in the present mode."""
         plane = self._plane
         mode, mission = plane.mode, plane.mission
         self.lifts_off: bool = mode == modes.TAKEOFF or (mode == modes.MISSION and mission.wants_up)
@@ -136,7 +135,6 @@ class Px4PlaneFlight(Px4Flight):
             self.circle()
 
     def _follow_sticks(self) -> None:
-        """Set bank, climb and airspeed from the sticks, alike in all manual modes. A stick pushed forward descends."""
         sticks, parameters = self._plane.sticks, self._plane.parameters
         climbs = sticks.pitch < 0
         climb = -sticks.pitch * parameters["FW_T_CLMB_MAX" if climbs else "FW_T_SINK_MAX"]
@@ -160,7 +158,6 @@ class Px4PlaneFlight(Px4Flight):
         self._motion.head(self.course, self.speed_m_s, climb)
 
     def _take_off(self) -> None:
-        """Climb straight on, and circle the point at which the altitude is reached."""
         self.climb_out()
         _, _, target_down = self.target
         if self._motion.down > target_down:
@@ -176,11 +173,10 @@ class Px4PlaneFlight(Px4Flight):
         self._land(self.circle)
 
     def descend(self) -> None:
-        """Follow the glide path (FW_LND_ANG) to the target on the ground."""
         self._land(self._glide)
 
     def _land(self, approach: Callable[[], None]) -> None:
-        """Land: call ``approach`` until the flare, then touch down and roll out."""
+        """Call ``approach`` until the flare, then touch down and roll out."""
         motion = self._motion
         height = motion.ground_down - motion.down
         if motion.is_on_ground:
@@ -195,11 +191,10 @@ class Px4PlaneFlight(Px4Flight):
         target_north, target_east, _ = self.target
         north, east = target_north - motion.north, target_east - motion.east
         height = math.hypot(north, east) * math.tan(math.radians(self._plane.parameters["FW_LND_ANG"]))
-        climb = min(0.0, motion.climb_to(motion.ground_down - height))
+        climb = min(0.0, motion.climb_rate_to(motion.ground_down - height))
         motion.head(math.atan2(east, north), self._plane.parameters["FW_AIRSPD_MIN"] * _GLIDE_SPEED_FACTOR, climb)
 
     def _return(self) -> None:
-        """Climb, fly to the destination, circle down to RTL_DESCEND_ALT, and land unless RTL_LAND_DELAY is negative."""
         motion, plane = self._motion, self._plane
         if self._phase == "land":
             self.circle_down()
@@ -248,7 +243,6 @@ class Px4PlaneMission(Px4Mission):
         self._plane.flight.course = self._plane.motion.yaw
 
     def _set_target_for(self, item: MissionItem) -> None:
-        """Set the flight's target and the radius of its circle for an item that begins."""
         super()._set_target_for(item)
         flight = self._plane.flight
         radius = 0.0
@@ -263,7 +257,6 @@ class Px4PlaneMission(Px4Mission):
             self._phase = "land"
 
     def update(self) -> None:
-        """Run one tick: set the motion target and check if the item is reached."""
         item, flight = self._item, self._plane.flight
         if item is None or self.is_finished:
             flight.circle()
@@ -285,7 +278,6 @@ class Px4PlaneMission(Px4Mission):
             self._plane.flight.target = self._place(item)
 
     def _go(self, item: MissionItem) -> None:
-        """Fly to an item for one tick, and complete the item when it is done."""
         flight = self._plane.flight
         if item.command in _CIRCLES or item.command == Cmd.NAV_DELAY:
             flight.circle()
@@ -304,7 +296,6 @@ class Px4PlaneMission(Px4Mission):
             self._begin_item()
 
     def _is_at_target(self, item: MissionItem) -> bool:
-        """Return True if the plane is close enough to an item, so that it turns to the next one."""
         if item.command == Cmd.NAV_DELAY:
             return True
         plane, motion = self._plane, self._plane.motion
@@ -319,9 +310,9 @@ class Px4PlaneMission(Px4Mission):
         return is_near and abs(down - motion.down) <= plane.parameters["NAV_FW_ALT_RAD"]
 
     def _hold(self) -> None:
-        """Change to HOLD after the mission, but fly on to the present target instead of holding here."""
         target = self._plane.flight.target
         super()._hold()
+        # The plane flies on to the present target instead of holding here.
         if self._plane.mode == modes.HOLD:
             self._plane.flight.target = target
 
