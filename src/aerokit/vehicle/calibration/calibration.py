@@ -104,7 +104,6 @@ class Calibration(AsyncIterator["CalibrationStep"]):
 
 
 def _abandon(run: CalibrationRun, steps: AsyncGenerator[CalibrationStep, None]) -> None:
-    """Cancel the calibration on the vehicle, and close the generator of its steps in the background."""
     run.abandon()
     run.session.background.start(steps.aclose, "aerokit calibration")
 
@@ -192,13 +191,8 @@ class CalibrationControl:
     ) -> Calibration:
         """Return the iterator of a calibration. Nothing is sent before its first step.
 
-        Args:
-            sensor: name of the public method.
-            ardupilot: procedure for ArduPilot.
-            px4: procedure for PX4.
-            command_param: number of the parameter of MAV_CMD_PREFLIGHT_CALIBRATION that starts this calibration; 0 if
-                the procedure does not need it.
-            param_value: value of this parameter. All parameters before it are 0.
+        The parameter of MAV_CMD_PREFLIGHT_CALIBRATION with the number ``command_param`` is ``param_value``. All
+        parameters before it are 0. If ``command_param`` is 0, the procedure gets no parameters.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
@@ -211,5 +205,4 @@ class CalibrationControl:
 
 
 def _acknowledged(instruction: str) -> Procedure:
-    """Return the procedure of a calibration that ends at the acknowledgement of its command."""
     return partial(procedures.acknowledged, instruction=instruction)
