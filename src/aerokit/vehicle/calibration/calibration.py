@@ -139,11 +139,11 @@ class CalibrationControl:
 
     def gyroscope(self) -> Calibration:
         """Calibrate the gyroscopes, while the vehicle stands still."""
-        return self._prepare("gyroscope", _acknowledged("keep the vehicle still"), command_param=1)
+        return self._prepare("gyroscope", _single_command("keep the vehicle still"), command_param=1)
 
     def level(self) -> Calibration:
         """Calibrate the level attitude, while the vehicle stands level and still."""
-        procedure = _acknowledged("place the vehicle level and keep it still")
+        procedure = _single_command("place the vehicle level and keep it still")
         return self._prepare("level", procedure, command_param=5, param_value=2)
 
     def barometer(self) -> Calibration:
@@ -151,7 +151,7 @@ class CalibrationControl:
 
         ArduPilot uses the present pressure as the pressure on the ground; PX4 uses the GPS altitude.
         """
-        return self._prepare("barometer", _acknowledged("shelter the vehicle from wind"), command_param=3)
+        return self._prepare("barometer", _single_command("shelter the vehicle from wind"), command_param=3)
 
     def airspeed(self) -> Calibration:
         """Calibrate the airspeed sensors. Shelter them from wind; PX4 later asks a person to blow into the tube."""
@@ -204,5 +204,5 @@ class CalibrationControl:
         return Calibration(run, procedure(run, *params))
 
 
-def _acknowledged(instruction: str) -> Procedure:
-    return partial(procedures.acknowledged, instruction=instruction)
+def _single_command(instruction: str) -> Procedure:
+    return partial(procedures.ardupilot_single_command, instruction=instruction)

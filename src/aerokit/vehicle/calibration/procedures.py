@@ -109,7 +109,9 @@ def _step_after(step: CalibrationStep, report: CalibrationReport) -> Calibration
     return step  # The other reports ("started", "side progress") do not change the step.
 
 
-async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
+async def ardupilot_single_command(
+    run: CalibrationRun, *params: float, instruction: str
+) -> AsyncGenerator[CalibrationStep, None]:
     """Send the one command of a calibration. Its acknowledgement is the result."""
     run.check_ready()
     yield run.new_step(None, instruction)
@@ -123,7 +125,7 @@ async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[C
     if await _read_parameter(run, "ARSPD_TYPE") == 0:
         raise run.failure("no airspeed sensor is enabled (ARSPD_TYPE is 0); nothing was sent")
     # param3 = 1 calibrates the barometer and, in the same step, the airspeed sensors.
-    async for step in acknowledged(run, 0, 0, 1, instruction="cover the airspeed sensor against wind"):
+    async for step in ardupilot_single_command(run, 0, 0, 1, instruction="cover the airspeed sensor against wind"):
         yield step
 
 
@@ -137,14 +139,14 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
     except ParameterRejected:  # The vehicle refused, so there is nothing to restore.
         raise
     except BaseException:  # The vehicle may have set the value, although the call failed or was cancelled.
-        await _restore(run, "ESC_CALIBRATION", old_value)
+        await _restore_parameter(run, "ESC_CALIBRATION", old_value)
         raise
     finally:
         run.finish()
     yield run.result("disconnect the battery, then connect it: the ESCs are calibrated at boot", reboot_due=True)
 
 
-async def _restore(run: CalibrationRun, name: str, value: float) -> None:
+async def _restore_parameter(run: CalibrationRun, name: str, value: float) -> None:
     with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
         if run.context.arbiter.is_state_recent:  # Nothing is sent to a silent vehicle.
             await run.parameters().set(name, value)
