@@ -30,7 +30,6 @@ LANDING_PATTERNS = {"fwLandingPattern": MavCmd.NAV_LAND, "vtolLandingPattern": M
 
 
 def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
-    """Generate the items of a ComplexItem whose type is in :data:`LANDING_PATTERNS`."""
     command = LANDING_PATTERNS[pattern["complexItemType"].value]
     is_relative = pattern["altitudesAreRelative"].boolean()
     frame = MavFrame.GLOBAL_RELATIVE_ALT if is_relative else MavFrame.GLOBAL
@@ -47,7 +46,7 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
 
 
 def _reset_items(pattern: JsonValue) -> list[MissionItem]:
-    """Create the items that set the speed and stop photos and video, which come before the approach."""
+    """Return the items before the approach, which set the speed and stop photos and video."""
     items = []
     if _flag(pattern, "useDoChangeSpeed"):
         speed = pattern["finalApproachSpeed"].number(0)
@@ -62,9 +61,8 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    """Create the item of an approach: a waypoint, or a descent in a circle. Older files have only circles."""
     x, y, z = _place(place)
-    if not _flag(pattern, "useLoiterToAlt", default=True):
+    if not _flag(pattern, "useLoiterToAlt", default=True):  # Older files lack this flag and have only circles.
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, param4=math.nan, x=x, y=y, z=z)
     radius = pattern["loiterRadius"].number(0)
     signed_radius = radius if pattern["loiterClockwise"].boolean() else -radius
@@ -115,7 +113,7 @@ def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
 def merged_entries(
     entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
 ) -> list[Any]:
-    """Return entries for ``items``. Old entries at the beginning and the end are kept if their items are unchanged.
+    """Return entries for ``items``. Old entries at both ends are kept if their items are unchanged.
 
     ``groups`` has the items of each old entry.
     """
@@ -166,7 +164,7 @@ def json_number(value: float) -> int | float | None:
 
 
 def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
-    """Return the simple items in an entry, or None for a landing pattern, whose items must be generated."""
+    """Return the simple items in an entry; None for a landing pattern."""
     kind = entry["type"]
     kind.one_of("SimpleItem", "ComplexItem")
     if kind.value == "SimpleItem":
@@ -189,9 +187,8 @@ def _jump_ids(
 ) -> dict[int, int]:
     """Map each doJumpId in a .plan file to the index of the mission item that has this id.
 
-    An entry of the file is one simple item, a survey with several, or a landing pattern. ``groups`` has the simple
-    items of each entry (None for a landing pattern), ``sizes`` the number of mission items that the entry becomes. If
-    two items have the same id, an item that is an entry itself is preferred to one inside a survey.
+    ``groups`` has the simple items of each entry (None for a landing pattern), ``sizes`` the number of mission items
+    that the entry becomes.
     """
     ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
@@ -206,6 +203,7 @@ def _jump_ids(
             else:
                 ids_in_surveys.setdefault(jump_id, index)
         first += size
+    # If two items have the same id, an item with an entry of its own is preferred to one inside a survey.
     return ids_in_surveys | ids_of_entries
 
 
@@ -234,7 +232,7 @@ def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
 
 
 def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
-    """Return the frame and altitude that the planner has saved; ``frame`` if the AltitudeMode does not define one."""
+    """Return the frame and the altitude that the planner has saved."""
     mode_member = value.child("AltitudeMode")
     mode = 0 if mode_member is None else mode_member.integer(0, 0xFF)
     # Mode 3 is an altitude above the terrain, which the planner has converted to one above mean sea level.
@@ -244,10 +242,9 @@ def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
 
 
 def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
-    """Return True if the items are equal. For two single jumps, the targets are ignored: they are always rewritten."""
     if len(group) == len(items) == 1:
         old, new = group[0], items[0]
-        if old.command == new.command == MavCmd.DO_JUMP:
+        if old.command == new.command == MavCmd.DO_JUMP:  # The target of a jump is always rewritten.
             return old.replace(param1=0.0) == new.replace(param1=0.0)
     return tuple(group) == tuple(items)
 
@@ -268,7 +265,7 @@ def _set_jump_ids(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[
 
 
 def load_json(text: str, name: str) -> JsonValue:
-    """Parse a JSON document, or raise :class:`FileFormatError`, which names the line of a syntax error."""
+    """Parse a JSON document. Raises FileFormatError, which names the line of a syntax error."""
     try:
         return JsonValue(json.loads(text, parse_constant=_no_constant), name, "")
     except json.JSONDecodeError as error:
@@ -301,7 +298,6 @@ class JsonValue:
         return FileFormatError(f"{self.name}: {self.path or 'the document'} = {text}: expected {expected}")
 
     def child(self, key: str) -> JsonValue | None:
-        """Return the value of a key of an object, or None if there is no such key."""
         members = self.members()
         path = f"{self.path}.{key}" if self.path else key
         return JsonValue(members[key], self.name, path) if key in members else None
@@ -314,7 +310,6 @@ class JsonValue:
         return child
 
     def members(self) -> dict[str, Any]:
-        """Return the value as an object."""
         if not isinstance(self.value, dict):
             raise self.expected("an object")
         return self.value
@@ -354,7 +349,6 @@ class JsonValue:
         return int(value)
 
     def boolean(self) -> bool:
-        """Return true or false."""
         if not isinstance(self.value, bool):
             raise self.expected("true or false")
         return self.value
