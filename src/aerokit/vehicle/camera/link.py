@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -21,7 +21,7 @@ from aerokit.vehicle.camera.orders import (
 from aerokit.vehicle.camera.values import CameraInformation, information_of
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
     from aerokit.connection.bus import Detach, EndSignal
     from aerokit.events import Event
@@ -306,18 +306,22 @@ class ActiveOperation:
         self._is_over = False
         self._detach_finish = link.on_finish(self._finish)
 
-    def record_start(self) -> None:
+    @asynccontextmanager
+    async def starting(self) -> AsyncIterator[None]:
+        """Start the operation in an `async with` block. If the block raises, the operation is stopped."""
+        try:
+            yield
+        except BaseException as error:
+            was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
+            if not was_sent or was_refused:
+                self.order.withdraw()
+                self.discard()
+            else:  # The camera may have started nevertheless.
+                self.order.commit()
+                # Raise the error without delay: the stop command is sent at once, and retried in the background.
+                await self.stop(is_awaited=False)
+            raise
         self.order.commit()
-
-    def record_failed_start(self, error: BaseException) -> bool:
-        """Return True if the camera may have started nevertheless and must be stopped."""
-        was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
-        if not was_sent or was_refused:
-            self.order.withdraw()
-            self.discard()
-            return False
-        self.order.commit()
-        return True
 
     def discard(self) -> None:
         """Mark the operation as ended without sending its stop command."""
@@ -366,15 +370,8 @@ class CameraBlock:
         await self._check()
         operation = ActiveOperation(self._link, self._subject, self._stop_command)
         self._operation = operation
-        try:
+        async with operation.starting():
             await self._start(operation.order)
-        except BaseException as error:
-            must_stop = operation.record_failed_start(error)
-            if must_stop:
-                # Raise the error without delay: the stop command is sent at once, and retried in the background.
-                await operation.stop(is_awaited=False)
-            raise
-        operation.record_start()
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._operation is not None:

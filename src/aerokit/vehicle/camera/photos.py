@@ -243,16 +243,12 @@ class PhotoInterval:
         await self._link.require_capability("photo_interval", "capture_image")
         operation = ActiveOperation(self._link, "series", lambda: self._shutter.stop_command)
         self._operation = operation
-        try:
-            await self._begin(operation)
-        except BaseException as error:
-            self._new_captures.__exit__()  # It does nothing if `_begin` has not entered the queue yet.
-            must_stop = operation.record_failed_start(error)
-            if must_stop:
-                # Raise the error without delay: the stop command is sent at once, and retried in the background.
-                await operation.stop(is_awaited=False)
-            raise
-        operation.record_start()
+        async with operation.starting():
+            try:
+                await self._begin(operation)
+            except BaseException:
+                self._new_captures.__exit__()  # It does nothing if `_begin` has not entered the queue yet.
+                raise
         return self
 
     async def _begin(self, operation: ActiveOperation) -> None:
