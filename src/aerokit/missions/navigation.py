@@ -598,9 +598,7 @@ def _place_or_altitude(
     return latitude_deg, longitude_deg, altitudes
 
 
-def _altitudes_or_home(*altitudes: float | None) -> Altitudes:
+def _altitudes_or_home(relative_m: float | None, amsl_m: float | None, terrain_m: float | None) -> Altitudes:
     """Return the altitude of the ground at a landing place. Without one, it is that of home."""
-    relative, amsl, terrain = altitudes
-    if altitudes == (None, None, None):
-        return (0.0, None, None)
-    return (relative, amsl, terrain)
+    altitudes = (relative_m, amsl_m, terrain_m)
+    return (0.0, None, None) if altitudes == (None, None, None) else altitudes

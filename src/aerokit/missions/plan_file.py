@@ -16,7 +16,7 @@ from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import MissionItem, canonical_frame
 from aerokit.missions.mission import Fence, FenceCircle, FencePolygon, Mission, Plan, RallyPoints
-from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries
+from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries, read_xyz
 from aerokit.missions.wire import unscaled_xy
 from aerokit.position import Position
 
@@ -251,10 +251,8 @@ def _read_rally(value: JsonValue) -> RallyPoints:
 
 
 def _read_rally_point(value: JsonValue) -> MissionItem:
-    latitude, longitude, altitude = value.elements(3)
-    x, y = round(latitude.number(-90, 90) * 1e7), round(longitude.number(-180, 180) * 1e7)
-    frame = MavFrame.GLOBAL_RELATIVE_ALT
-    return MissionItem(MavCmd.NAV_RALLY_POINT, frame, x=x, y=y, z=altitude.number())
+    x, y, z = read_xyz(value)
+    return MissionItem(MavCmd.NAV_RALLY_POINT, MavFrame.GLOBAL_RELATIVE_ALT, x=x, y=y, z=z)
 
 
 def _required_place(value: JsonValue) -> Position:

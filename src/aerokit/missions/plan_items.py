@@ -36,7 +36,7 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
     # Older files have a loiterCoordinate instead of the landingApproachCoordinate.
     approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
     heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # QGroundControl sends these values.
-    x, y, z = _place(pattern["landCoordinate"])
+    x, y, z = read_xyz(pattern["landCoordinate"])
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
         *_reset_items(pattern),
@@ -61,7 +61,7 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    x, y, z = _place(place)
+    x, y, z = read_xyz(place)
     if not _flag(pattern, "useLoiterToAlt", default=True):  # Older files lack this flag and have only circles.
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, param4=math.nan, x=x, y=y, z=z)
     radius = pattern["loiterRadius"].number(0)
@@ -75,7 +75,7 @@ def _flag(pattern: JsonValue, key: str, *, default: bool = False) -> bool:
     return default if value is None else value.boolean()
 
 
-def _place(value: JsonValue) -> tuple[int, int, float]:
+def read_xyz(value: JsonValue) -> tuple[int, int, float]:
     latitude, longitude, altitude = value.elements(3)
     x, y = round(latitude.number(-90, 90) * 1e7), round(longitude.number(-180, 180) * 1e7)
     return x, y, altitude.number()
