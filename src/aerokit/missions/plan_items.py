@@ -354,7 +354,7 @@ class JsonValue:
         return self.value
 
     def one_of(self, *choices: object) -> None:
-        """Raise unless the value is one of ``choices``."""
+        """Raise FileFormatError for any other value."""
         if self.value not in choices or isinstance(self.value, bool):
             raise self.expected(" or ".join(json.dumps(choice) for choice in choices))
 

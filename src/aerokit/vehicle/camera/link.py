@@ -308,7 +308,7 @@ class ActiveOperation:
 
     @asynccontextmanager
     async def starting(self) -> AsyncIterator[None]:
-        """Start the operation in an `async with` block. If the block raises, the operation is stopped."""
+        """Start the operation in this block. If the block raises, the operation ends."""
         try:
             yield
         except BaseException as error:

@@ -366,11 +366,11 @@ class CommandArbiter:
             self._open_mode_changes -= 1
 
     def expect_late(self, mode: Mode) -> None:
-        """Record that the vehicle has changed to this mode by itself, but HEARTBEAT may not report it yet."""
+        """Record that the vehicle has changed to this mode by itself. HEARTBEAT may report it late."""
         self._unreported_modes.append((self._now(), mode))
 
     def doubt_mode(self) -> None:
-        """Distrust the reported mode, because a command that changes it was sent without waiting for the result."""
+        """Distrust the reported mode until a later mode change is confirmed."""
         self._doubt_change(next(self._order_numbers))
 
     def _doubt_change(self, change: int) -> None:
@@ -382,7 +382,7 @@ class CommandArbiter:
     def _create_order(
         self, modes: Collection[Mode], ending_topics: Sequence[Topic], ends_flight: bool = False
     ) -> Order:
-        """Create an order that does not end if an earlier order still changes the mode."""
+        """Create an order that stays valid if an earlier order changes the mode late."""
         newest, present_mode = self.newest, self._telemetry.mode.latest
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at

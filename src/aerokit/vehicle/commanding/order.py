@@ -230,7 +230,6 @@ class Order:
         return self.was_sent and not (self.is_confirmed or self.was_refused or self.takeover_reason)
 
     def is_own(self, mode: Mode) -> bool:
-        """Return True if this mode may be the effect of the order itself."""
         return mode.custom_mode in self._own_modes
 
     def expect(self, modes: Collection[Mode]) -> None:

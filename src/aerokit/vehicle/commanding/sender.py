@@ -306,7 +306,7 @@ class OrderSender:
         return failure_reason
 
     def landing_failure(self, order: Order) -> Callable[[], str | None]:
-        """Like :meth:`mode_failure` with the order's modes, for an order that the vehicle completes by disarming."""
+        """Like :meth:`mode_failure`, for an order that the vehicle completes by disarming."""
         mode_failure, armed = self.mode_failure(order, *order.modes), self._session.telemetry.armed
 
         def failure_reason() -> str | None:
