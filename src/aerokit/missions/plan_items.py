@@ -117,20 +117,24 @@ def merged_entries(
 
     ``groups`` has the items of each old entry.
     """
+    targets = {item.param1 for item in items if item.command == MavCmd.DO_JUMP}
+
+    def may_keep(number: int, start: int) -> bool:
+        end = start + len(groups[number])
+        # The items of a landing pattern have no doJumpId, so the file cannot store a jump to them.
+        is_jump_target = not _items_with_id(entries[number]) and any(start <= target < end for target in targets)
+        return not is_jump_target and _matches(groups[number], items[start:end])
+
     # Keep the entries before `head_end`, which contain the items before `first_new`.
     head_end, first_new = 0, 0
-    while head_end < len(groups):
-        group = groups[head_end]
-        if not _matches(group, items[first_new : first_new + len(group)]):
-            break
+    while head_end < len(groups) and may_keep(head_end, first_new):
+        first_new += len(groups[head_end])
         head_end += 1
-        first_new += len(group)
     # Keep the entries from `tail_start` on, which contain the items from `end_new` on.
     tail_start, end_new = len(groups), len(items)
     while tail_start > head_end:
-        group = groups[tail_start - 1]
-        start = end_new - len(group)
-        if start < first_new or not _matches(group, items[start:end_new]):
+        start = end_new - len(groups[tail_start - 1])
+        if start < first_new or not may_keep(tail_start - 1, start):
             break
         tail_start -= 1
         end_new = start
@@ -249,15 +253,18 @@ def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool
     return tuple(group) == tuple(items)
 
 
+def _items_with_id(entry: dict[str, Any]) -> list[dict[str, Any]]:
+    if entry["type"] == "SimpleItem":
+        return [entry]
+    items: list[dict[str, Any]] = entry.get("TransectStyleComplexItem", {}).get("Items", [])
+    return items
+
+
 def _set_jump_ids(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[MissionItem]) -> None:
     """Number the items from 1 (doJumpId), and set jump targets to these numbers."""
     first = 0
     for entry, size in zip(entries, sizes):  # noqa: B905 - same length
-        if entry["type"] == "SimpleItem":
-            simple_items = [entry]
-        else:
-            simple_items = entry.get("TransectStyleComplexItem", {}).get("Items", [])
-        for index, simple_item in enumerate(simple_items, first):
+        for index, simple_item in enumerate(_items_with_id(entry), first):
             simple_item["doJumpId"] = index + 1
             if simple_item["command"] == MavCmd.DO_JUMP:
                 simple_item["params"][0] = json_number(items[index].param1 + 1)
