@@ -310,7 +310,7 @@ class CaptureQueue:
         return self._queue.popleft() if self._queue else None
 
     async def wait(self, seconds: float) -> bool:
-        """Wait for a capture; return False if none arrives in time."""
+        """Return False if no capture arrives in time."""
         with anyio.move_on_after(seconds):
             while not self._queue:
                 self._log.end.raise_if_ended()

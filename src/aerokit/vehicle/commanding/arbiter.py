@@ -431,7 +431,7 @@ class CommandArbiter:
             self._unreported_modes.extend((now, mode) for mode in order.modes if mode != present_mode)
 
     def late_modes(self) -> tuple[Mode, ...]:
-        """Return the modes that HEARTBEAT may still report, although the order or mission has ended."""
+        """Return the modes of ended orders and missions that HEARTBEAT may still report."""
         since = self._now() - MODE_GRACE_S
         return tuple(mode for at, mode in self._unreported_modes if at > since)
 

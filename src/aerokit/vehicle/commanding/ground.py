@@ -176,7 +176,7 @@ class GroundCheck:
         return self.fall() if self.is_reported_on_ground else in_flight()
 
     def fall(self) -> str | None:
-        """Return a text if the vehicle fell, or is falling although it is reported on the ground."""
+        """Return a text if the vehicle fell or is falling."""
         telemetry = self._session.telemetry
         is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
         if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:
