@@ -246,6 +246,16 @@ def test_changed_survey_becomes_simple_items() -> None:
     assert parse_plan(format_plan(changed)) == changed
 
 
+def test_jump_into_landing_pattern_makes_it_simple_items() -> None:
+    plan = read(samples.full_document())
+    first_of_landing = 7
+    items = [*plan.mission, jump(first_of_landing, repeat=1)]
+    changed = plan.replace(mission=plan.mission.replace(items=items))
+    entries = written(changed)["mission"]["items"]
+    assert entries[-1]["params"][0] == entries[-7]["doJumpId"]
+    assert parse_plan(format_plan(changed)) == changed
+
+
 def test_new_plan_file(tmp_path: Path) -> None:
     mission = Mission(
         [take_off(47, 8, altitude_relative_m=10), set_servo(9, 1500), jump(0, repeat=2), return_to_launch()],

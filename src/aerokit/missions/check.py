@@ -32,17 +32,11 @@ _GLOBAL_TEXT = "a global frame: 0, 3, 10, or 5, 6, 11"
 
 
 def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_item_0: bool | None = None) -> None:
-    """Check that all items can be sent.
+    """Raise InvalidArgument if an item cannot be sent. ``items`` are without home.
 
-    Args:
-        items: the items, without home.
-        mission_type: the MAV_MISSION_TYPE.
-        home_is_item_0: True for missions of ArduPilot: home takes the place of one item, so 65,534 others are allowed.
-            False for other autopilots: a destination at 0°, 0° is refused, because only ArduPilot takes it for the
-            current position. None if the autopilot is unknown: 65,535 items and 0°, 0° are allowed.
-
-    Raises:
-        InvalidArgument: an item cannot be sent; the text names item, field, value and the allowed values.
+    With ``home_is_item_0`` (ArduPilot), home takes the place of one item, so 65,534 others are allowed. If it is
+    False, a destination at 0°, 0° is refused, because only ArduPilot takes it for the current position. None stands
+    for an unknown autopilot: 65,535 items and 0°, 0° are allowed.
     """
     check_count(len(items), home_is_item_0=bool(home_is_item_0))
     for index, item in enumerate(items):
@@ -56,17 +50,13 @@ def check_items(items: Sequence[MissionItem], mission_type: int = 0, *, home_is_
 
 
 def check_count(count: int, *, home_is_item_0: bool = False) -> None:
-    """Raise :class:`InvalidArgument` if there are more items than the protocol can count."""
     limit = MAX_ITEMS - 1 if home_is_item_0 else MAX_ITEMS
     if count > limit:
         raise InvalidArgument(f"{count} items are too many: at most {limit} are possible")
 
 
 def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) -> None:
-    """Raise :class:`InvalidArgument` if the item is not valid in a plan of this MAV_MISSION_TYPE.
-
-    The error text begins with ``where``.
-    """
+    """Raise InvalidArgument if the item is not valid. The error text begins with ``where``."""
     if not isinstance(item, MissionItem):
         raise InvalidArgument(f"{where} = {item!r} is not a MissionItem")
     _check_integer(where, "command", item.command, 0xFFFF)
@@ -84,7 +74,7 @@ def check_item(item: MissionItem, where: str = "item", mission_type: int = 0) ->
 
 
 def check_jumps(items: Sequence[MissionItem]) -> None:
-    """Raise :class:`InvalidArgument` if a DO_JUMP or DO_JUMP_TAG has no target. Items are counted from 0."""
+    """Raise InvalidArgument if a DO_JUMP or DO_JUMP_TAG has no target."""
     tags = {item.param1 for item in items if item.command == MavCmd.JUMP_TAG}
     for index, item in enumerate(items):
         if item.command == MavCmd.DO_JUMP:
@@ -109,7 +99,6 @@ def _check_integer(where: str, field: str, value: object, high: int) -> None:
 
 
 def _check_command(where: str, command: int, mission_type: int) -> None:
-    """Raise InvalidArgument if a command does not belong to this type of plan."""
     is_fence_command = command in FENCE_COMMANDS
     is_rally_command = command in RALLY_COMMANDS
     if mission_type == MavMissionType.FENCE:
@@ -124,7 +113,6 @@ def _check_command(where: str, command: int, mission_type: int) -> None:
 
 
 def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
-    """Raise InvalidArgument if the frame is unknown, or not allowed for the command or the type of plan."""
     _check_integer(where, "frame", item.frame, 0xFF)
     if item.frame not in _FRAMES:
         raise _wrong(where, "frame", item.frame, "a MAV_FRAME")
@@ -135,7 +123,6 @@ def _check_frame(where: str, item: MissionItem, mission_type: int) -> None:
 
 
 def _check_float(where: str, field: str, value: object, *, may_be_nan: bool) -> None:
-    """Raise InvalidArgument if a field is not a number that a 32-bit float can store."""
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         raise _wrong(where, field, value, "a number")
     if math.isnan(value) and may_be_nan:
@@ -153,7 +140,6 @@ def _fits_float32(value: float) -> bool:
 
 
 def _check_place(where: str, item: MissionItem) -> None:
-    """Raise InvalidArgument if x or y is not an integer, or out of range."""
     scale = xy_scale(item.command, item.frame)
     for field, limit, name in (("x", 90, "latitude"), ("y", 180, "longitude")):
         value = getattr(item, field)

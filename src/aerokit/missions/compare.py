@@ -159,10 +159,9 @@ def _px4_letters(item: MissionItem) -> str:
 
 
 def _convert(letter: str, value: float) -> Iterator[float]:
-    """Yield the value that the vehicle reports after it has stored ``value`` in the form that ``letter`` stands for.
+    """Yield the value that the vehicle reports after it has stored ``value`` in this form.
 
-    Yield nothing if the value is out of the form's range, because C does not define the result of this conversion.
-    NaN and infinities become NaN in forms that store a number.
+    Yields nothing if the value is out of the form's range.
     """
     if letter == "-":  # not stored
         yield 0.0
@@ -176,6 +175,7 @@ def _convert(letter: str, value: float) -> Iterator[float]:
         yield math.nan
     elif letter in _INTEGERS:  # an integer with a range
         low, high = _INTEGERS[letter]
+        # C does not define the result of this conversion for a value that is out of range.
         if low <= math.trunc(value) <= high:
             yield float(math.trunc(value))
     else:
@@ -183,7 +183,7 @@ def _convert(letter: str, value: float) -> Iterator[float]:
 
 
 def _convert_special(letter: str, value: float) -> Iterator[float]:
-    """Yield the stored value for the letters that `_convert` does not handle itself; ``value`` is finite."""
+    """Yield the stored value for the other letters. ``value`` is finite."""
     whole = math.trunc(value)
     if letter == "f":  # 32-bit float, whose maximum is 3.4e38
         if abs(value) <= 3.4028234663852886e38:
@@ -236,10 +236,9 @@ def plan_differences(
 def changed_items(
     expected: Sequence[MissionItem], actual: Sequence[MissionItem], storage: ItemStorage = ItemStorage.WIRE
 ) -> tuple[int, ...]:
-    """Return the indices of expected items that ``actual`` lacks or has changed, so that an update must send them.
+    """Return the indices of expected items that ``actual`` lacks or has changed.
 
-    Further items at the end of ``actual`` are not reported. Changes that ``storage`` explains are tolerated: by
-    default, only those made by MISSION_ITEM_INT.
+    Further items at the end of ``actual`` are not reported. Changes that ``storage`` explains are tolerated.
     """
     common = min(len(expected), len(actual))
     changed = [i for i in range(common) if item_differences(expected[i], actual[i], storage)]
@@ -268,7 +267,6 @@ def item_differences(
 def _different_fields(
     expected: MissionItem, actual: MissionItem, storage: ItemStorage, single_precision: bool
 ) -> Iterator[str]:
-    """Yield the names of the fields in which two items with the same command differ."""
     if not _frames_match(expected, actual, storage):
         yield "frame"
     for field in ("param1", "param2", "param3", "param4"):
@@ -291,7 +289,6 @@ def _drops_autocontinue(actual: MissionItem, storage: ItemStorage) -> bool:
 
 
 def _frames_match(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
-    """Return True if both items have the same frame, or if the vehicle stores one frame as the other."""
     expected_frame, actual_frame = canonical_frame(expected.frame), canonical_frame(actual.frame)
     if expected_frame == actual_frame:
         return True
@@ -305,7 +302,6 @@ def _frames_match(expected: MissionItem, actual: MissionItem, storage: ItemStora
 
 
 def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage: ItemStorage) -> bool:
-    """Return True if a parameter is equal in both items, apart from how the vehicle stores it."""
     value, actual_value = getattr(expected, field), getattr(actual, field)
     if _close(value, actual_value):
         return True
@@ -320,7 +316,6 @@ def _same_number(expected: MissionItem, actual: MissionItem, field: str, storage
 def _same_place(
     expected: MissionItem, actual: MissionItem, field: str, storage: ItemStorage, single_precision: bool
 ) -> bool:
-    """Return True if ``field``, which is "x" or "y", is equal in both items, apart from rounding."""
     value, actual_value = getattr(expected, field), getattr(actual, field)
     scale = xy_scale(expected.command, expected.frame)
     if scale != 1:
@@ -342,7 +337,6 @@ def _float_step(value: float) -> float:
 
 
 def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStorage) -> bool:
-    """Return True if the altitudes (``z``) are equal, apart from how the vehicle stores them."""
     # Autopilots use no altitudes of a fence, not even that of a return point: ArduPilot does not store it
     # (MissionItemProtocol_Fence.cpp), PX4 ignores it (geofence.cpp).
     if expected.command in FENCE_COMMANDS or _close(expected.z, actual.z):
@@ -357,7 +351,7 @@ def _same_altitude(expected: MissionItem, actual: MissionItem, storage: ItemStor
 
 
 def _close(left: float, right: float) -> bool:
-    """Return True if the numbers are equal, both NaN, or equal as 32-bit floats with some margin for rounding."""
+    """Compare two numbers as 32-bit floats, with a margin for rounding. NaN equals NaN."""
     are_both_nan = left != left and right != right
     if left == right or are_both_nan:
         return True

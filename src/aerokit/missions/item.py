@@ -125,6 +125,7 @@ PARAMS_WITHOUT_NAN: dict[int, tuple[int, ...]] = {
     MavCmd.NAV_SCRIPT_TIME: (1, 2),
 }
 
+# The suffix has no meaning in MISSION_ITEM_INT.
 _FRAME_ALIASES: dict[int, int] = {
     MavFrame.GLOBAL_INT: MavFrame.GLOBAL,
     MavFrame.GLOBAL_RELATIVE_ALT_INT: MavFrame.GLOBAL_RELATIVE_ALT,
@@ -147,12 +148,12 @@ _STANDARD_COMMANDS = frozenset(int(command) for command in MavCmd)
 
 
 def canonical_frame(frame: int) -> int:
-    """Return the equivalent frame without the deprecated suffix "_INT", which has no meaning in MISSION_ITEM_INT."""
+    """Return the equivalent frame without the deprecated suffix "_INT"."""
     return _FRAME_ALIASES.get(frame, frame)
 
 
 def has_place(command: int) -> bool:
-    """Return True if x and y of this command are coordinates, or if the command is from another dialect."""
+    """Return True if x and y are coordinates. Commands from other dialects count as such."""
     return command in PLACES or command not in _STANDARD_COMMANDS
 
 
@@ -161,11 +162,9 @@ DEGREE_SCALE = 10_000_000
 
 
 def xy_scale(command: int, frame: int) -> int:
-    """Return the scale of x and y in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1.
-
-    ArduPilot determines the scale by the command, PX4 by the frame. If the two scales would differ, PX4 refuses the
-    item.
-    """
+    """Return the scale of x and y in MISSION_ITEM_INT: 10,000,000 for degrees, 10,000 for local metres, else 1."""
+    # ArduPilot determines the scale by the command, PX4 by the frame. If the two scales would differ, PX4 refuses the
+    # item.
     if not has_place(command):
         return 1
     if frame in GLOBAL_FRAMES:
@@ -174,7 +173,7 @@ def xy_scale(command: int, frame: int) -> int:
 
 
 def command_name(command: int) -> str:
-    """Return the name of a command without the prefix MAV_CMD, or ``"command"`` and the number if it is unknown."""
+    """Return the name without the prefix MAV_CMD, or ``command 123`` if it is unknown."""
     return MavCmd(command).name if command in _STANDARD_COMMANDS else f"command {command}"
 
 
@@ -260,8 +259,8 @@ def place_item(
     """Create an item at a place.
 
     Exactly one of the three ``altitudes`` must be given: above home, above mean sea level or above the terrain. A
-    Position supplies latitude and longitude, and also the altitude if none is given. Home supplies no altitude. If no
-    place is given and ``is_needed`` is False, the item has 0°, 0°, which ArduPilot takes for the current position.
+    Position may supply it. Without a place, the item has 0°, 0°, which ArduPilot takes for the current position. With
+    ``is_needed``, a missing place raises InvalidArgument.
     """
     if isinstance(latitude_deg, (Position, Home)):
         if longitude_deg is not None:
@@ -321,12 +320,13 @@ def altitude_and_frame(
 
 
 def action_item(command: int, *parameters: float, z: float = 0.0) -> MissionItem:
-    """Create an item without a place, in the frame MISSION, which PX4 requires for such items."""
+    """Create an item without a place."""
+    # PX4 requires the frame MISSION for such items.
     return MissionItem(command, MavFrame.MISSION, *_four(parameters), z=z)
 
 
 def in_range(name: str, value: object, low: float, high: float, *, also_allowed: tuple[float, ...] = ()) -> float:
-    """Return the value as a float; raise :class:`InvalidArgument` unless it is in the range or in ``also_allowed``."""
+    """Return the value as a float. Raises InvalidArgument if it is not allowed."""
     if (
         isinstance(value, (int, float))
         and not isinstance(value, bool)
@@ -338,14 +338,14 @@ def in_range(name: str, value: object, low: float, high: float, *, also_allowed:
 
 
 def whole_number(name: str, value: object, low: int, high: int) -> float:
-    """Return the value as a float; raise :class:`InvalidArgument` unless it is an ``int`` from low to high."""
+    """Return an ``int`` as a float. Raises InvalidArgument for another type, or if it is out of range."""
     if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high:
         return float(value)
     raise InvalidArgument(f"{name} = {value!r} is not allowed: it must be a whole number from {low} to {high}")
 
 
 def heading(name: str, value: float | None) -> float:
-    """Return the heading in degrees; for None return NaN, which means "not given" in the standard."""
+    """Return the heading in degrees. None becomes NaN, which means "not given" in the standard."""
     return math.nan if value is None else in_range(name, value, -360, 360)
 
 

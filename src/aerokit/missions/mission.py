@@ -224,11 +224,12 @@ def _return_item(place: Position) -> MissionItem:
 
 
 def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
-    """Return the polygon whose vertices begin at item ``first``. RemoteProtocolError if vertices are missing.
+    """Return the polygon whose vertices begin at item ``first``.
 
-    On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
+    Raises RemoteProtocolError if vertices are missing.
     """
     item = items[first]
+    # On PX4 and ArduPilot, every vertex contains the number of vertices of its polygon.
     count = int(item.param1) if 3 <= item.param1 <= 0xFFFF else 0  # A polygon has at least 3 vertices.
     vertices = items[first : first + count]
     if not count:
@@ -245,7 +246,6 @@ def _read_polygon(items: Sequence[MissionItem], first: int) -> FencePolygon:
 
 
 def _read_circle(item: MissionItem, index: int) -> FenceCircle:
-    """Convert an item to a circle of a fence."""
     center = _place(item, index)
     is_inclusion = item.command == MavCmd.NAV_FENCE_CIRCLE_INCLUSION
     try:
@@ -255,7 +255,6 @@ def _read_circle(item: MissionItem, index: int) -> FenceCircle:
 
 
 def _place(item: MissionItem, index: int) -> Position:
-    """Return the position of a fence item, with an altitude only if it is a return point with one."""
     try:
         place = Position(item.x / 1e7, item.y / 1e7)
     except InvalidArgument as error:

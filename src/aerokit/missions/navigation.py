@@ -592,15 +592,13 @@ def rally_point(
 def _place_or_altitude(
     latitude_deg: Position | Home | float | None, longitude_deg: float | None, altitudes: Altitudes
 ) -> tuple[Position | Home | float | None, float | None, Altitudes]:
-    """Return latitude, longitude and altitudes. If the only argument is a number, it is an altitude above home."""
+    """Take a single number for an altitude above home."""
     if isinstance(latitude_deg, (int, float)) and longitude_deg is None and altitudes == (None, None, None):
         return None, None, (latitude_deg, None, None)
     return latitude_deg, longitude_deg, altitudes
 
 
-def _altitudes_or_home(*altitudes: float | None) -> Altitudes:
-    """Return the altitudes of the ground at a landing place; if none is given, those of home."""
-    relative, amsl, terrain = altitudes
-    if altitudes == (None, None, None):
-        return (0.0, None, None)
-    return (relative, amsl, terrain)
+def _altitudes_or_home(relative_m: float | None, amsl_m: float | None, terrain_m: float | None) -> Altitudes:
+    """Return the altitude of the ground at a landing place. Without one, it is that of home."""
+    altitudes = (relative_m, amsl_m, terrain_m)
+    return (0.0, None, None) if altitudes == (None, None, None) else altitudes

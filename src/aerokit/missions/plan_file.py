@@ -16,7 +16,7 @@ from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavCmd, MavFrame
 from aerokit.missions.item import MissionItem, canonical_frame
 from aerokit.missions.mission import Fence, FenceCircle, FencePolygon, Mission, Plan, RallyPoints
-from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries
+from aerokit.missions.plan_items import JsonValue, json_number, load_json, merged_entries, read_entries, read_xyz
 from aerokit.missions.wire import unscaled_xy
 from aerokit.position import Position
 
@@ -108,7 +108,7 @@ def format_plan(plan: Plan | Mission) -> str:
 
 
 def _document(plan: Plan) -> dict[str, Any]:
-    """Return the JSON object of a .plan file: a new one, or that of ``plan.source`` with the changed parts replaced."""
+    """Return the JSON object of a .plan file. Unchanged parts of ``plan.source`` are kept."""
     document: dict[str, Any]
     if plan.source:
         old = parse_plan(plan.source)  # first, because it raises FileFormatError if the text is no plan
@@ -131,7 +131,7 @@ def _document(plan: Plan) -> dict[str, Any]:
 
 
 def _check_required(document: JsonValue) -> None:
-    """Raise one error for all required fields that are missing. The types of fields are checked when they are read."""
+    """Raise one error for all required fields that are missing."""
     incomplete = [(path, keys) for path, keys in _missing_fields(document.value) if keys]
     if not incomplete:
         return
@@ -183,7 +183,6 @@ def _missing_in(path: str, value: Any, *keys: str) -> tuple[str, list[str]]:
 
 
 def _read_mission(value: JsonValue) -> Mission:
-    """Read the member ``mission``."""
     value["version"].one_of(2)
     groups = read_entries(value["items"].elements())
     home = value.child("plannedHomePosition")
@@ -192,7 +191,6 @@ def _read_mission(value: JsonValue) -> Mission:
 
 
 def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
-    """Return firmware type, vehicle type, cruise speed and hover speed. Missing values get their defaults."""
     defaults = _numbers(Plan())
     default_firmware, default_vehicle, default_cruise, default_hover = defaults
     if mission is None:
@@ -207,7 +205,6 @@ def _read_numbers(mission: JsonValue | None) -> tuple[int, int, float, float]:
 
 
 def _read_fence(value: JsonValue) -> Fence:
-    """Read the member ``geoFence``."""
     version = _check_version(value, "polygon", "polygons", "circles", "breachReturn")
     if version == 1:  # Version 1 is allowed only for empty fences.
         return Fence()
@@ -221,19 +218,15 @@ def _read_fence(value: JsonValue) -> Fence:
 
 
 def _check_version(value: JsonValue, *content_keys: str) -> int:
-    """Return the version; raise FileFormatError if it is not supported.
-
-    Version 2 is supported. Version 1 is supported only without content (``content_keys``), because QGroundControl has
-    written it for empty fences and empty rally points.
-    """
+    """Return the version. Raises FileFormatError if it is not supported."""
     is_empty = not any(value.members().get(key) for key in content_keys)
+    # QGroundControl has written version 1 for empty fences and empty rally points.
     allowed = (1, 2) if is_empty else (2,)
     value["version"].one_of(*allowed)
     return int(value["version"].value)
 
 
 def _read_polygon(value: JsonValue) -> FencePolygon:
-    """Read one polygon of the fence."""
     corners = value["polygon"]
     places = [_required_place(corner) for corner in corners.elements()]
     if len(places) < 3:
@@ -242,7 +235,6 @@ def _read_polygon(value: JsonValue) -> FencePolygon:
 
 
 def _read_circle(value: JsonValue) -> FenceCircle:
-    """Read one circle of the fence."""
     circle = value["circle"]
     radius = circle["radius"]
     center = _required_place(circle["center"])
@@ -259,10 +251,8 @@ def _read_rally(value: JsonValue) -> RallyPoints:
 
 
 def _read_rally_point(value: JsonValue) -> MissionItem:
-    latitude, longitude, altitude = value.elements(3)
-    x, y = round(latitude.number(-90, 90) * 1e7), round(longitude.number(-180, 180) * 1e7)
-    frame = MavFrame.GLOBAL_RELATIVE_ALT
-    return MissionItem(MavCmd.NAV_RALLY_POINT, frame, x=x, y=y, z=altitude.number())
+    x, y, z = read_xyz(value)
+    return MissionItem(MavCmd.NAV_RALLY_POINT, MavFrame.GLOBAL_RELATIVE_ALT, x=x, y=y, z=z)
 
 
 def _required_place(value: JsonValue) -> Position:
@@ -271,7 +261,7 @@ def _required_place(value: JsonValue) -> Position:
 
 
 def _read_place(value: JsonValue, *, altitude: str) -> Position | None:
-    """Return the place; None if coordinates are null. Altitudes refer to ``altitude``: "amsl" or "relative"."""
+    """Return None if a coordinate is null. ``altitude`` is "amsl" or "relative"."""
     latitude_value, longitude_value, *altitude_values = value.elements(2, 3)
     latitude = latitude_value.number(-90, 90, null=True)
     longitude = longitude_value.number(-180, 180, null=True)
@@ -304,7 +294,7 @@ def _numbers(plan: Plan) -> tuple[int, int, float, float]:
 
 
 def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> None:
-    """Write the mission of a plan into a document. Members that are unchanged since ``old`` are kept as they are."""
+    """Write the mission into a document. Members that are unchanged since ``old`` are kept."""
     mission = document.setdefault("mission", {})
     if not mission:
         mission.update({"globalPlanAltitudeMode": 1, "items": [], "version": 2})
@@ -322,7 +312,6 @@ def _update_mission(document: dict[str, Any], plan: Plan, old: Plan | None) -> N
 
 
 def _fence_members(fence: Fence) -> dict[str, Any]:
-    """Return the members of ``geoFence``. InvalidArgument if the return point's altitude cannot be stored."""
     members: dict[str, Any] = {
         "version": 2,
         "circles": [

@@ -30,14 +30,13 @@ LANDING_PATTERNS = {"fwLandingPattern": MavCmd.NAV_LAND, "vtolLandingPattern": M
 
 
 def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
-    """Generate the items of a ComplexItem whose type is in :data:`LANDING_PATTERNS`."""
     command = LANDING_PATTERNS[pattern["complexItemType"].value]
     is_relative = pattern["altitudesAreRelative"].boolean()
     frame = MavFrame.GLOBAL_RELATIVE_ALT if is_relative else MavFrame.GLOBAL
     # Older files have a loiterCoordinate instead of the landingApproachCoordinate.
     approach = pattern.child("landingApproachCoordinate") or pattern["loiterCoordinate"]
     heading = 0.0 if command == MavCmd.NAV_LAND else math.nan  # QGroundControl sends these values.
-    x, y, z = _place(pattern["landCoordinate"])
+    x, y, z = read_xyz(pattern["landCoordinate"])
     return (
         MissionItem(MavCmd.DO_LAND_START, MavFrame.MISSION),
         *_reset_items(pattern),
@@ -47,7 +46,7 @@ def landing_items(pattern: JsonValue) -> tuple[MissionItem, ...]:
 
 
 def _reset_items(pattern: JsonValue) -> list[MissionItem]:
-    """Create the items that set the speed and stop photos and video, which come before the approach."""
+    """Return the items before the approach, which set the speed and stop photos and video."""
     items = []
     if _flag(pattern, "useDoChangeSpeed"):
         speed = pattern["finalApproachSpeed"].number(0)
@@ -62,9 +61,8 @@ def _reset_items(pattern: JsonValue) -> list[MissionItem]:
 
 
 def _approach(pattern: JsonValue, frame: MavFrame, place: JsonValue) -> MissionItem:
-    """Create the item of an approach: a waypoint, or a descent in a circle. Older files have only circles."""
-    x, y, z = _place(place)
-    if not _flag(pattern, "useLoiterToAlt", default=True):
+    x, y, z = read_xyz(place)
+    if not _flag(pattern, "useLoiterToAlt", default=True):  # Older files lack this flag and have only circles.
         return MissionItem(MavCmd.NAV_WAYPOINT, frame, param4=math.nan, x=x, y=y, z=z)
     radius = pattern["loiterRadius"].number(0)
     signed_radius = radius if pattern["loiterClockwise"].boolean() else -radius
@@ -77,7 +75,7 @@ def _flag(pattern: JsonValue, key: str, *, default: bool = False) -> bool:
     return default if value is None else value.boolean()
 
 
-def _place(value: JsonValue) -> tuple[int, int, float]:
+def read_xyz(value: JsonValue) -> tuple[int, int, float]:
     latitude, longitude, altitude = value.elements(3)
     x, y = round(latitude.number(-90, 90) * 1e7), round(longitude.number(-180, 180) * 1e7)
     return x, y, altitude.number()
@@ -115,24 +113,28 @@ def read_entries(entries: Sequence[JsonValue]) -> list[tuple[MissionItem, ...]]:
 def merged_entries(
     entries: Sequence[Any], groups: Sequence[tuple[MissionItem, ...]], items: Sequence[MissionItem]
 ) -> list[Any]:
-    """Return entries for ``items``. Old entries at the beginning and the end are kept if their items are unchanged.
+    """Return entries for ``items``. Old entries at both ends are kept if their items are unchanged.
 
     ``groups`` has the items of each old entry.
     """
+    targets = {item.param1 for item in items if item.command == MavCmd.DO_JUMP}
+
+    def may_keep(number: int, start: int) -> bool:
+        end = start + len(groups[number])
+        # The items of a landing pattern have no doJumpId, so the file cannot store a jump to them.
+        is_jump_target = not _items_with_id(entries[number]) and any(start <= target < end for target in targets)
+        return not is_jump_target and _matches(groups[number], items[start:end])
+
     # Keep the entries before `head_end`, which contain the items before `first_new`.
     head_end, first_new = 0, 0
-    while head_end < len(groups):
-        group = groups[head_end]
-        if not _matches(group, items[first_new : first_new + len(group)]):
-            break
+    while head_end < len(groups) and may_keep(head_end, first_new):
+        first_new += len(groups[head_end])
         head_end += 1
-        first_new += len(group)
     # Keep the entries from `tail_start` on, which contain the items from `end_new` on.
     tail_start, end_new = len(groups), len(items)
     while tail_start > head_end:
-        group = groups[tail_start - 1]
-        start = end_new - len(group)
-        if start < first_new or not _matches(group, items[start:end_new]):
+        start = end_new - len(groups[tail_start - 1])
+        if start < first_new or not may_keep(tail_start - 1, start):
             break
         tail_start -= 1
         end_new = start
@@ -166,7 +168,7 @@ def json_number(value: float) -> int | float | None:
 
 
 def _simple_values(entry: JsonValue) -> list[JsonValue] | None:
-    """Return the simple items in an entry, or None for a landing pattern, whose items must be generated."""
+    """Return the simple items in an entry; None for a landing pattern."""
     kind = entry["type"]
     kind.one_of("SimpleItem", "ComplexItem")
     if kind.value == "SimpleItem":
@@ -189,9 +191,8 @@ def _jump_ids(
 ) -> dict[int, int]:
     """Map each doJumpId in a .plan file to the index of the mission item that has this id.
 
-    An entry of the file is one simple item, a survey with several, or a landing pattern. ``groups`` has the simple
-    items of each entry (None for a landing pattern), ``sizes`` the number of mission items that the entry becomes. If
-    two items have the same id, an item that is an entry itself is preferred to one inside a survey.
+    ``groups`` has the simple items of each entry (None for a landing pattern), ``sizes`` the number of mission items
+    that the entry becomes.
     """
     ids_of_entries: dict[int, int] = {}
     ids_in_surveys: dict[int, int] = {}
@@ -206,6 +207,7 @@ def _jump_ids(
             else:
                 ids_in_surveys.setdefault(jump_id, index)
         first += size
+    # If two items have the same id, an item with an entry of its own is preferred to one inside a survey.
     return ids_in_surveys | ids_of_entries
 
 
@@ -234,7 +236,7 @@ def _jump_target(param: JsonValue, ids: dict[int, int]) -> float:
 
 
 def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
-    """Return the frame and altitude that the planner has saved; ``frame`` if the AltitudeMode does not define one."""
+    """Return the frame and the altitude that the planner has saved."""
     mode_member = value.child("AltitudeMode")
     mode = 0 if mode_member is None else mode_member.integer(0, 0xFF)
     # Mode 3 is an altitude above the terrain, which the planner has converted to one above mean sea level.
@@ -244,23 +246,25 @@ def _planned_altitude(value: JsonValue, frame: int) -> tuple[int, float]:
 
 
 def _matches(group: Sequence[MissionItem], items: Sequence[MissionItem]) -> bool:
-    """Return True if the items are equal. For two single jumps, the targets are ignored: they are always rewritten."""
     if len(group) == len(items) == 1:
         old, new = group[0], items[0]
-        if old.command == new.command == MavCmd.DO_JUMP:
+        if old.command == new.command == MavCmd.DO_JUMP:  # The target of a jump is always rewritten.
             return old.replace(param1=0.0) == new.replace(param1=0.0)
     return tuple(group) == tuple(items)
+
+
+def _items_with_id(entry: dict[str, Any]) -> list[dict[str, Any]]:
+    if entry["type"] == "SimpleItem":
+        return [entry]
+    items: list[dict[str, Any]] = entry.get("TransectStyleComplexItem", {}).get("Items", [])
+    return items
 
 
 def _set_jump_ids(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[MissionItem]) -> None:
     """Number the items from 1 (doJumpId), and set jump targets to these numbers."""
     first = 0
     for entry, size in zip(entries, sizes):  # noqa: B905 - same length
-        if entry["type"] == "SimpleItem":
-            simple_items = [entry]
-        else:
-            simple_items = entry.get("TransectStyleComplexItem", {}).get("Items", [])
-        for index, simple_item in enumerate(simple_items, first):
+        for index, simple_item in enumerate(_items_with_id(entry), first):
             simple_item["doJumpId"] = index + 1
             if simple_item["command"] == MavCmd.DO_JUMP:
                 simple_item["params"][0] = json_number(items[index].param1 + 1)
@@ -268,7 +272,7 @@ def _set_jump_ids(entries: Sequence[Any], sizes: Sequence[int], items: Sequence[
 
 
 def load_json(text: str, name: str) -> JsonValue:
-    """Parse a JSON document, or raise :class:`FileFormatError`, which names the line of a syntax error."""
+    """Parse a JSON document. Raises FileFormatError, which names the line of a syntax error."""
     try:
         return JsonValue(json.loads(text, parse_constant=_no_constant), name, "")
     except json.JSONDecodeError as error:
@@ -301,7 +305,6 @@ class JsonValue:
         return FileFormatError(f"{self.name}: {self.path or 'the document'} = {text}: expected {expected}")
 
     def child(self, key: str) -> JsonValue | None:
-        """Return the value of a key of an object, or None if there is no such key."""
         members = self.members()
         path = f"{self.path}.{key}" if self.path else key
         return JsonValue(members[key], self.name, path) if key in members else None
@@ -314,7 +317,6 @@ class JsonValue:
         return child
 
     def members(self) -> dict[str, Any]:
-        """Return the value as an object."""
         if not isinstance(self.value, dict):
             raise self.expected("an object")
         return self.value
@@ -354,13 +356,12 @@ class JsonValue:
         return int(value)
 
     def boolean(self) -> bool:
-        """Return true or false."""
         if not isinstance(self.value, bool):
             raise self.expected("true or false")
         return self.value
 
     def one_of(self, *choices: object) -> None:
-        """Raise unless the value is one of ``choices``."""
+        """Raise FileFormatError for any other value."""
         if self.value not in choices or isinstance(self.value, bool):
             raise self.expected(" or ".join(json.dumps(choice) for choice in choices))
 

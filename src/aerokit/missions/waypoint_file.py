@@ -117,19 +117,16 @@ class _Row:
         self._integer("current", 0xFF)  # Raises for an invalid number. The value is not used.
 
     def is_home(self) -> bool:
-        """Return True if this line can be home: a waypoint whose altitude is relative to mean sea level.
-
-        Mission Planner used to write command 0 for home.
-        """
+        """Return True if this line can be home."""
+        # Mission Planner used to write command 0 for home.
         return self.command in (0, MavCmd.NAV_WAYPOINT) and canonical_frame(self.frame) == MavFrame.GLOBAL
 
     def home(self) -> Position | None:
-        """Return the place in this line; None for 0°, 0°, which stands for an unknown home."""
+        """Return None for 0°, 0°. Files have this place if home is unknown."""
         latitude, longitude = self._number("latitude", 90), self._number("longitude", 180)
         return Position(latitude, longitude, self._number("altitude")) if latitude or longitude else None
 
     def item(self) -> MissionItem:
-        """Return the item in this line. FileFormatError for values that are invalid or out of range."""
         has_degrees = xy_scale(self.command, self.frame) == DEGREE_SCALE
         latitude = self._number("latitude", 90.0 if has_degrees else math.inf, may_be_nan=True)
         longitude = self._number("longitude", 180.0 if has_degrees else math.inf, may_be_nan=True)
@@ -147,7 +144,6 @@ class _Row:
         )
 
     def _integer(self, column: str, high: int) -> int:
-        """Return the number in a column. FileFormatError if it is not a whole number from 0 to ``high``."""
         text = self.texts[_COLUMNS.index(column)]
         # Valid numbers have at most five digits. Refuse very long texts here, because int() would take long for them.
         is_short_number = text.isascii() and text.isdigit() and len(text) < 9
@@ -156,7 +152,6 @@ class _Row:
         return int(text)
 
     def _number(self, column: str, limit: float = math.inf, *, may_be_nan: bool = False) -> float:
-        """Return the number in a column. FileFormatError if it is not a finite number within ``limit``."""
         text = self.texts[_COLUMNS.index(column)]
         try:
             value = float(text) if "_" not in text else math.inf  # float() would accept 1_000.
@@ -170,7 +165,6 @@ class _Row:
 
 
 def _home_row(home: Position | None) -> str:
-    """Return the first line of items, which is home. Zeros if home is unknown."""
     place = (0.0, 0.0, 0.0)
     if home is not None:
         place = (home.latitude_deg, home.longitude_deg, home.altitude_amsl_m or 0.0)
@@ -179,7 +173,6 @@ def _home_row(home: Position | None) -> str:
 
 
 def _item_row(item: MissionItem, index: int) -> str:
-    """Return the line for one item. InvalidArgument for numbers that the file cannot store."""
     integers = (index, 0, int(item.frame), int(item.command))
     numbers = (item.param1, item.param2, item.param3, item.param4, *unscaled_xy(item))
     if any(math.isinf(number) for number in (*numbers, item.z)):

@@ -26,10 +26,7 @@ def to_wire(
     mission_type: int = 0,
     current: bool = False,
 ) -> messages.MissionItemInt:
-    """Convert an item to MISSION_ITEM_INT. ``x`` and ``y`` must be integers, which ``check_items`` ensures.
-
-    https://mavlink.io/en/messages/common.html#MISSION_ITEM_INT
-    """
+    """Convert an item to MISSION_ITEM_INT. Its ``x`` and ``y`` must be integers."""
     return messages.MissionItemInt(
         target_system=target_system,
         target_component=target_component,
@@ -59,12 +56,10 @@ def to_wire_float(
     current: int = 0,
     place: tuple[float, float] | None = None,
 ) -> messages.MissionItem:
-    """Convert an item to MISSION_ITEM, for vehicles without MISSION_ITEM_INT. Places are rounded to about a metre.
+    """Convert an item to MISSION_ITEM, for vehicles without MISSION_ITEM_INT.
 
-    ``place`` has the values to send in ``x`` and ``y``. If it is None, those of the item are sent, converted to degrees
-    if they are a position.
-
-    https://mavlink.io/en/messages/common.html#MISSION_ITEM
+    Places are rounded to about a metre. If ``place`` is given, it is sent in ``x`` and ``y`` instead of the item's own
+    values.
     """
     x, y = unscaled_xy(item) if place is None else place
     return messages.MissionItem(
@@ -114,9 +109,9 @@ def unscaled_xy(item: MissionItem) -> tuple[float, float]:
 
 
 def from_degrees(value: float, command: int, frame: int) -> int | float:
-    """Convert one coordinate from degrees or metres to ``x`` or ``y``; the inverse of :func:`unscaled_xy`.
+    """Convert one coordinate to ``x`` or ``y``. This is the inverse of :func:`unscaled_xy`.
 
-    Positions are rounded to integers; other values keep their fraction.
+    Positions are rounded to integers. Other values keep their fraction.
     """
     if math.isnan(value):
         return DEFAULT_XY
@@ -127,21 +122,19 @@ def from_degrees(value: float, command: int, frame: int) -> int | float:
 
 
 def with_home(items: Sequence[MissionItem], home: Position | None = None) -> tuple[MissionItem, ...]:
-    """Add home as item 0, because ArduPilot counts home, and adjust jump targets. An unknown home is 0°, 0°.
-
-    ArduPilot ignores this item and uses its own home.
-    """
+    """Add home as item 0, and adjust jump targets. An unknown home is 0°, 0°."""
+    # ArduPilot counts home as item 0. It ignores this item and uses its own home.
     return (home_item(home), *shift_jumps(items, 1))
 
 
 def without_home(items: Sequence[MissionItem]) -> tuple[tuple[MissionItem, ...], Position | None]:
-    """Return the items after item 0, with adapted jumps, and the place of item 0 (home), None if it is not valid."""
+    """Return the items after item 0, with adjusted jump targets, and the place of item 0."""
     home = items[0].position if items else None
     return shift_jumps(items[1:], -1), home
 
 
 def home_item(home: Position | None) -> MissionItem:
-    """Create a waypoint at home, with its altitude above mean sea level (0 if unknown), or at 0°, 0° for None."""
+    """Create the item for home. An unknown home is 0°, 0°."""
     if home is None:
         return MissionItem(MavCmd.NAV_WAYPOINT, MavFrame.GLOBAL)
     x, y = round(home.latitude_deg * 1e7), round(home.longitude_deg * 1e7)
@@ -149,8 +142,9 @@ def home_item(home: Position | None) -> MissionItem:
 
 
 def shift_jumps(items: Iterable[MissionItem], offset: int) -> tuple[MissionItem, ...]:
-    """Add ``offset`` to the targets of DO_JUMP, which are the only parameters that refer to items by number."""
+    """Add ``offset`` to the targets of DO_JUMP."""
 
+    # No other command refers to items by number.
     def shifted(item: MissionItem) -> MissionItem:
         return item.replace(param1=item.param1 + offset) if item.command == MavCmd.DO_JUMP else item
 
@@ -160,19 +154,19 @@ def shift_jumps(items: Iterable[MissionItem], offset: int) -> tuple[MissionItem,
 def convert_from_ardupilot(items: Iterable[MissionItem], here: tuple[float, float] | None) -> Iterator[MissionItem]:
     """Convert the items of a mission that was made for ArduPilot, so that another autopilot accepts them.
 
-    For a command that has no position, ArduPilot accepts any frame, PX4 only MAV_FRAME_MISSION. In ArduPilot, the
-    position 0°, 0° means the current position. It is replaced by the last destination before it, or by ``here``
-    (latitude and longitude in degrees) if there is none. If ``here`` is None, 0°, 0° is kept, and `check_items` refuses
-    the mission.
+    ``here`` is the current position (latitude and longitude in degrees), for a destination at 0°, 0°. If it is None,
+    0°, 0° is kept, and `check_items` refuses the mission.
     """
     current_xy: tuple[int, int] | None = None
     if here is not None:
         latitude_deg, longitude_deg = here
         current_xy = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
     for item in items:
+        # For a command that has no position, ArduPilot accepts any frame, PX4 only MAV_FRAME_MISSION.
         if item.frame in GLOBAL_FRAMES and not has_place(item.command):
             item = item.replace(frame=int(MavFrame.MISSION))
         if item.command in DESTINATIONS and item.frame in GLOBAL_FRAMES:
+            # In ArduPilot, 0°, 0° means the current position: that of the last destination before it.
             if current_xy is not None and item.x == item.y == 0:
                 x, y = current_xy
                 item = item.replace(x=x, y=y)
@@ -241,11 +235,7 @@ def pack_items(
 
 
 def read_header(data: bytes) -> PlanHeader:
-    """Decode the header of a packed plan.
-
-    Raises:
-        RemoteProtocolError: the data is not a packed plan.
-    """
+    """Decode the header of a packed plan. Raises RemoteProtocolError for other data."""
     if len(data) < HEADER.size:
         raise RemoteProtocolError(f"packed plan: expected a header of {HEADER.size} bytes, received {len(data)} bytes")
     magic, *numbers = HEADER.unpack_from(data)
@@ -257,10 +247,8 @@ def read_header(data: bytes) -> PlanHeader:
 def unpack_items(data: bytes, mission_type: int | None = None) -> tuple[MissionItem, ...]:
     """Decode all items of a packed plan. The first has the number ``first_index`` of the header.
 
-    In a mission of ArduPilot, the item with number 0 is home.
-
-    Raises:
-        RemoteProtocolError: the data is not a packed plan, is truncated, or has another ``mission_type``.
+    In a mission of ArduPilot, the item with number 0 is home. Raises RemoteProtocolError if the data is not a complete
+    packed plan of this type.
     """
     header = read_header(data)
     if mission_type is not None and header.mission_type != mission_type:

@@ -104,7 +104,6 @@ class Calibration(AsyncIterator["CalibrationStep"]):
 
 
 def _abandon(run: CalibrationRun, steps: AsyncGenerator[CalibrationStep, None]) -> None:
-    """Cancel the calibration on the vehicle, and close the generator of its steps in the background."""
     run.abandon()
     run.session.background.start(steps.aclose, "aerokit calibration")
 
@@ -140,11 +139,11 @@ class CalibrationControl:
 
     def gyroscope(self) -> Calibration:
         """Calibrate the gyroscopes, while the vehicle stands still."""
-        return self._prepare("gyroscope", _acknowledged("keep the vehicle still"), command_param=1)
+        return self._prepare("gyroscope", _single_command("keep the vehicle still"), command_param=1)
 
     def level(self) -> Calibration:
         """Calibrate the level attitude, while the vehicle stands level and still."""
-        procedure = _acknowledged("place the vehicle level and keep it still")
+        procedure = _single_command("place the vehicle level and keep it still")
         return self._prepare("level", procedure, command_param=5, param_value=2)
 
     def barometer(self) -> Calibration:
@@ -152,7 +151,7 @@ class CalibrationControl:
 
         ArduPilot uses the present pressure as the pressure on the ground; PX4 uses the GPS altitude.
         """
-        return self._prepare("barometer", _acknowledged("shelter the vehicle from wind"), command_param=3)
+        return self._prepare("barometer", _single_command("shelter the vehicle from wind"), command_param=3)
 
     def airspeed(self) -> Calibration:
         """Calibrate the airspeed sensors. Shelter them from wind; PX4 later asks a person to blow into the tube."""
@@ -192,13 +191,8 @@ class CalibrationControl:
     ) -> Calibration:
         """Return the iterator of a calibration. Nothing is sent before its first step.
 
-        Args:
-            sensor: name of the public method.
-            ardupilot: procedure for ArduPilot.
-            px4: procedure for PX4.
-            command_param: number of the parameter of MAV_CMD_PREFLIGHT_CALIBRATION that starts this calibration; 0 if
-                the procedure does not need it.
-            param_value: value of this parameter. All parameters before it are 0.
+        The parameter of MAV_CMD_PREFLIGHT_CALIBRATION with the number ``command_param`` is ``param_value``. All
+        parameters before it are 0. If ``command_param`` is 0, the procedure gets no parameters.
         """
         run = CalibrationRun(self._context, sensor, self._runs, self._parameters)
         is_px4 = self._context.session.autopilot.calibration_protocol == "texts"
@@ -210,6 +204,5 @@ class CalibrationControl:
         return Calibration(run, procedure(run, *params))
 
 
-def _acknowledged(instruction: str) -> Procedure:
-    """Return the procedure of a calibration that ends at the acknowledgement of its command."""
-    return partial(procedures.acknowledged, instruction=instruction)
+def _single_command(instruction: str) -> Procedure:
+    return partial(procedures.ardupilot_single_command, instruction=instruction)

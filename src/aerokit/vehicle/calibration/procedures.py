@@ -47,7 +47,7 @@ ACCELEROMETER_CANNOT_CANCEL = (
 
 
 async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
-    """PX4: yield a new step when a ``[cal]`` status text changes the step. PX4 itself detects the poses."""
+    """Yield the steps that PX4's ``[cal]`` status texts report. PX4 detects the poses itself."""
     await run.begin(CANCEL_ALL)
     telemetry, now = run.session.telemetry, run.session.connection.now
     reports: deque[CalibrationReport] = deque()
@@ -94,7 +94,6 @@ async def px4_by_status_texts(run: CalibrationRun, *params: float) -> AsyncGener
 
 
 def _step_after(step: CalibrationStep, report: CalibrationReport) -> CalibrationStep:
-    """Return the step that follows ``step`` after a report of PX4."""
     if report.kind == "progress":
         return step.replace(progress=report.progress)
     if report.kind == "pending":
@@ -110,8 +109,10 @@ def _step_after(step: CalibrationStep, report: CalibrationReport) -> Calibration
     return step  # The other reports ("started", "side progress") do not change the step.
 
 
-async def acknowledged(run: CalibrationRun, *params: float, instruction: str) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: run a calibration that consists of one command. The acknowledgement of the command is the result."""
+async def ardupilot_single_command(
+    run: CalibrationRun, *params: float, instruction: str
+) -> AsyncGenerator[CalibrationStep, None]:
+    """Send the one command of a calibration. Its acknowledgement is the result."""
     run.check_ready()
     yield run.new_step(None, instruction)
     await run.begin(cancel=None)
@@ -120,17 +121,15 @@ async def acknowledged(run: CalibrationRun, *params: float, instruction: str) ->
 
 
 async def ardupilot_airspeed(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: calibrate the airspeed sensors and the barometer by one command."""
     run.check_ready()
     if await _read_parameter(run, "ARSPD_TYPE") == 0:
         raise run.failure("no airspeed sensor is enabled (ARSPD_TYPE is 0); nothing was sent")
     # param3 = 1 calibrates the barometer and, in the same step, the airspeed sensors.
-    async for step in acknowledged(run, 0, 0, 1, instruction="cover the airspeed sensor against wind"):
+    async for step in ardupilot_single_command(run, 0, 0, 1, instruction="cover the airspeed sensor against wind"):
         yield step
 
 
 async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduCopter: set ESC_CALIBRATION to 3, so that the vehicle calibrates the ESCs at its next boot."""
     run.check_ready()
     old_value = await _read_parameter(run, "ESC_CALIBRATION")
     yield run.new_step(None, "remove the propellers, then continue", needs_confirmation=True)
@@ -140,15 +139,14 @@ async def ardupilot_escs(run: CalibrationRun, *_: float) -> AsyncGenerator[Calib
     except ParameterRejected:  # The vehicle refused, so there is nothing to restore.
         raise
     except BaseException:  # The vehicle may have set the value, although the call failed or was cancelled.
-        await _restore(run, "ESC_CALIBRATION", old_value)
+        await _restore_parameter(run, "ESC_CALIBRATION", old_value)
         raise
     finally:
         run.finish()
     yield run.result("disconnect the battery, then connect it: the ESCs are calibrated at boot", reboot_due=True)
 
 
-async def _restore(run: CalibrationRun, name: str, value: float) -> None:
-    """Restore the parameter that starts the calibration at boot; log a warning if this is not confirmed."""
+async def _restore_parameter(run: CalibrationRun, name: str, value: float) -> None:
     with anyio.CancelScope(shield=True), anyio.move_on_after(RESTORE_TIMEOUT_S), suppress(AerokitError):
         if run.context.arbiter.is_state_recent:  # Nothing is sent to a silent vehicle.
             await run.parameters().set(name, value)
@@ -162,7 +160,7 @@ async def _restore(run: CalibrationRun, name: str, value: float) -> None:
 
 
 async def _read_parameter(run: CalibrationRun, name: str) -> float:
-    """Return the value of a parameter; raise NotSupported if the vehicle does not have it."""
+    """Return the parameter's value. Raises NotSupported if the vehicle has no such parameter."""
     try:
         return (await run.parameters().read(name)).value
     except ParameterRejected:
@@ -171,7 +169,6 @@ async def _read_parameter(run: CalibrationRun, name: str) -> float:
 
 
 async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: yield the progress of all compasses, and accept the result if all have succeeded."""
     await run.begin((MavCmd.DO_CANCEL_MAG_CAL, 0))
     percents: dict[int, int] = {}  # progress in percent by number of the compass
     reports: dict[int, MagCalReport] = {}  # final report by number of the compass
@@ -179,7 +176,6 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
     compass_mask = 0  # Bit i is set if compass i is being calibrated.
 
     def on_message(message: MagCalProgress | MagCalReport) -> None:
-        """Record the progress or result of one compass. The same progress again does not count as a change."""
         nonlocal compass_mask, has_changed
         if not run.is_from_autopilot(message):
             return
@@ -187,7 +183,7 @@ async def ardupilot_compass(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         if isinstance(message, MagCalReport):
             reports[message.compass_id] = message
         elif percents.get(message.compass_id) == message.completion_pct:
-            return
+            return  # The same progress again is not a change.
         else:
             percents[message.compass_id] = message.completion_pct
         has_changed = True
@@ -236,7 +232,6 @@ def _status_name(status: int) -> str:
 
 
 async def ardupilot_accelerometer(run: CalibrationRun, *params: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot: yield the six poses that the vehicle requests one after the other, and confirm each."""
     await run.begin(cancel=None, cannot_cancel_reason=ACCELEROMETER_CANNOT_CANCEL)
     requests: deque[int] = deque()
     confirmed_pose, confirmed_at = 0, -math.inf
@@ -287,7 +282,6 @@ RESULTS_OF_RC_COMMAND = (MavResult.UNSUPPORTED,)
 
 
 async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[CalibrationStep, None]:
-    """ArduPilot and PX4: measure the travel of each channel in RC_CHANNELS, and write RCn_MIN, RCn_MAX and RCn_TRIM."""
     run.check_ready()
     channels = run.session.telemetry.cells["rc_channels"]
     lows: dict[int, int] = {}
@@ -296,8 +290,7 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
         cleanup.enter_context(run.session.streaming("rc_channels"))
 
         async def wait_channels() -> None:
-            """Wait for an RC_CHANNELS that arrives after this call. Stick positions received before may be outdated."""
-            previous_update = channels.updated_at
+            previous_update = channels.updated_at  # Older stick positions may be outdated.
             await run.wait(
                 lambda: channels.updated_at > previous_update,
                 CHANNELS_TIMEOUT_S,
@@ -345,6 +338,6 @@ async def radio_by_channels(run: CalibrationRun, *_: float) -> AsyncGenerator[Ca
 
 
 def _pulses(value: object) -> dict[int, int]:
-    """Map the number of each received channel, from 1, to its pulse width in µs."""
+    """Map channel numbers, from 1, to pulse widths in µs. Channels that are not received are left out."""
     pulses: tuple[int | None, ...] = getattr(value, "channels_us", ())
     return {number: pulse for number, pulse in enumerate(pulses, 1) if pulse}

@@ -76,7 +76,7 @@ class CalibrationRun:
     # ------------------------------------------------------------------------------- start and end
 
     def check_ready(self) -> None:
-        """Raise OperationRejected unless the vehicle is known to be disarmed; NotSupported for unknown firmware."""
+        """Raise NotSupported for unknown firmware, and OperationRejected if the vehicle may be armed."""
         autopilot = self.session.autopilot
         if not autopilot.calibration_protocol:
             raise NotSupported(
@@ -85,11 +85,10 @@ class CalibrationRun:
         self.session.check_disarmed(self.call_name, is_current=self.context.arbiter.is_state_recent)
 
     async def begin(self, cancel: tuple[float, ...] | None, cannot_cancel_reason: str = "") -> None:
-        """Wait until no other calibration is being cancelled, then register this calibration as running.
+        """Register this calibration as running, once the cancellation of earlier ones has ended.
 
-        Args:
-            cancel: the command that cancels the calibration, with its parameters; None if there is no such command.
-            cannot_cancel_reason: tells the user why this calibration cannot be cancelled; empty if it can.
+        ``cancel`` is the command that cancels this calibration, with its parameters. Raises BusyError if another
+        calibration is in progress.
         """
         self.check_ready()
         # The run of a deleted iterator is abandoned only in the next iteration of the event loop, so wait for that.
@@ -109,7 +108,7 @@ class CalibrationRun:
         self._cleanup.callback(self.session.on_reboot.remove, self._on_reboot)
 
     async def command(self, command: int, *params: float, accepts: Collection[int] = ()) -> None:
-        """Send a command of the calibration and wait for its answer. The results in ``accepts`` raise no error."""
+        """Send a command and wait for its acknowledgement. Results in ``accepts`` raise no error."""
         # ArduPilot calibrates its gyroscopes before it acknowledges the start. None selects the usual time-out.
         attempt_timeout = START_TIMEOUT_S if command == MavCmd.PREFLIGHT_CALIBRATION else None
         try:
@@ -119,7 +118,6 @@ class CalibrationRun:
                 raise
 
     async def start(self, *params: float, command: int = MavCmd.PREFLIGHT_CALIBRATION) -> None:
-        """Send the command that starts the calibration. If the vehicle refuses, end this run and raise the error."""
         try:
             await self.command(command, *params)
         except CommandRejected:
@@ -139,13 +137,12 @@ class CalibrationRun:
 
     @property
     def is_running(self) -> bool:
-        """True if the calibration may be running on the vehicle."""
         return self in self._runs
 
     # --------------------------------------------------------------------------------------- cancel
 
     def abandon(self) -> None:
-        """Cancel the calibration on the vehicle, without waiting. Does nothing if it is not running."""
+        """Cancel the calibration on the vehicle, without waiting."""
         if not self.is_running or self._is_abandoned:
             return
         self._is_abandoned = True
@@ -187,10 +184,6 @@ class CalibrationRun:
         self.session.commands.send_unconfirmed(int(command), *params)
 
     async def _confirm_cancel(self) -> None:
-        """Send the cancel command if it was not sent yet; repeat it until the vehicle confirms the cancellation.
-
-        It is sent at most `MAX_CANCEL_ATTEMPTS` times, and not after a reboot or a takeover.
-        """
         assert self._cancel_command is not None
         command = self._cancel_command[0]
         must_send = self._cancel_sent_at is None  # `abandon` has sent the first command, unless the vehicle was silent.
@@ -222,11 +215,6 @@ class CalibrationRun:
             self.finish()
 
     def _is_cancelled(self, cancel_command: float) -> bool:
-        """Return True if the vehicle has confirmed ``cancel_command``, or has rebooted.
-
-        On ArduPilot, the confirmation is a COMMAND_ACK. On PX4, it is a HEARTBEAT that no longer reports a calibration,
-        because PX4 acknowledges PREFLIGHT_CALIBRATION twice with different results.
-        """
         if self._has_rebooted:
             return True
         assert self._cancel_sent_at is not None
@@ -236,6 +224,7 @@ class CalibrationRun:
         if self.session.autopilot.calibration_protocol != "texts":
             # ArduPilot executes the command, but answers UNSUPPORTED (GCS_Common.cpp), so any answer confirms it.
             return self.session.commands.last_result(int(cancel_command)) is not None
+        # PX4 acknowledges PREFLIGHT_CALIBRATION twice, with different results, so its HEARTBEAT is the confirmation.
         status = self.session.telemetry.system_status
         return status.updated_at > self._cancel_sent_at and status.latest != MavState.CALIBRATING
 
@@ -275,5 +264,4 @@ class CalibrationRun:
         return self.new_step(1.0, instruction, result=CalibrationResult(compasses, reboot_due, texts))
 
     def failure(self, reason: str) -> OperationRejected:
-        """Return the error of a calibration that failed, with the vehicle's texts."""
         return OperationRejected(f"{self.call_name}: {reason}", reasons=self.session.texts_since(self._started_at))

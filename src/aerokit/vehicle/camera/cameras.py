@@ -257,7 +257,6 @@ class Cameras:
         self._first_link.is_muted = number in self._cameras
 
     def _on_capture(self, message: Any, device_id: int) -> None:
-        """Create the camera object if needed, so that its capture log also gets this first capture."""
         number = self._record(message, device_id)
         is_camera = number != 0
         has_object = number == self._first_link.number or number in self._cameras
@@ -270,7 +269,7 @@ class Cameras:
             # If the list is full, a new capture replaces the last one.
             del self._early_captures[MAX_EARLY_CAPTURES - 1 :]
             self._early_captures.append((message, capture))
-        else:
+        else:  # The new object has missed this message.
             self.at(number)._log.record(message, capture)
 
     def _process_early_captures(self) -> None:
@@ -282,11 +281,7 @@ class Cameras:
             self.at(capture.camera)._log.record(message, capture)
 
     def _record(self, message: Any, device_id: int) -> int:
-        """Add the camera to the state value `cell`; return its number, or 0 if the message is not from a camera.
-
-        The number is ``device_id`` if the autopilot is the sender, otherwise the component id of the sender. The first
-        camera with a component of its own becomes `first`.
-        """
+        """Add the camera to `cell` and return its number. Returns 0 if the message is not from a camera."""
         frame = message.received_frame
         if frame is None:
             return 0
@@ -300,11 +295,11 @@ class Cameras:
         if number not in numbers:
             source = Source(self._session.system_id, frame.component_id, message.NAME)
             self.cell.set(tuple(sorted((*numbers, number), key=_sort_key)), source)
+        # The first camera with its own component id becomes `first`.
         if not has_autopilot_number and self._first_link.number is None:
             self._first_link.bind(number)
         return int(number)
 
 
 def _sort_key(number: int) -> tuple[bool, int]:
-    """Sort cameras by number, but those attached to the autopilot last."""
     return number in AUTOPILOT_CAMERA_IDS, number

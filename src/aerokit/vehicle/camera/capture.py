@@ -75,14 +75,13 @@ class Capture(Snapshot):
 
 
 def capture_of(message: Any, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
-    """Decode a message about a picture. Call this at once: CAMERA_TRIGGER is combined with the present position."""
+    """Decode a message about a picture. Call it as soon as the message arrives."""
     if message.NAME == "CAMERA_TRIGGER":
         return from_trigger(message, camera, received_at, telemetry)
     return (from_feedback if message.NAME == "CAMERA_FEEDBACK" else from_image)(message, camera, received_at)
 
 
 def from_image(message: CameraImageCaptured, camera: int, received_at: float) -> Capture:
-    """Decode CAMERA_IMAGE_CAPTURED."""
     w, x, y, z = message.q
     length = math.sqrt(w * w + x * x + y * y + z * z)
     quaternion = (w, x, y, z) if math.isfinite(length) and length > 0 else None
@@ -103,11 +102,10 @@ def from_image(message: CameraImageCaptured, camera: int, received_at: float) ->
 
 
 def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> Capture:
-    """Decode ArduPilot's CAMERA_FEEDBACK, which counts pictures from 1."""
     roll, pitch, yaw = _angles(message.roll, message.pitch, message.yaw)
     return Capture(
         camera=camera,
-        index=(message.img_idx - 1) % FEEDBACK_INDEX_RANGE,
+        index=(message.img_idx - 1) % FEEDBACK_INDEX_RANGE,  # `img_idx` counts pictures from 1.
         success=True,  # ArduPilot always sends the flag CAMERA_FEEDBACK_PHOTO (AP_Camera_Backend.cpp).
         received_at=received_at,
         taken_at=_utc(message.time_usec),
@@ -121,7 +119,7 @@ def from_feedback(message: CameraFeedback, camera: int, received_at: float) -> C
 
 
 def from_trigger(message: CameraTrigger, camera: int, received_at: float, telemetry: Telemetry) -> Capture:
-    """Decode PX4's CAMERA_TRIGGER. The message has no position, so the vehicle's position and attitude are used."""
+    # PX4's message has no position, so the vehicle's present position and attitude are used.
     position = telemetry.position.latest if telemetry.position.age <= MAX_POSE_AGE_S else None
     attitude = telemetry.attitude.latest if telemetry.attitude.age <= MAX_POSE_AGE_S else None
     roll: float | None = None
@@ -168,7 +166,7 @@ def _quaternion_of(roll: float | None, pitch: float | None, yaw: float | None) -
 
 
 def _euler(quaternion: Quaternion) -> tuple[float, float, float]:
-    """Convert to roll, pitch and yaw in degrees. For a camera that points straight up or down, roll is 0."""
+    """Return roll, pitch and yaw in degrees."""
     length = math.sqrt(sum(value * value for value in quaternion))
     w, x, y, z = (value / length for value in quaternion)
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Rounding may exceed 1, which asin() refuses.
@@ -302,11 +300,9 @@ def _split(jpeg: bytes) -> tuple[list[bytes], bytes]:
 
 
 def _segments(jpeg: bytes) -> Iterator[bytes]:
-    """Yield each segment before the image data: FF, marker, length (2 bytes), content.
-
-    The length includes its own 2 bytes.
-    """
+    """Yield each segment before the image data."""
     start = 2  # after the two bytes FF D8, with which every JPEG begins
+    # A segment consists of FF, its marker, its length in 2 bytes, and its content. The length includes these 2 bytes.
     while jpeg[start + 1 : start + 2] != bytes((SCAN,)):
         length = int.from_bytes(jpeg[start + 2 : start + 4], "big")
         segment = jpeg[start : start + 2 + length]
@@ -328,7 +324,6 @@ def _pillow(module: str) -> Any:
 
 
 def _exif_tags(capture: Capture) -> dict[int, Any]:
-    """Return the EXIF tags for time and elevation angle, where known, by their numbers in the standard."""
     tags: dict[int, Any] = {}
     time = _time_of(capture)
     if time is not None:
@@ -340,7 +335,6 @@ def _exif_tags(capture: Capture) -> dict[int, Any]:
 
 
 def _gps_tags(capture: Capture) -> dict[int, Any]:
-    """Return the GPS tags of a capture by their numbers in the EXIF standard."""
     place = capture.place
     assert place is not None
     tags: dict[int, Any] = {
@@ -363,8 +357,8 @@ def _gps_tags(capture: Capture) -> dict[int, Any]:
 
 
 def _sexagesimal(degrees: float) -> tuple[float, float, float]:
-    """Convert to degrees, minutes and seconds, rounded to 0.0001 seconds (some millimetres)."""
-    ten_thousandths = round(abs(degrees) * 36_000_000)  # the angle in units of 1/10,000 arc second
+    """Return degrees, minutes and seconds, without the sign."""
+    ten_thousandths = round(abs(degrees) * 36_000_000)  # the angle in units of 1/10,000 arc second, which is 3 mm
     total_minutes, rest = divmod(ten_thousandths, 60 * 10_000)
     whole_degrees, minutes = divmod(total_minutes, 60)
     return float(whole_degrees), float(minutes), rest / 10_000

@@ -63,7 +63,7 @@ class _Entry:
             self.boot_us = 0 if is_utc else stamp
 
     def reports_same_picture(self, other: _Entry) -> bool:
-        """Return True if this entry and another one with the same index are about the same picture."""
+        """Compare two entries that have the same index."""
         # PX4 reports each picture by two messages of different types, which arrive in quick succession.
         if self.kind is not other.kind:
             return abs(self.capture.received_at - other.capture.received_at) <= DUPLICATE_WINDOW_S
@@ -75,7 +75,7 @@ class _Entry:
         return self.capture.place == other.capture.place
 
     def was_taken_later(self, other: _Entry) -> bool:
-        """Return True if the time stamps show that this picture is later. Returns False if they cannot be compared."""
+        """Return False if the time stamps cannot be compared."""
         if self.utc_us and other.utc_us:
             return self.utc_us > other.utc_us
         return bool(self.boot_us and other.boot_us) and self.boot_us > other.boot_us
@@ -142,7 +142,7 @@ class CaptureLog:
         return None if entry is None else entry.capture
 
     async def _request(self, index: int) -> bool:
-        """Request the capture once; return True if the camera answers that it does not have this capture."""
+        """Request the capture once. Returns True if the camera answers that it does not have it."""
         request = self._link.requests.request
         try:
             if not self._link.is_autopilot_attached:
@@ -170,7 +170,6 @@ class CaptureLog:
         self.record(message, capture_of(message, self._link.number or 0, self._link.now(), self._link.telemetry))
 
     def record(self, message: Message, capture: Capture) -> None:
-        """Store ``capture``, which is the result of `capture_of` for ``message``."""
         if isinstance(message, m.CameraImageCaptured):
             self._has_images = True
             self._add(message, capture)
@@ -188,7 +187,6 @@ class CaptureLog:
             self._add(message, capture)
 
     def _on_status(self, message: m.CameraCaptureStatus) -> None:
-        """Record the number of pictures. A lower number than before shows that the camera counts from 0 again."""
         boot_ms, count = message.time_boot_ms, message.image_count
         if 0 < self._count_boot_ms - boot_ms < REORDER_WINDOW_MS:
             return  # This status was sent before the newest one, and arrived late.
@@ -222,7 +220,6 @@ class CaptureLog:
         return has_wrapped or entry.was_taken_later(highest)
 
     def _add(self, message: Message, capture: Capture) -> None:
-        """Store a capture and publish it, unless an earlier message about this picture has the same content or more."""
         entry = _Entry(message, capture)
         if capture.success is False:
             self._add_failed(message, entry)
@@ -252,31 +249,24 @@ class CaptureLog:
         self._publish(message, capture, is_new=is_new)
 
     def _update_highest(self, entry: _Entry) -> None:
-        """Record the entry with the highest index.
-
-        An index far above the highest one may be corrupt, so it counts only when the next picture, or a second message
-        about the same picture, confirms it.
-        """
         index, highest, outlier = entry.capture.index, self._highest, self._outlier
         self._outlier = None
         if highest is None or 0 <= index - highest.capture.index <= MAX_INDEX_GAP:
             self._highest = entry
         elif index > highest.capture.index:
+            # The index may be corrupt. The next picture, or a second message about this picture, confirms it.
             if outlier is not None and 0 <= index - outlier.capture.index <= MAX_INDEX_GAP:
                 self._highest = entry
             else:
                 self._outlier = entry
 
     def _add_failed(self, message: Message, entry: _Entry) -> None:
-        """Publish a failed picture once, and store it unless a successful picture has the same index.
-
-        Two pictures can have one index, because a camera may use the index of a failed picture again.
-        """
         index, last_failed = entry.capture.index, self._failed
         if last_failed is not None and last_failed.capture.index == index and last_failed.reports_same_picture(entry):
             return  # The message is repeated.
         self._failed = entry
         previous = self._by_index.get(index)
+        # A successful picture with this index stays, because a camera may use the index of a failed picture again.
         if previous is None or previous.capture.success is False:
             self._store(entry)
         self._publish(message, entry.capture, is_new=True)
@@ -317,11 +307,10 @@ class CaptureQueue:
             self._detach()
 
     def pop(self) -> Capture | None:
-        """Return the oldest capture in the queue and remove it; None if the queue is empty."""
         return self._queue.popleft() if self._queue else None
 
     async def wait(self, seconds: float) -> bool:
-        """Wait for a capture; return False if none arrives in time."""
+        """Return False if no capture arrives in time."""
         with anyio.move_on_after(seconds):
             while not self._queue:
                 self._log.end.raise_if_ended()

@@ -150,7 +150,6 @@ class LensMixin(CameraMixin):
             await self._link.command(command, kind, value, self._link.device_id, order=order, attempts=attempts)
 
     def _continuous(self, action: str, capability: str, command: int, kind: int, speed: float) -> CameraBlock:
-        """Return a block that starts a zoom or focus movement and, when it is left, stops the movement."""
         link = self._link
         return CameraBlock(
             link,
@@ -345,7 +344,6 @@ class StorageMixin(CameraMixin):
         return self.storage.value
 
     async def _request_medium(self, number: int) -> None:
-        """Request information about one medium, and wait for it."""
         await self._link.request(m.StorageInformation, number, where=lambda message: message.storage_id == number)
 
     async def format_storage(

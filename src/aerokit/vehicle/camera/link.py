@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -21,7 +21,7 @@ from aerokit.vehicle.camera.orders import (
 from aerokit.vehicle.camera.values import CameraInformation, information_of
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
     from aerokit.connection.bus import Detach, EndSignal
     from aerokit.events import Event
@@ -90,7 +90,7 @@ class CameraLink(CameraOrders):
 
     @property
     def video_stream(self) -> int:
-        """Stream id in recording commands: 0 (all streams), or the camera's device id if the autopilot expects that."""
+        """Stream id for recording commands. 0 means all streams."""
         return self.device_id if self._session.autopilot.video_addresses_camera else 0
 
     @property
@@ -106,7 +106,7 @@ class CameraLink(CameraOrders):
             self._session.publish(event_type, *fields, self.component.component_id)
 
     def call_later(self, seconds: float, action: Callable[[], None]) -> None:
-        """Call ``action`` after a delay, unless the vehicle's block exits earlier."""
+        """Call ``action`` after a delay. The end of the vehicle's `async with` block prevents the call."""
 
         async def wait() -> None:
             await anyio.sleep(seconds)
@@ -115,7 +115,7 @@ class CameraLink(CameraOrders):
         self._session.background.start(wait, "aerokit camera timer")
 
     def timeout_error(self, predicate: str) -> OperationTimeout:
-        """Return the error ``camera 100 <predicate>; <state of the link>``, e.g. with "reported no storage"."""
+        """Return an error with the text ``camera 100 <predicate>; <state of the link>``."""
         return OperationTimeout(f"{self.describe()} {predicate}; {self._session.describe_link()}")
 
     def describe(self) -> str:
@@ -126,7 +126,6 @@ class CameraLink(CameraOrders):
         return f"camera {self.number}{f' ({model})' if model else ''}"
 
     def bind(self, number: int) -> None:
-        """Bind to the camera with this number. Does nothing if the link is already bound."""
         if self.number is not None:
             return
         self.number = number
@@ -139,15 +138,15 @@ class CameraLink(CameraOrders):
             self._attach(message_type, callback)
 
     def start_polling(self) -> None:
-        """Start polling state values in the background. Must be called on the event loop's thread."""
+        """Start polling state values in the background. Call it on the event loop's thread."""
         if not self._is_polling:
             self._is_polling = True
             self._session.background.start(self.requests.run, "aerokit camera")
 
     async def identify(self) -> CameraInformation | None:
-        """Find the camera, and request its information unless this is known already.
+        """Find the camera, and request its information if that is not known yet.
 
-        Returns None if the camera is attached to an autopilot that has sent no information about it.
+        Returns None if an autopilot sends no information about its camera.
         """
         if self._needs_information():
             async with self._identify_lock:
@@ -171,7 +170,6 @@ class CameraLink(CameraOrders):
             self.bind(AUTOPILOT_CAMERA_IDS[0])
 
     async def _request_information(self) -> None:
-        """Request CAMERA_INFORMATION. Raise if a camera with its own component id has never identified itself."""
         # An autopilot may have no information about a camera that is attached to it.
         must_identify = not self.is_autopilot_attached
         try:
@@ -204,7 +202,7 @@ class CameraLink(CameraOrders):
         where: Callable[[MessageT], bool] | None = None,
         timeout: float = 3.0,
     ) -> MessageT | None:
-        """Request one message; return None if it does not arrive or the camera refuses it."""
+        """Request one message. Returns None if the camera refuses or does not answer."""
 
         def is_answer(message: MessageT) -> bool:
             return self._is_from_this_camera(message) and (where is None or where(message))
@@ -244,7 +242,6 @@ class CameraLink(CameraOrders):
             self._attach(message_type, callback)
 
     def _attach(self, message_type: type[Message], callback: Callable[[Any], object]) -> None:
-        """Call ``callback`` with this camera's messages of one type, until the vehicle's `async with` block is left."""
         bus, component_id = self._session.connection.bus, self.component.component_id
 
         def on_message(message: Any) -> None:
@@ -256,17 +253,15 @@ class CameraLink(CameraOrders):
             self._session.at_close(bus.attach(message_type, on_message, system_id=self._session.system_id))
 
     def _is_from_this_camera(self, message: Any) -> bool:
-        """Return True if a message of the component is about this camera. An autopilot may have several cameras."""
-        # Each message type has only one or two of the fields below, and a firmware may leave them at 0. If all are 0,
-        # the message is from the first camera.
         if not self.is_autopilot_attached:
             return True
+        # An autopilot may have several cameras. Each message type has only one or two of the fields below, and a
+        # firmware may leave them at 0. If all are 0, the message is from the first camera.
         number_from_1 = getattr(message, "camera_device_id", 0) or getattr(message, "camera_id", 0)
         number_from_0 = getattr(message, "lens_id", 0) or getattr(message, "cam_idx", 0)
         return bool((number_from_1 or number_from_0 + 1) == self.number)
 
     def _on_heartbeat(self, _: m.Heartbeat) -> None:
-        """Record a HEARTBEAT; after a silence, identify the camera again, because it may be another one."""
         previous_at, self._heartbeat_at = self._heartbeat_at, self.now()
         is_first = previous_at == -math.inf
         if not is_first and self._heartbeat_at - previous_at > MAX_SILENCE_S:
@@ -311,19 +306,22 @@ class ActiveOperation:
         self._is_over = False
         self._detach_finish = link.on_finish(self._finish)
 
-    def record_start(self) -> None:
-        """Record that the camera has accepted the start."""
+    @asynccontextmanager
+    async def starting(self) -> AsyncIterator[None]:
+        """Start the operation in this block. If the block raises, the operation ends."""
+        try:
+            yield
+        except BaseException as error:
+            was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
+            if not was_sent or was_refused:
+                self.order.withdraw()
+                self.discard()
+            else:  # The camera may have started nevertheless.
+                self.order.commit()
+                # Raise the error without delay: the stop command is sent at once, and retried in the background.
+                await self.stop(is_awaited=False)
+            raise
         self.order.commit()
-
-    def record_failed_start(self, error: BaseException) -> bool:
-        """Record that the start failed; return True if the camera may have started anyway, and must be stopped."""
-        was_sent, was_refused = self.order.may_move, isinstance(error, CommandRejected)
-        if not was_sent or was_refused:
-            self.order.withdraw()
-            self.discard()
-            return False
-        self.order.commit()
-        return True
 
     def discard(self) -> None:
         """Mark the operation as ended without sending its stop command."""
@@ -331,7 +329,7 @@ class ActiveOperation:
         self._detach_finish()
 
     async def stop(self, *, is_awaited: bool) -> None:
-        """Stop the operation, once. Does nothing if a newer order was given."""
+        """Send the stop command, once. After a newer order, nothing is sent."""
         if not self._is_over:
             self.discard()
             command, *params = self._stop_command()
@@ -369,19 +367,11 @@ class CameraBlock:
         self._operation: ActiveOperation | None = None
 
     async def __aenter__(self) -> None:
-        """Check the camera's capabilities, and start the operation."""
         await self._check()
         operation = ActiveOperation(self._link, self._subject, self._stop_command)
         self._operation = operation
-        try:
+        async with operation.starting():
             await self._start(operation.order)
-        except BaseException as error:
-            must_stop = operation.record_failed_start(error)
-            if must_stop:
-                # Raise the error without delay: the stop command is sent at once, and retried in the background.
-                await operation.stop(is_awaited=False)
-            raise
-        operation.record_start()
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if self._operation is not None:

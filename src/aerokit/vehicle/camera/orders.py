@@ -89,18 +89,13 @@ class CameraOrders:
 
     @property
     def on_finish(self) -> Callable[[Callable[[], None]], Detach]:
-        """See :meth:`VehicleContext.on_finish`."""
         return self._context.on_finish
 
     def topic(self, subject: str) -> Topic:
-        """Return the key of the orders to one function of this camera. Orders with different keys are independent.
-
-        ``subject`` names the function, such as ``"video"``. All objects of the same camera return the same key.
-        """
+        """Return the key of all orders to one function of this camera, such as ``"video"``."""
         return ("camera", self.component.component_id, self.device_id, subject)
 
     def begin_order(self, subject: str) -> Order:
-        """Begin an order, which ends the previous order about this subject."""
         return self._context.arbiter.device_order(self.topic(subject), may_be_withdrawn=True)
 
     def latest_order(self, subject: str) -> Order | None:
@@ -108,21 +103,19 @@ class CameraOrders:
 
     @contextmanager
     def new_order(self, subject: str) -> Iterator[Order]:
-        """Begin an order, which becomes final at the end of the block.
-
-        If the block raises, the order is withdrawn, and the previous order becomes valid again: an order that was
-        refused or not answered does not count (docs/reliability.md).
-        """
+        """Begin an order. If the block raises, the order is withdrawn."""
         order = self.begin_order(subject)
         try:
             yield order
         except BaseException:
+            # An order that was refused or not answered does not count, so the previous one is valid again
+            # (docs/reliability.md).
             order.withdraw()
             raise
         order.commit()
 
     async def command(self, command: int, *params: float, order: Order | None = None, **options: Any) -> None:
-        """Send a command that changes something, retried according to docs/reliability.md.
+        """Send a command, retried according to docs/reliability.md.
 
         A newer order about the same topic ends the retries of ``order``.
         """
@@ -153,10 +146,9 @@ class CameraOrders:
         send: Callable[[], Awaitable[None]],
         had_effect: Callable[[], Awaitable[bool | None]],
     ) -> None:
-        """Send an order that must not be executed twice; retry only if the camera reports that the order had no effect.
+        """Send an order. It is sent again only if the camera reports that it had no effect.
 
-        ``had_effect`` asks the camera whether the order had an effect, and returns None without an answer. A newer
-        order ends the retries.
+        ``had_effect`` asks the camera, and returns None if there is no answer. A newer order ends the retries.
         """
         for attempt in range(1, MAX_ORDER_ATTEMPTS + 1):
             try:
@@ -179,16 +171,16 @@ class CameraOrders:
                     raise
 
     def send_now(self, command: int, *params: float) -> None:
-        """Send a command once without waiting, e.g. when a block exits by cancellation."""
+        """Send a command once, without waiting for the acknowledgement."""
         if self._component is None or not self._session.is_open:
             return
         self._session.commands.send_unconfirmed(command, *params, component_id=self._component.component_id)
 
     async def end_operation(self, order: Order, command: int, *params: float, is_awaited: bool) -> None:
-        """End the operation of a block: send its stop command at once, and repeat it as :meth:`command` does.
+        """Send the stop command of an operation, and repeat it in the background until it is acknowledged.
 
-        Does nothing if a newer order was given. The repetitions are sent by a background task. With ``is_awaited``,
-        waits for this task and raises as :meth:`command`; otherwise the task logs a failure as a warning.
+        Does nothing if a newer order was given. With ``is_awaited``, this call waits for the acknowledgement and
+        raises as :meth:`command`. Otherwise a failure is logged.
         """
         if not order.is_newest or self._session.is_closed:
             return
@@ -197,7 +189,6 @@ class CameraOrders:
         errors: list[AerokitError] = []
 
         async def confirm() -> None:
-            """Wait for the acknowledgement of the command, and repeat the command until then."""
             try:
                 if order.is_newest:
                     await self.command(command, *params, order=order, was_just_sent=True)
@@ -287,7 +278,6 @@ class _PolledCell:
         self.read_at = self._now()
 
     def is_due(self) -> bool:
-        """Return True if the message must be requested now."""
         now = self._now()
         is_used = self._cell._is_watched or now - self.read_at <= INTEREST_TIMEOUT_S
         period_s = max(DOUBTFUL_POLL_INTERVAL_S, self.period_s) if self.is_doubtful else self.period_s
@@ -311,7 +301,7 @@ class MessageRequests:
         where: Callable[[MessageT], bool] = lambda _: True,
         timeout: float = 3.0,
     ) -> MessageT | None:
-        """Request one message; return None if it does not arrive in time.
+        """Request one message. Returns None if it does not arrive in time.
 
         Raises CommandRejected if the camera does not support the message.
         """
@@ -342,7 +332,6 @@ class MessageRequests:
         where: Callable[[MessageT], bool],
         timeout: float,
     ) -> MessageT | None:
-        """Request one message by the older command; return None if it does not arrive in time."""
         command, legacy_params = LEGACY_REQUESTS[message_type]
         if message_type in NUMBERED_MESSAGES and params:  # The caller requests one item by its number.
             legacy_params = (params[0], *legacy_params[1:])
@@ -366,7 +355,6 @@ class MessageRequests:
             cell.is_doubtful = False
 
     async def run(self) -> None:
-        """Poll the state values that are in use, until cancelled."""
         while True:
             await anyio.sleep(POLL_INTERVAL_S)
             for cell in self._polled:
@@ -374,7 +362,6 @@ class MessageRequests:
                     await self._refresh(cell)
 
     async def _refresh(self, cell: _PolledCell) -> None:
-        """Request the message of one state value. If the camera refuses, record that it lacks, or may lack, it."""
         cell.requested_at = self._link.now()
         try:
             await self.request(cell.message_type, timeout=POLL_INTERVAL_S)

@@ -58,9 +58,9 @@ class Shutter:
         return None if message is None else status_of(message)
 
     async def request_status_reliably(self) -> CameraStatus | None:
-        """Request the status, several times if necessary: the answer decides whether an order may be sent again."""
-        # A camera that has never sent its status may not support the message, so it gets fewer requests:
-        # FIRST_STATUS_ATTEMPTS for the first order, and only one for later orders.
+        # The answer decides whether an order may be sent again, so the request is repeated. A camera that has never
+        # sent its status may not support the message, so it gets fewer requests: FIRST_STATUS_ATTEMPTS for the first
+        # order, and only one for later orders.
         attempts_before_first = 1 if self._never_answered else FIRST_STATUS_ATTEMPTS
         attempts = STATUS_ATTEMPTS if self._reports_status else attempts_before_first
         for _ in range(attempts):
@@ -71,10 +71,7 @@ class Shutter:
         return None
 
     async def take_photo(self, timeout: float) -> Capture:
-        """Take one photo and return its capture. If the camera's report of it is lost, request the report.
-
-        Raises the errors of `Camera.take_photo`.
-        """
+        """Take one photo and return its capture. Raises as :meth:`Camera.take_photo`."""
         async with self._lock:
             series = self.link.latest_order("series")
             before = await self.request_status_reliably()
@@ -116,7 +113,6 @@ class Shutter:
     async def _fetch_missed(
         self, before: CameraStatus | None, status: CameraStatus, known_indices: set[int], *, is_accepted: bool
     ) -> Capture | None:
-        """Request the capture of the ordered picture, if the status shows that it was taken."""
         if before is not None:
             was_taken = status.image_count > before.image_count
             new_index = before.image_count  # Indices begin at 0.
@@ -135,10 +131,8 @@ class Shutter:
         return capture
 
     async def order_photo(self, before: CameraStatus | None, *, is_repeated: bool = False) -> CommandTimeout | None:
-        """Send the order for a picture once; return the time-out if the order was not acknowledged.
-
-        A repeated order has the same sequence number as before, so that a camera does not execute it twice.
-        """
+        """Send the order once. Returns the time-out if it was not acknowledged."""
+        # A repeated order keeps its sequence number, so that a camera does not execute it twice.
         if not is_repeated:
             pictures = 0 if before is None else before.image_count
             # An earlier program may have ordered the existing pictures with sequence numbers up to the image count, so
@@ -155,7 +149,6 @@ class Shutter:
         return None
 
     async def _send_image_start(self) -> None:
-        """Send the order for a single picture. A camera that does not support it gets the older command."""
         interval_s, count = 0, 1
         params = (self.link.device_id, interval_s, count, self._sequence_number)
         try:
@@ -169,12 +162,10 @@ class Shutter:
                 raise error from None
 
     async def _send_digicam_control(self) -> None:
-        """Send the older command, for PX4's trigger and for cameras without MAV_CMD_IMAGE_START_CAPTURE."""
         unchanged, take_photo = (0, 0, 0, 0), 1  # session, zoom and focus in param1 to param4, the shutter in param5
         await self.link.command(MavCmd.DO_DIGICAM_CONTROL, *unchanged, take_photo, 0, 0, attempts=1)
 
     async def start_series(self, order: Order, seconds: float, count: int, before: CameraStatus | None) -> None:
-        """Start a series; repeat the order only if the camera reports that it has not started."""
         if self.link.is_trigger:
             interval_ms, shutter_time, enable = seconds * 1000.0, UNCHANGED, 1
             await self.link.command(TRIGGER_INTERVAL, interval_ms, shutter_time)
@@ -196,18 +187,14 @@ class Shutter:
 
 
 def _is_new(capture: Capture, before: CameraStatus | None, known_indices: set[int]) -> bool:
-    """Return True if a capture may be of a picture that was ordered after the status ``before``.
-
-    An index below the image count of ``before`` usually means an older picture. ``known_indices`` are those of the
-    captures known before the order. If the low index is not among them, the picture may be new, because a camera may
-    use the index of a failed picture again.
-    """
+    """Return True if the picture may have been ordered after the status ``before``."""
+    # A low index usually means an older picture. If no older capture has this index, the picture may be new, because a
+    # camera may use the index of a failed picture again.
     is_low = before is not None and capture.index < before.image_count
     return not is_low or capture.index not in known_indices
 
 
 def _has_taken_none(before: CameraStatus | None, status: CameraStatus) -> bool:
-    """Return True if the image count has not risen between the two reports, and the camera is not capturing now."""
     return before is not None and status.image_count <= before.image_count and not status.is_capturing
 
 
@@ -253,24 +240,18 @@ class PhotoInterval:
         return self._missed
 
     async def __aenter__(self) -> Self:
-        """Start the series."""
         await self._link.require_capability("photo_interval", "capture_image")
         operation = ActiveOperation(self._link, "series", lambda: self._shutter.stop_command)
         self._operation = operation
-        try:
-            await self._begin(operation)
-        except BaseException as error:
-            self._new_captures.__exit__()  # It does nothing if `_begin` has not entered the queue yet.
-            must_stop = operation.record_failed_start(error)
-            if must_stop:
-                # Raise the error without delay: the stop command is sent at once, and retried in the background.
-                await operation.stop(is_awaited=False)
-            raise
-        operation.record_start()
+        async with operation.starting():
+            try:
+                await self._begin(operation)
+            except BaseException:
+                self._new_captures.__exit__()  # It does nothing if `_begin` has not entered the queue yet.
+                raise
         return self
 
     async def _begin(self, operation: ActiveOperation) -> None:
-        """Determine the index of the first capture, and start the series. Captures are queued from now on."""
         before = await self._shutter.request_status_reliably()
         self._next_index = None if before is None else before.image_count
         first_index = 0 if before is None else before.image_count
@@ -280,7 +261,6 @@ class PhotoInterval:
         await self._shutter.start_series(operation.order, self._seconds, self._count, before)
 
     async def __aexit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        """Stop the series, unless the camera has ended it by itself after the requested number of pictures."""
         self._new_captures.__exit__()
         # PX4's trigger does not know the requested number, so it never ends the series by itself.
         has_ended = 0 < self._count <= self._delivered and not self._link.is_trigger
@@ -325,10 +305,7 @@ class PhotoInterval:
             await self._check_silence(silent_checks)
 
     def _first_after_reset(self, capture: Capture) -> Capture | None:
-        """Return the previous capture if it and ``capture`` show that the camera began to count from 0 again.
-
-        Both must have low, successive indices, because a single low index could be corrupt.
-        """
+        """Return the previous capture if it was the first after the camera began to count from 0 again."""
         previous, self._possible_first = self._possible_first, None
         if (
             self._log.reset_at > self._known_reset_at
@@ -336,12 +313,12 @@ class PhotoInterval:
             and capture.index < self._next_index
         ):
             self._possible_first = capture
+            # A single low index could be corrupt, so two successive ones are needed.
             if previous is not None and capture.index == previous.index + 1:
                 return previous
         return None
 
     def _collect(self) -> None:
-        """Move the received captures to `_waiting` or, if they failed, to `_failed`; drop implausible indices."""
         while capture := self._new_captures.pop():
             first = self._first_after_reset(capture)
             if first is not None:  # The series goes on with the new indices.
@@ -371,20 +348,16 @@ class PhotoInterval:
                     self._set_newest(capture.index)
 
     def _set_newest(self, index: int) -> None:
-        """Record ``index`` as the newest index, and the present time as its time."""
         self._newest_index = index
         self._newest_at = self._link.now()
 
     def _max_new_captures(self) -> float:
-        """Upper limit of the number of pictures taken since the newest capture."""
         return 2.0 * (self._link.now() - self._newest_at) / self._seconds + MAX_EXTRA_CAPTURES
 
     def _is_plausible(self, index: int) -> bool:
-        """Return True if the series can have reached this index by now. An index far ahead is corrupt."""
         return index <= self._newest_index + self._max_new_captures()
 
     def _contradicts_guess(self, index: int) -> bool:
-        """Return True if this index is so far below the expected next one that the guessed start must be corrupt."""
         return (
             self._is_start_guessed
             and self._next_index is not None
@@ -392,11 +365,7 @@ class PhotoInterval:
         )
 
     async def _fetch_missing(self) -> None:
-        """Request the next capture; if it does not arrive, count it as missed.
-
-        After `MAX_UNANSWERED` unanswered requests, nothing more is requested, and all captures before the first one in
-        `_waiting` count as missed.
-        """
+        """Request the next capture. If it does not arrive, it counts as missed."""
         index = self._next_index
         assert index is not None
         capture = None
@@ -421,10 +390,10 @@ class PhotoInterval:
             self._next_index = following_index
 
     async def _check_silence(self, silent_checks: int) -> None:
-        """Request the next capture if the camera's status shows that its report was lost.
+        """Ask the camera why no capture has arrived, and request the next capture if its report was lost.
 
-        Otherwise, raise OperationRejected if the camera has ended the series, or OperationTimeout if this is the last
-        of ``MAX_SILENT_CHECKS`` checks since a capture arrived.
+        Raises OperationRejected if the camera has ended the series, and OperationTimeout at the last of
+        ``MAX_SILENT_CHECKS`` checks.
         """
         status = await self._shutter.request_status(2.0 * CHECK_INTERVAL_S)
         self._collect()

@@ -191,14 +191,13 @@ T = TypeVar("T", float, int)
 
 
 def finite_or_none(value: T) -> T | None:
-    """Return the value, or None for NaN and infinities."""
     return value if math.isfinite(value) else None
 
 
 def place_of(
     latitude_e7: int, longitude_e7: int, altitude_amsl_m: float, altitude_relative_m: float | None
 ) -> Position | None:
-    """Decode a position; return None if it is invalid, or so close to 0, 0 that it stands for "unknown"."""
+    """Decode a position. Returns None if it is invalid or unknown."""
     latitude, longitude = latitude_e7 * 1e-7, longitude_e7 * 1e-7
     is_unknown = abs(latitude) <= MIN_COORDINATE_DEG and abs(longitude) <= MIN_COORDINATE_DEG
     if is_unknown or abs(latitude) > 90.0 or abs(longitude) > 180.0:
@@ -208,7 +207,6 @@ def place_of(
 
 
 def information_of(message: m.CameraInformation, number: int) -> CameraInformation:
-    """Decode CAMERA_INFORMATION of the camera with this number."""
     # Major, minor, patch and dev version, one byte each, lowest byte first.
     version = message.firmware_version
     numbers = [(version >> shift) & 0xFF for shift in (0, 8, 16, 24)]
@@ -232,12 +230,10 @@ def information_of(message: m.CameraInformation, number: int) -> CameraInformati
 
 
 def mode_of(message: m.CameraSettings) -> str:
-    """Return the name of the mode in CAMERA_SETTINGS; "unknown" for another mode."""
     return next((name for name, number in MODES.items() if number == message.mode_id), "unknown")
 
 
 def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
-    """Decode CAMERA_CAPTURE_STATUS."""
     is_recording = message.video_status == 1
     return CameraStatus(
         is_capturing=message.image_status in CAPTURING,
@@ -251,8 +247,7 @@ def status_of(message: m.CameraCaptureStatus) -> CameraStatus:
 
 
 def storage_of(message: m.StorageInformation) -> CameraStorage:
-    """Decode STORAGE_INFORMATION. The sizes are valid only if the medium is ready."""
-    is_ready = message.status == StorageStatus.READY
+    is_ready = message.status == StorageStatus.READY  # Otherwise the sizes are not valid.
     return CameraStorage(
         number=message.storage_id,
         count=message.storage_count,
@@ -268,7 +263,6 @@ def storage_of(message: m.StorageInformation) -> CameraStorage:
 
 
 def stream_of(message: m.VideoStreamInformation) -> CameraStream:
-    """Decode VIDEO_STREAM_INFORMATION."""
     return CameraStream(
         number=message.stream_id or 1,  # MAVSDK's camera server sends 0.
         count=message.count,
@@ -296,7 +290,6 @@ def stream_state(message: m.VideoStreamInformation | m.VideoStreamStatus) -> dic
 
 
 def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
-    """Decode CAMERA_TRACKING_IMAGE_STATUS. The mode determines which of the fields are valid."""
     corners = (message.rec_top_x, message.rec_top_y, message.rec_bottom_x, message.rec_bottom_y)
     is_point = message.tracking_mode == Tracking.POINT
     is_rectangle = message.tracking_mode == Tracking.RECTANGLE
@@ -312,7 +305,6 @@ def tracking_of(message: m.CameraTrackingImageStatus) -> TrackingStatus:
 
 
 def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
-    """Decode CAMERA_TRACKING_GEO_STATUS."""
     heading = finite_or_none(message.hdg)
     return TrackedPlace(
         is_active=bool(message.tracking_status & TrackingFlags.ACTIVE),
@@ -328,7 +320,6 @@ def tracked_place_of(message: m.CameraTrackingGeoStatus) -> TrackedPlace:
 
 
 def thermal_range_of(message: m.CameraThermalRange) -> ThermalRange:
-    """Decode CAMERA_THERMAL_RANGE."""
     return ThermalRange(
         stream=message.stream_id,
         max_celsius=message.max,

@@ -85,7 +85,6 @@ class VideoMixin(CameraMixin):
         await self._wait_recording(timeout, expected=True)
 
     async def _order_start(self, order: Order, status_hz: float) -> None:
-        """Send the order to start recording, and wait until the camera has accepted it."""
         command = (START, self._link.video_stream, status_hz, self._link.device_id)
         await self._link.order_once(
             order, lambda: self._link.command(*command, order=order, attempts=1), self._is_recording
@@ -174,7 +173,6 @@ class VideoMixin(CameraMixin):
         return self.streams.value
 
     async def _request_stream(self, number: int) -> bool:
-        """Request information about one stream; return True if it arrives."""
         message = await self._link.request(
             m.VideoStreamInformation, number, where=lambda message: message.stream_id == number
         )

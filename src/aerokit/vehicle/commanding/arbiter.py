@@ -34,11 +34,11 @@ STEERING, ACTION = "steering", "action"
 
 
 def was_armed_by_order(disarmed_at: float, accepted_at: float) -> bool:
-    """Return True if the vehicle, which is now armed, was armed by the order that it accepted at ``accepted_at``.
+    """Return True if the order that was accepted at ``accepted_at`` has armed the vehicle.
 
-    ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed. If this is more than
-    ``ARM_HEARTBEAT_DELAY_S`` after the acceptance, the order had no effect, and another party has armed the vehicle.
+    ``disarmed_at`` is the time of the last HEARTBEAT that reported disarmed.
     """
+    # If HEARTBEAT reported disarmed later than that, the order had no effect, and another party has armed the vehicle.
     return disarmed_at <= accepted_at + ARM_HEARTBEAT_DELAY_S
 
 
@@ -99,7 +99,6 @@ class CommandArbiter:
         return order
 
     def _is_newest(self, order: Order) -> bool:
-        """Return True if the order is not withdrawn, and no newer order about one of its `ending_topics` was given."""
         latest_orders = (self.latest(topic) for topic in order.ending_topics)
         is_superseded = any(latest is not None and latest.number > order.number for latest in latest_orders)
         return not order.is_withdrawn and not is_superseded
@@ -108,7 +107,6 @@ class CommandArbiter:
         self._latest.update(dict.fromkeys(topics, order))
 
     def supersede(self, topics: Iterable[Topic]) -> None:
-        """End the posted orders about these topics, because a newer order was given."""
         topics = tuple(topics)
         self._ordered_since_disarmed.update(topics)
         # This order has no rules of its own: it is registered only to be newer than the posted ones.
@@ -129,10 +127,9 @@ class CommandArbiter:
     def order(
         self, *modes: Mode, subjects: Collection[Subject] = ("mode", "motion"), ends_flight: bool = False
     ) -> Order:
-        """Create a steering order, which may make the vehicle enter ``modes``.
+        """Create a steering order, which may change the mode to ``modes``. It supersedes the previous one.
 
-        It supersedes the previous steering order, and all orders about ``subjects`` that were created by :meth:`post`.
-        With ``ends_flight``, a failsafe does not end the new order.
+        Posted orders about ``subjects`` end, too. With ``ends_flight``, a failsafe does not end the new order.
         """
         self._notify_steering()
         self._ordered_modes.extend((self._now(), mode.custom_mode) for mode in modes)
@@ -169,7 +166,6 @@ class CommandArbiter:
             callback()
 
     def on_reboot(self) -> None:
-        """End all orders, because the vehicle has rebooted."""
         for order in (*self._orders, *self._posted):
             order.on_reboot()
         self._ordered_since_disarmed.clear()
@@ -184,11 +180,8 @@ class CommandArbiter:
     def auxiliary_order(self, device_order: Order | None = None, *, ends_flight: bool = False) -> Iterator[Order]:
         """Create an order that does not say where to fly (speed, home, arming …).
 
-        ``device_order`` is the order about a device for which the new order sends a command. A newer order about the
-        device ends both.
-
-        Raises:
-            OperationRejected: a newer order about the device was given.
+        With ``device_order``, the new order is a part of it: a newer order about the same device ends both. Raises
+        OperationRejected if a newer one was already given.
         """
         if device_order is not None and not device_order.is_newest:
             raise OperationRejected(f"{SUPERSEDED}; the rest of the order was not sent")
@@ -208,8 +201,8 @@ class CommandArbiter:
     ) -> Iterator[Order]:
         """Create a posted order, which is valid during the `with` block.
 
-        The new order ends earlier posted orders whose first subject is in ``subjects``. If ``subjects`` begins with
-        "mode" or "motion", it also ends the action in progress. A newer order about its first subject ends it.
+        The order ends earlier posted orders whose first subject is in ``subjects``. A newer order about its own first
+        subject ends it. If this subject is "mode" or "motion", the order also ends the action in progress.
         """
         first_subject = subjects[0]
         is_steering = first_subject != "arm"
@@ -289,14 +282,12 @@ class CommandArbiter:
         self._record_accepted(armed)
 
     def _record_accepted(self, armed: bool | None, accepted_at: float | None = None) -> None:
-        """Record when (by default now) an arming command was accepted, because HEARTBEAT reports the effect later."""
-        if armed:
+        if armed:  # HEARTBEAT reports the effect later.
             accepted_at = self._now() if accepted_at is None else accepted_at
             # A newer command may have been accepted before this one was abandoned.
             self._arming_accepted_at = max(self._arming_accepted_at, accepted_at)
 
     def _supersede_arming(self, armed: bool | None) -> None:
-        """If a newer command arms or disarms (``armed`` is not None), end earlier orders to arm or disarm."""
         if armed is None:
             return
         self.arm_commands_sent += 1
@@ -309,11 +300,7 @@ class CommandArbiter:
 
     @property
     def is_flown_by_program(self) -> bool:
-        """True while the vehicle is armed and executes orders of this program.
-
-        For this, the program must have armed the vehicle, or have given a steering order since another party armed it.
-        After that, there must have been no takeover and no failsafe.
-        """
+        """True if an armed vehicle executes orders of this program."""
         order = self.current
         if order is None or order.takeover_reason or order.failsafe:
             return False
@@ -322,44 +309,39 @@ class CommandArbiter:
 
     @property
     def current(self) -> Order | None:
-        """The program's present order to the armed vehicle: the newest steering order, or the order that armed it."""
+        """The program's present order: the newest steering order, or the order that armed the vehicle."""
         newest = self.newest
         # A steering order that was given before the vehicle armed belongs to an earlier flight.
         return newest if newest is not None and newest.given_at >= self._last_arming_at else self._arming_order
 
     def clear_failsafe(self) -> None:
-        """Clear the failsafe of the newest order and the arming order, because the program reclaimed the vehicle."""
         for order in (self.newest, self._arming_order):
             if order is not None:
                 order.clear_failsafe()
 
     @property
     def may_be_executing(self) -> bool:
-        """True while the vehicle may still execute an order of the program.
-
-        Becomes False when the vehicle disarms. A takeover makes it False only if the program has given no order to arm
-        since the vehicle was last disarmed, because a takeover does not undo such an order.
-        """
+        """True while the vehicle may still execute an order of the program."""
         order, topics = self.newest, self._ordered_since_disarmed
         # After an order without modes, such as a raw command, a mode change does not prove a takeover. If a posted
         # order has followed, `order` is not the newest one, and its end says nothing.
         was_taken_over = order is not None and bool(order.modes) and bool(order.takeover_reason) and order.is_newest
+        # Disarming clears `topics`. A takeover does not undo an order to arm.
         return "arm" in topics if was_taken_over else bool(topics)
 
     @property
     def is_state_recent(self) -> bool:
-        """True while the last HEARTBEAT is recent enough to describe the vehicle's state."""
         self.slept_since(self._now())  # If the computer has just slept, this call adds the sleep to all ages.
         return self._telemetry.armed.age <= MODE_MAX_AGE_S
 
     @property
     def mode_is_in_doubt(self) -> bool:
-        """True while the result of a mode change is unknown, so that the reported mode may still change."""
+        """True while the result of a mode change is unknown."""
         is_in_doubt = self._open_mode_changes > 0 or self._doubted_change > self._confirmed_change
         return is_in_doubt or bool(self.late_modes())
 
     def settle_mode(self) -> None:
-        """Record that the vehicle reports the mode ordered last. Modes of earlier orders are no longer expected."""
+        """Record that the vehicle reports the mode that was ordered last."""
         self.mode_settles_at = -math.inf
         self._unreported_modes.clear()
 
@@ -367,14 +349,13 @@ class CommandArbiter:
     def changing_mode(self) -> Iterator[None]:
         """Keep the reported mode in doubt during a `with` block in which a command changes the mode.
 
-        If the block is cancelled or times out, the mode stays in doubt until a later change is confirmed. A refused
-        command causes no such doubt. Blocks may overlap, because a new order may be given during a block.
+        If the block is cancelled or times out, the doubt remains until a later change is confirmed.
         """
         change = next(self._order_numbers)
-        self._open_mode_changes += 1
+        self._open_mode_changes += 1  # Blocks may overlap, because a new order may be given during a block.
         try:
             yield
-        except CommandRejected:
+        except CommandRejected:  # The vehicle has not changed the mode.
             raise
         except BaseException:
             self._doubt_change(change)
@@ -385,11 +366,11 @@ class CommandArbiter:
             self._open_mode_changes -= 1
 
     def expect_late(self, mode: Mode) -> None:
-        """Record that the vehicle has changed to this mode by itself, but HEARTBEAT may not report it yet."""
+        """Record that the vehicle has changed to this mode by itself. HEARTBEAT may report it late."""
         self._unreported_modes.append((self._now(), mode))
 
     def doubt_mode(self) -> None:
-        """Distrust the reported mode, because a command that changes it was sent without waiting for the result."""
+        """Distrust the reported mode until a later mode change is confirmed."""
         self._doubt_change(next(self._order_numbers))
 
     def _doubt_change(self, change: int) -> None:
@@ -401,7 +382,7 @@ class CommandArbiter:
     def _create_order(
         self, modes: Collection[Mode], ending_topics: Sequence[Topic], ends_flight: bool = False
     ) -> Order:
-        """Create an order that does not end if an earlier order still changes the mode."""
+        """Create an order that stays valid if an earlier order changes the mode late."""
         newest, present_mode = self.newest, self._telemetry.mode.latest
         is_under_way = newest is not None and present_mode is not None and newest.is_own(present_mode)
         is_unsettled = is_under_way or self.mode_is_in_doubt or self._now() < self.mode_settles_at
@@ -419,7 +400,6 @@ class CommandArbiter:
     def _build_order(
         self, modes: Collection[Mode], ending_topics: Sequence[Topic], expected: Collection[int], **rules: Any
     ) -> Order:
-        """Create an order with the vehicle's present state as the state before the order."""
         return Order(
             self._now(),
             next(self._order_numbers),
@@ -434,19 +414,16 @@ class CommandArbiter:
         )
 
     def _all_end_flight(self, modes: Collection[Mode]) -> bool:
-        """Return True if all these modes are for landing or returning."""
         autopilot, is_vtol = self._telemetry.autopilot, self._telemetry.is_vtol
         ending_modes = {autopilot.mode_for("land", is_vtol=is_vtol), autopilot.mode_for("return", is_vtol=is_vtol)}
         ending_numbers = {mode.custom_mode for mode in ending_modes if mode is not None}
         return bool(modes) and {mode.custom_mode for mode in modes} <= ending_numbers
 
     def _posted_modes(self) -> tuple[Mode, ...]:
-        """Return the modes to which posted orders, including superseded ones, may still lead."""
         unconfirmed_orders = [order for order in self._posted if not order.is_confirmed]
         return tuple(mode for order in unconfirmed_orders for mode in order.modes)
 
     def _record_unreported(self, order: Order) -> None:
-        """Record the modes of an order that has just ended, if HEARTBEAT may still report them as its effect."""
         now, present_mode = self._now(), self._telemetry.mode.latest
         is_reported = present_mode is not None and order.is_own(present_mode)
         is_recent = now - order.given_at < MODE_GRACE_S  # An order with several modes may change the mode once more.
@@ -454,15 +431,11 @@ class CommandArbiter:
             self._unreported_modes.extend((now, mode) for mode in order.modes if mode != present_mode)
 
     def late_modes(self) -> tuple[Mode, ...]:
-        """Return the modes that HEARTBEAT may still report as effects of a recent event.
-
-        The event is that an order was replaced or left, or that a mission has ended.
-        """
+        """Return the modes of ended orders and missions that HEARTBEAT may still report."""
         since = self._now() - MODE_GRACE_S
         return tuple(mode for at, mode in self._unreported_modes if at > since)
 
     def _is_steering(self) -> bool:
-        """Return True while the vehicle is in a mode of the newest order and no takeover or failsafe has followed."""
         order, mode = self.newest, self._telemetry.mode.latest
         return (
             order is not None
@@ -482,7 +455,6 @@ class CommandArbiter:
             order.on_system_status(state)
 
     def _on_armed(self, armed_before: bool | None, armed: bool) -> None:
-        """Record the armed state of each HEARTBEAT, changed or not, and pass it to orders and commands in progress."""
         if armed_before and not armed:
             self._ordered_since_disarmed.clear()
         if armed and not armed_before:
@@ -494,7 +466,6 @@ class CommandArbiter:
             receiver.on_armed(armed, self._telemetry.armed.updated_at)
 
     def _on_arming(self) -> None:
-        """Record whether the program or another party has armed the vehicle."""
         self._last_arming_at = self._telemetry.armed.updated_at
         is_order_open = any(sent.arms for sent in self._sent) or any(order.armed for order in self._posted)
         was_accepted = math.isfinite(self._arming_accepted_at)
@@ -508,6 +479,5 @@ class CommandArbiter:
         self._arming_order = self._create_order(modes, ()) if was_armed_by_program else None
 
     def _active_orders(self) -> tuple[Order, ...]:
-        """Orders that process the reports of the vehicle."""
         arm_order = () if self._arming_order is None else (self._arming_order,)
         return (*arm_order, *self._orders, *self._posted)

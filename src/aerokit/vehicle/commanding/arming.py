@@ -181,7 +181,6 @@ class ArmingActions(VehicleBase):
     async def _arm_with_fallback_mode(
         self, may_change_mode: bool, force: bool, timeout: float, max_silence_s: float | None
     ) -> None:
-        """Arm in the present mode. If a parameter may forbid this, change the mode after a refusal, and arm then."""
         began_at = self.connection.now()
         order_before, arm_commands_before = self._arbiter.latest(STEERING), self._arbiter.arm_commands_sent
         try:
@@ -210,10 +209,6 @@ class ArmingActions(VehicleBase):
             await self._arm_in_present_mode(force, timeout, max_silence_s)
 
     async def _arm_in_present_mode(self, force: bool, timeout: float, max_silence_s: float | None) -> None:
-        """Send the arm command once, and wait for its effect.
-
-        After any error but a refusal, `ArmCleanup` watches whether the vehicle arms late, and disarms it.
-        """
         started, was_armed = self.connection.now(), self.telemetry.is_armed
         with self._arbiter.auxiliary_order() as order, self._arm_cleanup.arming(order, was_armed):
             try:
@@ -265,7 +260,6 @@ class ArmingActions(VehicleBase):
             )
 
     def _reason_if_flying(self) -> tuple[str, ...]:
-        """Return the landed state as a reason, if it shows that the vehicle is flying."""
         landed = self.telemetry.landed_state.latest
         if landed not in (MavLandedState.IN_AIR, MavLandedState.TAKEOFF, MavLandedState.LANDING):
             return ()
@@ -274,7 +268,6 @@ class ArmingActions(VehicleBase):
     async def _await_armed(
         self, *, armed: bool, order: Order, started: float, timeout: float, max_silence_s: float | None
     ) -> None:
-        """Wait until a HEARTBEAT received after ``started`` reports that the vehicle is armed, or disarmed."""
         cell = self.telemetry.armed
         await await_progress(
             self._session,
@@ -312,12 +305,11 @@ class ArmingActions(VehicleBase):
         return self.autopilot.mode_to_arm_in()
 
     def _is_in_mode_armable_by_option(self) -> bool:
-        """Return True if a parameter of the vehicle decides whether its present mode allows arming."""
         mode = self.telemetry.mode.latest
         return mode is not None and mode.name in self.autopilot.armable_by_option
 
     async def _change_to_arming_mode(self, mode: Mode) -> None:
-        """Change the mode for arming; raise if a newer order or a silence then forbids the arm command."""
+        """Change the mode. Raises if the arm command must not follow."""
         order = self._arbiter.order(mode)
         arm_commands_before = self._arbiter.arm_commands_sent
         await self._sender.ensure_mode(mode, order)
@@ -331,7 +323,7 @@ class ArmingActions(VehicleBase):
             raise HeartbeatTimeout(f"arm(): the vehicle is silent; {link}; the arm command was not sent")
 
     async def _wait_until_armable(self) -> None:
-        """After a change of the mode, wait briefly until SYS_STATUS no longer reports that the pre-arm checks fail."""
+        """Wait briefly until SYS_STATUS no longer reports failing pre-arm checks."""
         sensors = self.telemetry.sensors
         with self._session.streaming("sensors"), anyio.move_on_after(MODE_READY_TIMEOUT_S):
             since = self.connection.now()
@@ -382,17 +374,12 @@ class ArmingActions(VehicleBase):
         )
 
     async def _order_reboot(self, force: bool) -> None:
-        """Send the command once: if only the acknowledgement is lost, repeating the command causes another reboot."""
         params = (1, *(0.0,) * 4, FORCE_REBOOT if force else 0)
+        # If only the acknowledgement is lost, a repetition would cause another reboot.
         options: dict[str, Any] = {"attempts": 1, "attempt_timeout": REBOOT_ACK_TIMEOUT_S}
         await self._sender.auxiliary_command(MavCmd.PREFLIGHT_REBOOT_SHUTDOWN, *params, **options)
 
     async def _await_reboot(self, reboots_before: int) -> None:
-        """Poll the time since boot until it shows a reboot.
-
-        A reboot is recognised by a lower time than in the previous answer. The polls are frequent at first, because the
-        clock of a fast simulation soon exceeds that time again.
-        """
         started = self.connection.now()
         next_request_at = started
         while self._session.watch.reboots == reboots_before:
@@ -400,5 +387,7 @@ class ArmingActions(VehicleBase):
             now = self.connection.now()
             if now >= next_request_at:
                 self._session.link_watch.request_time()
+                # The requests are frequent at first, because the clock of a fast simulation soon exceeds the time since
+                # boot before the reboot.
                 next_request_at = now + POLL_INTERVAL_S + (now - started) / 10
             await anyio.sleep(POLL_INTERVAL_S)

@@ -45,11 +45,9 @@ class BackgroundTask:
 
     @property
     def is_open(self) -> bool:
-        """True while the task is not done."""
         return self._scope is not None
 
     def start(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Run ``work`` in the background, as long as the connection is open."""
         self.cancel()  # Two tasks might give the same order twice.
         scope, done = Cancellation(), asyncio.Event()
         self._scope, self._done = scope, done
@@ -66,14 +64,14 @@ class BackgroundTask:
         self._session.background.start(run, self._name)
 
     def cancel(self) -> None:
-        """Cancel the task. It still finishes the steps that it shields from cancellation."""
+        """Cancel the task. Steps that it shields from cancellation still finish."""
         if self._scope is not None:
             self._scope.cancel()
             self._scope = None
 
     @contextmanager
     def protected(self) -> Iterator[None]:
-        """Ignore ``cancel`` during a `with` block, because orders that the task itself gives would cancel it."""
+        """Ignore ``cancel`` during a `with` block in which the task itself gives an order."""
         scope, self._scope = self._scope, None
         try:
             yield
@@ -81,7 +79,6 @@ class BackgroundTask:
             self._scope = scope
 
     async def finish(self, within_s: float) -> None:
-        """At the end of the vehicle's `async with` block, wait at most ``within_s``; warn if the task still runs."""
         if self._scope is None or self._done is None or not self._session.connection.is_open:
             return
         if within_s:
@@ -126,26 +123,21 @@ class FlightCleanup:
         arbiter.on_steering(self._task.cancel)
 
     async def hold(self) -> None:
-        """Order the vehicle to hold, see :meth:`aerokit.Vehicle.hold`."""
         mode = self._sender.mode_for("hold", "hold")
         order = self._arbiter.order(mode)
         with self.flying(order):
             await self.stop_in(mode, order)
 
     async def stop_in(self, mode: Mode, order: Order) -> None:
-        """Order the vehicle to hold, even if it already is in the hold mode.
-
-        PX4 may be flying to a place in LOITER, its hold mode.
-        """
+        """Order the vehicle to hold, even if it already is in the hold mode."""
         order.only_stops = True
-        if self._holds_by_reposition:
+        if self._holds_by_reposition:  # PX4 may be flying to a place in LOITER, its hold mode.
             await self._sender.send_long(order, *STOP_HERE)
             await self._sender.ensure_mode(mode, order)
         else:
             await self._sender.change_mode(mode, order, reported_since=order.given_at)
 
     async def _confirm_hold(self, mode: Mode, order: Order) -> None:
-        """Wait for the acknowledgement of :meth:`_send_hold`; resend the hold if none arrives."""
         change_mode = (MavCmd.DO_SET_MODE, *self._session.autopilot.mode_order(mode).params)
         command, *params = STOP_HERE if self._holds_by_reposition else change_mode
         await self._sender.send_long(
@@ -163,13 +155,9 @@ class FlightCleanup:
     def hold_in_background(self, order: Order) -> bool:
         """Order a hold because ``order`` was abandoned. Never waits, so that cancelled calls can use it.
 
-        Returns False, and sends nothing, if ``order`` cannot have moved the vehicle or has ended (for example because a
-        pilot took over), if the vehicle is disarmed or has no hold mode, or if its session has ended.
-
-        Otherwise returns True. The hold is sent at once if the last HEARTBEAT is recent. If it is not, or if ``order``
-        was itself a hold, the hold is sent after the next HEARTBEAT, but only if ``order`` has not ended and the
-        vehicle is not disarmed by then. A background task waits for the confirmation, and repeats the hold if there is
-        none.
+        Returns True if the hold was sent, or is sent by a background task after the next HEARTBEAT. The task repeats
+        the hold if it is not confirmed. Returns False if ``order`` has ended or cannot have moved the vehicle, if the
+        vehicle is disarmed or has no hold mode, or if its session has ended.
         """
         if not order.may_move:
             return False
@@ -197,11 +185,7 @@ class FlightCleanup:
             )
 
     async def _complete_hold(self, mode: Mode, order: Order, *, is_sent: bool) -> None:
-        """Wait for the confirmation of a hold. If it was not sent yet, send it after the next HEARTBEAT.
-
-        Without a confirmation, the hold is sent again after the next HEARTBEAT, unless the order has ended by then, for
-        example because a pilot took over. There are at most `MAX_HOLD_ATTEMPTS` attempts.
-        """
+        """Wait for the confirmation of a hold. Without one, send it again after the next HEARTBEAT."""
         for _ in range(MAX_HOLD_ATTEMPTS):
             try:
                 if is_sent:
@@ -226,28 +210,19 @@ class FlightCleanup:
 
     @property
     def is_hold_pending(self) -> bool:
-        """True from the moment at which a flight is abandoned until the vehicle confirms the hold that ends it."""
         return self._task.is_open
 
     async def finish(self) -> None:
-        """At the end of the vehicle's `async with` block, wait briefly for the acknowledgement of a hold.
-
-        The hold is repeated while it is not acknowledged.
-        """
         await self._task.finish(HOLD_CLOSE_TIMEOUT_S if self._arbiter.is_state_recent else 0)
 
     @contextmanager
     def flying(self, order: Order) -> Iterator[None]:
-        """Register the order while a call waits for its effect, so that `end_flights` can order a hold instead.
-
-        The vehicle is also ordered to hold if it hits the ground in the block, because it could climb again to the
-        target of the order.
-        """
+        """Register the order while a call waits for its effect, so that `end_flights` can order a hold."""
         self._awaited_order = order
         try:
             yield
         except OperationRejected:
-            if order.impact:
+            if order.impact:  # The vehicle could climb again to the target of the order.
                 self.hold_in_background(order)
             raise
         finally:
@@ -263,14 +238,10 @@ class FlightCleanup:
     def preparing_stream(self, mode: Mode) -> Iterator[Order]:
         """Create an order to change to ``mode``, for a caller that must prepare a stream before it sends the order.
 
-        The caller prepares the stream in the `with` block, which may wait, and sends the order after the block. If the
-        block fails, the order is not sent, and the vehicle is told to hold if an earlier order of the program may still
-        move it (see `hold_in_background`).
-
-        Raises:
-            BusyError: another stream is open. No order was created.
-            OperationRejected: at the end of the block, the order was superseded or taken over.
-            HeartbeatTimeout: at the end of the block, the vehicle was silent.
+        The caller prepares the stream in the `with` block, and sends the order after it. If the block fails, the order
+        is not sent. An earlier order of the program may still move the vehicle, so a hold is ordered (see
+        `hold_in_background`). Raises BusyError if another stream is open, OperationRejected if the order has ended
+        during the block, and HeartbeatTimeout if the vehicle is silent after it.
         """
         self.check_no_stream()
         order = self._arbiter.order(mode)
@@ -287,7 +258,6 @@ class FlightCleanup:
             raise
 
     def end_flights(self) -> None:
-        """At the end of the vehicle's `async with` block, stop an open stream, and hold if an order is in progress."""
         if self.stop_stream is not None:
             self.stop_stream("the async with block of its vehicle was left")
         if self._awaited_order is not None:
@@ -295,7 +265,6 @@ class FlightCleanup:
 
     @property
     def _holds_by_reposition(self) -> bool:
-        """True if MAV_CMD_DO_REPOSITION changes to the hold mode, as on PX4."""
         return self._session.autopilot.reposition is not None and self._session.autopilot.reposition_purpose == "hold"
 
 
@@ -322,7 +291,7 @@ class ArmCleanup:
 
     @contextmanager
     def arming(self, order: Order, was_armed: bool) -> Iterator[None]:
-        """Register an awaited arm order. If the vehicle's block ends meanwhile, `finish` treats it as cancelled."""
+        """Register an arm order while a call awaits it, so that `finish` can watch it."""
         self._awaited = order, was_armed
         try:
             yield
@@ -331,24 +300,21 @@ class ArmCleanup:
                 self._awaited = None
 
     def hint(self) -> str:
-        """Return the hint for error texts that an arm command may still be executed."""
         unsent = self._session.connection.unsent_bytes
         hint = f"; {unsent} bytes are still in the send buffer" if unsent else ""
         return f"it may still be executed{hint}; if it arms the vehicle within {ARM_WATCH_S:g} s, aerokit disarms it"
 
     def watch(self, order: Order, was_armed: bool) -> None:
-        """Start watching whether the vehicle arms after all, because the abandoned arm command may still arrive."""
+        """Watch in the background whether the abandoned arm command still arms the vehicle."""
         if not self._is_newest_arm_command(order):
             return
         self._session.connection.discard_unsent()  # An arm command that is still unsent must not be sent later.
         self._task.start(partial(self._watch_arming, order, was_armed, self._session.telemetry.mode.latest))
 
     def _is_newest_arm_command(self, order: Order) -> bool:
-        """Return True if the order's command was sent, and the program has sent no arm or disarm command since."""
         return order.arm_command == self._arbiter.arm_commands_sent
 
     async def _watch_arming(self, order: Order, was_armed: bool, mode: Mode | None) -> None:
-        """Disarm the vehicle if the abandoned order arms it within `ARM_WATCH_S`."""
         has_armed = False
         with anyio.move_on_after(ARM_WATCH_S):
             has_armed = await self._wait_until_armed(was_armed)
@@ -356,13 +322,10 @@ class ArmCleanup:
             await self._undo_late_arming(order, mode)
 
     async def _wait_until_armed(self, was_armed: bool) -> bool:
-        """Return True once the vehicle arms; False if the link ends first.
-
-        A vehicle that was armed before the order must disarm first.
-        """
+        """Return False if the link ends before the vehicle arms."""
         armed, since = self._session.telemetry.armed, self._session.connection.now()
         try:
-            if was_armed:
+            if was_armed:  # The order has an effect only after the vehicle has disarmed.
                 await armed.wait_until(lambda value: not value, description="disarmed")
             await armed.wait_until(lambda value: value and armed.updated_at > since, description="armed")
         except AerokitError as error:
@@ -371,7 +334,7 @@ class ArmCleanup:
         return True
 
     async def _undo_late_arming(self, order: Order, mode: Mode | None) -> None:
-        """Disarm the vehicle, which has armed after its arm order was abandoned, unless another party armed it."""
+        """Disarm the vehicle if the abandoned order has armed it."""
         was_armed_by_order = await self._was_armed_by(order, mode)
         if not self._is_newest_arm_command(order) or self._session.telemetry.is_confirmed_disarmed:
             return
@@ -390,14 +353,9 @@ class ArmCleanup:
                 logger.error("an abandoned arm command has armed the vehicle, and it could not be disarmed: %s", error)
 
     async def _was_armed_by(self, order: Order, mode: Mode | None) -> bool:
-        """Return True if this order, and not a pilot, has armed the vehicle. Called when HEARTBEAT has reported armed.
+        """Return True if this order, and no other party, has armed the vehicle.
 
-        The order armed it if the vehicle accepted the order and has not reported disarmed since. Without an
-        acknowledgement, HEARTBEAT must have reported armed at most `ARM_HEARTBEAT_DELAY_S` after the order was given,
-        and no other party may have taken over since. If the computer slept meanwhile, the result is always False.
-
-        ``mode`` is the mode at the time when the order was abandoned. If the mode is different now, and no newer order
-        of this program explains that, another party has taken over.
+        ``mode`` is the mode at the time at which the order was abandoned.
         """
         armed_at = self._session.telemetry.armed.updated_at
         disarmed_at = max(order.given_at, self._arbiter.last_disarmed_report_at)
@@ -406,9 +364,11 @@ class ArmCleanup:
             return False
         mode_now, newest = self._session.telemetry.mode.latest, self._arbiter.newest
         was_ordered = newest is not None and newest.number > order.number and newest.modes == (mode_now,)
+        # A mode change that no newer order of this program explains is a takeover.
         was_taken_over = order.takeover_reason or order.failsafe or not (mode_now == mode or was_ordered)
         if not was_taken_over and armed_at - order.given_at <= ARM_HEARTBEAT_DELAY_S:
             return True
+        # A vehicle that reports armed later was armed by the order only if it has accepted the order.
         if not self._is_accepted(disarmed_at):
             await anyio.sleep(ARM_ACK_WAIT_S)
         # A vehicle that was disarmed meanwhile and is armed again was armed by another party.
@@ -420,14 +380,10 @@ class ArmCleanup:
         return was_armed_by_order(disarmed_at, accepted_at)
 
     def stop(self) -> None:
-        """Stop monitoring, because a newer order about arming was given."""
         self._task.cancel()
 
     async def finish(self) -> None:
-        """At the end of the vehicle's `async with` block, wait briefly for the outcome of a cancelled arm order.
-
-        Log a warning if the outcome stays unknown. An arm order that another task still awaits counts as cancelled.
-        """
-        if self._awaited is not None:
+        """Wait briefly for the outcome of an abandoned arm order. Logs a warning if it stays unknown."""
+        if self._awaited is not None:  # Another task still awaits this order. It counts as abandoned.
             self.watch(*self._awaited)
         await self._task.finish(ARM_CLOSE_TIMEOUT_S)

@@ -64,7 +64,7 @@ class Eight(ClosedPath):
         )
 
     def _to_north_east(self, along: float, across: float) -> Vector:
-        """Convert components along the axis, and to the right of it, to components north and east."""
+        """Convert components along the axis, and to its right, to components north and east."""
         cos, sin = math.cos(self._axis), math.sin(self._axis)
         return along * cos - across * sin, along * sin + across * cos
 
@@ -102,15 +102,12 @@ class PathFlight:
 
     @property
     def is_complete(self) -> bool:
-        """True once the set-point has stopped at the end."""
         return self._phase >= self._last_phase
 
     def advance(self, seconds: float) -> TrajectorySetpoint:
-        """Move the set-point on by this many seconds, and return it."""
         return self._advance_on_path(seconds) if self.is_on_path else self._advance_to_path(seconds)
 
     def _advance_to_path(self, seconds: float) -> TrajectorySetpoint:
-        """Move the set-point along the straight line to the first point of the path."""
         (path_north, path_east), _, _ = self._path.at(self._path.first_phase)
         start_north, start_east, start_down = self._initial_offset
         to_path = (path_north - start_north, path_east - start_east, -start_down)  # The path is at down = 0.
@@ -131,7 +128,6 @@ class PathFlight:
         return self._setpoint((north, east), down, (north_m_s, east_m_s, down_m_s), (0.0, 0.0))
 
     def _advance_on_path(self, seconds: float) -> TrajectorySetpoint:
-        """Move the set-point along the path, and compute the velocity and acceleration that keep the vehicle on it."""
         _, tangent, _ = self._path.at(self._phase)
         metres_per_radian = math.hypot(*tangent)
         self._change_speed(seconds, (self._last_phase - self._phase) * metres_per_radian)
@@ -153,7 +149,7 @@ class PathFlight:
         return self._setpoint(place, 0.0, (tangent_north * phase_rate, tangent_east * phase_rate, 0.0), centripetal)
 
     def _change_speed(self, seconds: float, remaining_m: float) -> None:
-        """Accelerate to the ordered speed, or slow down so that the set-point can stop after ``remaining_m``."""
+        """Accelerate to the ordered speed, or brake so that the set-point can stop after ``remaining_m``."""
         max_to_stop = math.sqrt(2 * ACCELERATION_M_S2 * max(0.0, remaining_m))
         accelerated = self._present_speed_m_s + ACCELERATION_M_S2 * seconds
         self._present_speed_m_s = min(accelerated, self._speed_m_s, max(max_to_stop, MIN_SPEED_M_S))
@@ -161,7 +157,7 @@ class PathFlight:
     def _setpoint(
         self, place: Vector, down: float, velocity: tuple[float, float, float], acceleration: Vector
     ) -> TrajectorySetpoint:
-        """Return the set-point in the local frame for a place that is given relative to the center."""
+        """Convert a place relative to the center to a set-point in the local frame."""
         center_north, center_east, center_down = self._center
         north, east = place
         position = (center_north + north, center_east + east, center_down + down)
@@ -186,7 +182,7 @@ class TurnCounter:
         """True while the vehicle is near the circle."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Add the part of a turn since the previous report. The position is in metres from the center."""
+        """Process a position of the vehicle, in metres from the center."""
         self.is_on_path = abs(math.hypot(north_m, east_m) - self._radius_m) <= self._tolerance_m
         bearing_before = self._bearing
         self._bearing = math.atan2(east_m, north_m) if self.is_on_path else None
@@ -208,13 +204,11 @@ class LobeCounter:
         """True while the vehicle is in one of the lobes, far enough from the crossing to tell them apart."""
 
     def add(self, north_m: float, east_m: float) -> None:
-        """Process a position of the vehicle, in metres from the center.
-
-        The first lobe that the vehicle reaches counts as half a figure, and so does each change to the other lobe.
-        """
+        """Process a position of the vehicle, in metres from the center."""
         along = north_m * math.cos(self._axis) + east_m * math.sin(self._axis)
         self.is_on_path = abs(along) > self._min_along_m
         lobe = 1 if along > 0 else -1
+        # The first lobe that the vehicle reaches counts as half a figure, too.
         if self.is_on_path and lobe != self._lobe:
             self._lobe = lobe
             self.rounds += 0.5

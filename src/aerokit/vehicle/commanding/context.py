@@ -71,7 +71,6 @@ class VehicleContext:
         return was_hold_pending
 
     def describe_now(self) -> str:
-        """Return the reported state for a warning, like ``in GUIDED, still armed, last heartbeat 0.5 s ago``."""
         autopilot, telemetry = self.session.autopilot, self.session.telemetry
         hold_mode = autopilot.mode_for("hold", is_vtol=telemetry.is_vtol)
         mode = telemetry.mode.latest

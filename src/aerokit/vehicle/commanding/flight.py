@@ -113,10 +113,11 @@ class FlightActions(VehicleBase):
             raise explained from error
 
     def _with_landed_state(self, error: CommandRejected) -> CommandRejected | None:
-        """Add the landed state to the error of a refused take-off, because the vehicle's refusal does not name it.
+        """Add the landed state to the error of a refused take-off.
 
-        Return None if the vehicle is not known to be in the air.
+        Returns None if the vehicle is not known to be in the air.
         """
+        # The vehicle does not say why it refuses a take-off in the air.
         state = IN_THE_AIR.get(self.telemetry.landed_state.latest)
         altitude_m = self._position.altitude_relative()
         is_high = altitude_m > MIN_FLYING_HEIGHT_M
@@ -142,22 +143,18 @@ class FlightActions(VehicleBase):
         return plan
 
     async def _begin_take_off(self, plan: TakeOff, order: Order) -> None:
-        """Send the steps of the take-off: a mode, a command, or both. A reported climb acknowledges the command."""
         if plan.mode is not None:
             await self._sender.ensure_mode(plan.mode, order)
         if plan.command is not None:
-            is_rising = self._climb_detector()
+            is_rising = self._climb_detector()  # A reported climb acknowledges the command.
             with self._session.streaming("position", "landed_state"):
                 await self._sender.send_long(order, plan.command, *plan.params, modes=order.modes, is_done=is_rising)
 
     def _climb_detector(self) -> Callable[[], bool]:
-        """Return a function that returns True once new messages report a climb.
-
-        Earlier messages may describe the previous flight. A climb during an earlier take-off proves nothing.
-        """
+        """Return a function that returns True once new messages report a climb."""
         started, landed = self.connection.now(), self.telemetry.landed_state
         if landed.latest == MavLandedState.TAKEOFF and landed.age <= POSITION_MAX_AGE_S:
-            return lambda: False
+            return lambda: False  # A climb during an earlier take-off proves nothing.
         # Without a recent altitude, the climb is measured from the first one that is received.
         is_start_known = self._position.was_received_since(started - POSITION_MAX_AGE_S)
         start_m = self._position.altitude_relative() if is_start_known else -math.inf
@@ -177,7 +174,6 @@ class FlightActions(VehicleBase):
     async def _await_altitude(
         self, altitude_m: float, timeout: float, max_silence_s: float | None, order: Order
     ) -> None:
-        """Wait for the altitude. Fail in any mode but that of the take-off and the mode that follows it."""
         # A vehicle that hovers at the altitude may be slightly below it, but not on the ground.
         min_altitude_m = altitude_m - min(max(0.5, 0.05 * altitude_m), 0.5 * altitude_m)
         started = self.connection.now()
@@ -260,17 +256,13 @@ class FlightActions(VehicleBase):
     async def _await_ground(
         self, operation: str, order: Order, timeout: float | None, max_silence_s: float | None
     ) -> None:
-        """Wait until messages received after the order report the vehicle on the ground.
-
-        Older messages may be outdated. A submarine counts as landed when it leaves its surfacing mode, unless it is
-        known to be deep.
-        """
         armed, landed, mode = self.telemetry.armed, self.telemetry.landed_state, self.telemetry.mode
         accepted_at = self.connection.now()
         landing_failure = self._sender.landing_failure(order)
         ground = GroundCheck(self._session)
 
         def is_down() -> bool:
+            # Messages from before the order may be outdated.
             is_disarmed = self.telemetry.is_confirmed_disarmed and armed.updated_at > order.given_at
             is_landed = is_reported_on_ground(self.telemetry) and landed.updated_at > order.given_at
             # A submarine "lands" by going to the surface. Most submarines have no global position, so an unknown depth
@@ -304,13 +296,11 @@ class FlightActions(VehicleBase):
             )
 
     async def _await_home(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
-        """Wait until the vehicle is above home, for an autopilot that does not land after a return."""
         home = self.telemetry.home
         arrival_radius_m = self.autopilot.arrival_radius_m
         started = self.connection.now()
 
         def distance_m() -> float:
-            """Return the distance from home; infinite while home or the position is unknown."""
             if home.latest is None:
                 return math.inf
             return self._position.distance_to(Position(home.latest.latitude_deg, home.latest.longitude_deg))

@@ -84,7 +84,6 @@ class FollowedTarget:
         self._interval_s = 0.0
 
     def read(self) -> TargetState | None:
-        """Return the target's latest state. If the target is a vehicle or a function, this reads or calls it."""
         if isinstance(self._target, HasTelemetry):
             self._read_vehicle(self._target.telemetry)
         elif not isinstance(self._target, AsyncIterable) and (position := self._target()) is not None:
@@ -92,7 +91,6 @@ class FollowedTarget:
         return self.latest
 
     def _read_vehicle(self, telemetry: Any) -> None:
-        """Read position and velocity of a target that is a vehicle, from its telemetry."""
         position, velocity = telemetry.position, telemetry.velocity.latest
         if position.latest is None or not math.isfinite(position.age):
             return
@@ -107,14 +105,7 @@ class FollowedTarget:
         self.latest = TargetState(place, speeds, reported_at=received_at, first_reported_at=received_at)
 
     def add(self, position: object) -> None:
-        """Update ``latest`` from a position that the program supplied. An unchanged position counts as a new report.
-
-        The velocity is computed from two different positions, because the program may report the same position several
-        times. The velocity becomes zero after a jump, and when the next different position is overdue.
-
-        Raises:
-            InvalidArgument: the object is not a `Position`.
-        """
+        """Process a position that the program supplied. Raises InvalidArgument if it is not a `Position`."""
         if not isinstance(position, Position):
             raise InvalidArgument(f"position = {short_repr(position)} is not allowed: it must be a Position")
         latest, now = self.latest, self._now()
@@ -122,7 +113,7 @@ class FollowedTarget:
             return  # A velocity computed from two positions in such quick succession would be inexact.
         if latest is None:
             self.latest = TargetState(position, ZERO, reported_at=now, first_reported_at=now)
-        elif position == latest.position:
+        elif position == latest.position:  # The program may report the same position several times.
             is_change_overdue = now - latest.first_reported_at > OVERDUE_INTERVALS * self._interval_s
             # If the position should have changed by now, the target has stopped.
             velocity = ZERO if is_change_overdue else latest.velocity
@@ -136,7 +127,7 @@ class FollowedTarget:
 
 
 def _mean_velocity(start: Position, end: Position, seconds: float) -> tuple[float, float, float]:
-    """Return the velocity (north, east, down in m/s) of a target that moved from one position to the other."""
+    """Return the components north, east and down in m/s."""
     distance_m, bearing = start.distance_to(end), math.radians(start.bearing_to(end))
     north_m, east_m = distance_m * math.cos(bearing), distance_m * math.sin(bearing)
     return north_m / seconds, east_m / seconds, VehiclePosition.height_above(start, end) / seconds
@@ -245,13 +236,9 @@ class FollowStream(SteeringStream[TargetState]):
         await super().__aexit__(exc_type, exc, traceback)
 
     def _start_reading(self) -> None:
-        """Read the target in the background if it is an asynchronous iterable.
-
-        Other targets are read at each tick of the stream.
-        """
         target = self._target
         if isinstance(target, HasTelemetry) or not isinstance(target, AsyncIterable):
-            return
+            return  # These targets are read at each tick of the stream.
         scope = Cancellation()
         self._reading = scope
 
@@ -282,7 +269,6 @@ class FollowStream(SteeringStream[TargetState]):
             scope.cancel()
 
     async def _first_state(self) -> TargetState:
-        """Wait for a position of the target that is not too old."""
         until = self._now() + self._valid_for_s
         while True:
             self._session.end.raise_if_ended()
@@ -295,7 +281,7 @@ class FollowStream(SteeringStream[TargetState]):
             await anyio.sleep(POLL_INTERVAL_S)
 
     def _choose_place(self, state: TargetState) -> None:
-        """Use the present bearing from the target and the present altitude where the caller gave none."""
+        """Take the present bearing and altitude where the caller gave none."""
         here, target = self._session.telemetry.position.fresh(POSITION_MAX_AGE_S), state.position
         # Until the target moves, its course is unknown: assume that it moves away from the vehicle.
         self._course_deg = here.bearing_to(target)
@@ -319,7 +305,6 @@ class FollowStream(SteeringStream[TargetState]):
         return self._context.sender.mode_for("follow", "setpoint")
 
     def _tick(self, due: float) -> None:
-        """Read the target, and send the set-point for its position."""
         state = None
         try:
             state = self._tracker.read()
@@ -343,14 +328,14 @@ class FollowStream(SteeringStream[TargetState]):
         return super()._stop_reason(lag)
 
     def _reference_deg(self, state: TargetState) -> float:
-        """Return the direction from which the bearing is measured: the target's course, or 0 for north."""
+        """Return the target's course if bearings are measured from it, otherwise 0 (north)."""
         north_m_s, east_m_s, _ = state.velocity
         if math.hypot(north_m_s, east_m_s) >= MIN_COURSE_SPEED_M_S:
             self._course_deg = math.degrees(math.atan2(east_m_s, north_m_s))
         return self._course_deg if self._place.from_course else 0.0
 
     def _encode_place(self, state: TargetState) -> Message:
-        """Return the set-point for this moment, assuming that the target keeps its velocity between two positions."""
+        # The target is assumed to keep its velocity between two positions.
         moved_for_s = max(0.0, min(self._now() - state.first_reported_at, self._valid_for_s))
         north_m_s, east_m_s, down_m_s = state.velocity
         bearing = math.radians(self._reference_deg(state) + self._bearing_deg)

@@ -81,7 +81,7 @@ class ImpactDetector:
         self._has_slowed = False
 
     def update(self) -> None:
-        """Detect an impact by the vehicle's last reported velocity; called repeatedly."""
+        """Process the vehicle's last reported velocity. Call this repeatedly."""
         cell = self._telemetry.velocity
         velocity, updated_at = cell.latest, cell.updated_at
         if velocity is None or updated_at == self._updated_at:
@@ -120,7 +120,7 @@ class ImpactDetector:
         self._has_slowed = self._impact_m_s is not None and (self._has_slowed or is_slow)
 
     def describe(self) -> str:
-        """Return a text about the impact; empty if there was none, or if the vehicle has flown on since."""
+        """Return a text about the impact; empty if there was none."""
         if self._impact_m_s is None or not self._has_slowed:
             return ""
         return f"{HIT_GROUND} at {self._impact_m_s:.1f} m/s"
@@ -148,7 +148,7 @@ class GroundCheck:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """During a `with` block, process every velocity at its arrival, instead of only the last one at each check."""
+        """Process every velocity that arrives during a `with` block."""
         detach = self._session.telemetry.velocity.observe(lambda *_: self._impact.update())
         try:
             yield
@@ -157,14 +157,10 @@ class GroundCheck:
 
     @property
     def is_reported_on_ground(self) -> bool:
-        """True while the vehicle is reported on the ground, also after `confirms` has returned True."""
         return self._reported_at is not None
 
     def confirms(self, is_reported: bool) -> bool:
-        """Return True if the vehicle is reported on the ground, has settled since, and did not fall.
-
-        If no velocity is received, the report alone counts.
-        """
+        """Return True if the vehicle is reported on the ground, has settled since, and did not fall."""
         now, velocity = self._session.connection.now(), self._session.telemetry.velocity
         self._impact.update()
         if not is_reported:
@@ -177,11 +173,10 @@ class GroundCheck:
         return self._has_settled(now, velocity.updated_at) and not self._impact.describe()
 
     def failure_reason(self, in_flight: Callable[[], str | None]) -> str | None:
-        """Return :meth:`fall` while the vehicle is reported on the ground, otherwise ``in_flight()``."""
         return self.fall() if self.is_reported_on_ground else in_flight()
 
     def fall(self) -> str | None:
-        """Return a text if the vehicle has hit the ground, or sinks fast although reported landed and disarmed."""
+        """Return a text if the vehicle fell or is falling."""
         telemetry = self._session.telemetry
         is_newer = self._reported_at is not None and telemetry.velocity.updated_at > self._reported_at
         if is_newer and telemetry.is_confirmed_disarmed and self._down_m_s() >= FALL_SINK_M_S:
@@ -189,7 +184,7 @@ class GroundCheck:
         return self._impact.describe() or None
 
     def _has_settled(self, now: float, updated_at: float) -> bool:
-        """Return True if the vehicle has stopped climbing or sinking, or if it reports no recent velocity.
+        """Return True if the vehicle has stopped climbing or sinking.
 
         ``updated_at`` is the time of the last velocity.
         """
@@ -215,5 +210,4 @@ class GroundCheck:
 
 
 def _has_changed(before_m: float | None, now_m: float | None, min_change_m: float) -> bool:
-    """Return True if the height changed by more than ``min_change_m``; False if one of the heights is unknown."""
     return before_m is not None and now_m is not None and abs(now_m - before_m) > min_change_m

@@ -274,7 +274,6 @@ class SetpointStream(SteeringStream[SetpointT]):
             self._repeats_left = INITIAL_REPEATS
 
     def _send(self) -> None:
-        """Send the set-point. If each repetition restarts the autopilot's path, send it only when one is due."""
         is_due = self._repeats_left > 0 or self._now() - self._sent_at >= REPEAT_INTERVAL_S
         if is_due or not self._restarts_path:
             super()._send()
@@ -282,7 +281,6 @@ class SetpointStream(SteeringStream[SetpointT]):
             self._sent_at = self._now()
 
     def _stop_reason(self, lag: float) -> str | None:
-        """Return why the stream must stop; one more reason is that the vehicle stays in place but should move."""
         if self._mode is None or not wants_motion(self._value, self._context):
             # A vehicle that does not have to move cannot stall, so the detection starts again.
             self._stall = StallDetector(self._session)

@@ -34,9 +34,7 @@ RC_RECEIVER = SENSORS[MavSysStatusSensor.RC_RECEIVER]
 def in_order(report_reasons: list[str], other_reasons: list[str]) -> list[str]:
     """Return all reasons in the order in which aerokit lists them.
 
-    ``report_reasons`` name missing or old reports. Those that begin with an entry of ``REPORTS_ABOUT_ARMING`` come
-    first, the others last. Between them are ``other_reasons``: the vehicle's own texts, its mode, failing sensors, and
-    missing estimates.
+    ``report_reasons`` name missing or old reports.
     """
     first = [reason for reason in report_reasons if reason.startswith(REPORTS_ABOUT_ARMING)]
     last = [reason for reason in report_reasons if reason not in first]
@@ -54,14 +52,11 @@ class Health:
         session.at_close(session.connection.bus.attach_event(LinkRestored, self._on_restored))
 
     def _on_restored(self, event: LinkRestored) -> None:
-        """Distrust states received before the link was restored, because the vehicle may have rebooted meanwhile."""
+        # The vehicle may have rebooted, so states that were received before are distrusted.
         self._restored_at = event.at
 
     def missing_for_flight(self) -> list[str]:
-        """Return what is still missing before the vehicle can fly, from the state received so far. Sends nothing.
-
-        The order is that of :func:`in_order`.
-        """
+        """Return what is still missing before the vehicle can fly. Sends nothing."""
         telemetry = self._telemetry
         missing = [
             f"{cell.name} ({cell.waits_for} not received)"
@@ -74,13 +69,11 @@ class Health:
         return in_order([*missing, *self._outdated_states()], [*texts, *self._health_problems(), *unexplained])
 
     def _recent_texts(self) -> list[str]:
-        """Return why checks fail, from recent status texts; empty if they pass or the vehicle is armed.
-
-        Texts from before the last request to run the checks, or from before the link was restored, are ignored.
-        """
+        """Return why pre-arm checks fail, from recent status texts."""
         if not self._checks_fail() or self._telemetry.is_armed:
             return []
         now = self._session.connection.now()
+        # Texts from before the last request to run the checks, or from before the link was restored, may be outdated.
         since = max(now - PREARM_REPORT_INTERVAL_S, self._checked_at, self._restored_at)
         reasons = [
             (text.at, reason)
@@ -94,7 +87,6 @@ class Health:
         return list(dict.fromkeys(reason for _, reason in reasons))
 
     def _outdated_states(self) -> list[str]:
-        """Return one text for each state that is too old to describe the present."""
         telemetry = self._telemetry
         is_lost = self._session.watch.link_state.latest is LinkState.LOST
         lost_link = ", the link is lost" if is_lost else ""
@@ -114,7 +106,6 @@ class Health:
         return [*heartbeats, *too_old, *from_before_silence]
 
     async def why_not_armable(self) -> list[str]:
-        """Return why arming would be refused now. A vehicle that can run its checks on request runs them first."""
         if self._telemetry.is_armed:
             return []
         return list(await self.arming_reasons(self._session.connection.now()))
@@ -122,7 +113,7 @@ class Health:
     async def arming_reasons(self, since: float) -> tuple[str, ...]:
         """Return the reasons against arming, among them the status texts received since ``since``.
 
-        If there are no such texts, the vehicle is requested to run its pre-arm checks.
+        Without such texts, the vehicle is requested to run its pre-arm checks.
         """
         with self._session.streaming("sensors", "estimator"):
             await self._session.wait_for_status_texts()
@@ -136,7 +127,7 @@ class Health:
         return reasons
 
     def _unnamed_reasons(self) -> list[str]:
-        """Return low batteries, or a general text, as reasons for failing checks that the vehicle does not explain."""
+        """Return low batteries, or a general text, for failing checks that the vehicle does not explain."""
         low_batteries = []  # PX4 sends its status text about a low battery only once.
         for battery in self._telemetry.batteries.latest or ():
             # With these charge states (critical, emergency, failed, unhealthy), vehicles refuse to arm.
@@ -157,7 +148,6 @@ class Health:
         return [self.unarmable_text(mode)] if mode is not None and mode.name in self._unarmable_modes() else []
 
     def unarmable_text(self, mode: Mode) -> str:
-        """Return a text that says that the vehicle cannot arm in this mode, and with which option or mode it can."""
         option = self._autopilot.armable_by_option.get(mode.name)
         armable_modes = ", ".join(sorted({*self._autopilot.modes.names} - self._unarmable_modes()))
         if option is None:
@@ -169,7 +159,6 @@ class Health:
         return text if arming_mode is None else f"{text}; arm() changes to {arming_mode.name} {when}"
 
     def _unarmable_modes(self) -> frozenset[str]:
-        """Return the names of the modes in which arming is impossible, or possible only with an option."""
         return self._autopilot.unarmable_modes.union(self._autopilot.armable_by_option)
 
     async def _refresh(self) -> None:
@@ -179,13 +168,13 @@ class Health:
             await self._telemetry.estimator.wait_until(lambda _: self._telemetry.estimator.age <= HEALTH_MAX_AGE_S)
 
     async def request_reasons(self, since: float) -> None:
-        """If the vehicle's pre-arm checks fail, make it report why, unless it has done so since this time."""
+        """Request the reasons if pre-arm checks fail. Does nothing if some were received since ``since``."""
         sensors = self._telemetry.sensors.latest
         if sensors is not None and sensors.prearm_checks_pass is False and not self._telemetry.is_armed:
             await self._request_texts(since)
 
     async def _request_texts(self, since: float) -> None:
-        """Let the vehicle run its pre-arm checks, unless it has sent texts about arming since this time."""
+        """Let the vehicle run its pre-arm checks. Does nothing if texts about arming were received since ``since``."""
         if self.arming_texts(since) or not self._autopilot.runs_prearm_checks:
             return
         requested_at = self._session.connection.now()
@@ -197,39 +186,28 @@ class Health:
         await anyio.sleep(REPORT_WAIT_S)
 
     def arming_texts(self, since: float) -> list[str]:
-        """Return the status texts about arming that were received since this time."""
         return [text for text in self._session.texts_since(since) if self._autopilot.arming_reason(text) is not None]
 
     def _health_problems(self) -> list[str]:
-        """Return failing sensors and missing estimates. If estimates are missing, also report a missing GPS fix."""
         return [*self._failing_sensors(), *self._missing_estimates()]
 
     def _missing_estimates(self) -> list[str]:
-        """Return one text for each missing estimate; a missing GPS fix, their probable cause, comes first."""
         estimator = self._telemetry.estimator.latest
         if estimator is None or not estimator.missing:
             return []
         receivers = self._telemetry.gps.latest or ()
         has_no_fix = receivers and not any(receiver.has_3d_fix for receiver in receivers)
         causes = ["no GPS receiver has a 3D fix (GPS_RAW_INT)"] if has_no_fix else []
+        # The probable cause comes first.
         return [*causes, *(f"the estimator has no {name} ({estimator.message})" for name in estimator.missing)]
 
     def _checks_fail(self) -> bool:
-        """Return True if the vehicle reports that its pre-arm checks do not pass.
-
-        PX4's report is ignored in a mode that does not allow arming, because it is then about the requirements of that
-        mode instead of those for arming.
-        """
         sensors = self._telemetry.sensors.latest
+        # In a mode that does not allow arming, PX4 reports what this mode requires, and not what arming requires.
         is_meaningless = self._autopilot.prearm_depends_on_mode and self.unarmable_mode()
         return sensors is not None and sensors.prearm_checks_pass is False and not is_meaningless
 
     def _failing_sensors(self) -> list[str]:
-        """Return the failing sensors that may prevent arming; none if the vehicle reports that it can be armed.
-
-        An RC receiver is left out in modes that do not require one, because PX4 reports a missing receiver as failing
-        in all modes.
-        """
         sensors = self._telemetry.sensors.latest
         # In a mode that does not allow arming, PX4 reports what this mode requires. The report then does not show what
         # arming in another mode requires.
@@ -239,7 +217,7 @@ class Health:
         return [f"{name} is not healthy (SYS_STATUS)" for name in sensors.failing if self._is_required(name)]
 
     def _is_required(self, sensor: str) -> bool:
-        """Return False for an RC receiver that the present mode does not require."""
         mode, modes_with_rc = self._telemetry.mode.latest, self._autopilot.modes_with_rc
+        # PX4 reports a missing RC receiver as failing in all modes, also in those that do not require it.
         needs_rc = mode is None or modes_with_rc is None or mode.name in modes_with_rc
         return needs_rc or not sensor.startswith(RC_RECEIVER)

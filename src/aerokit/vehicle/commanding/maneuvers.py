@@ -295,7 +295,6 @@ class ManeuverActions(VehicleBase):
 
     @property
     def _is_on_wings(self) -> bool:
-        """True for a fixed wing and for a VTOL in forward flight, which cannot stop."""
         vtol_state = self.telemetry.vtol_state.latest
         if vtol_state:  # Only a VTOL reports a state other than MAV_VTOL_STATE_UNDEFINED (0).
             return vtol_state == MavVtolState.FW

@@ -65,7 +65,6 @@ REQUIRED_STATES = (
 
 @contextmanager
 def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
-    """Request all streams of the vehicle for the duration of a `with` block: the body of ``Vehicle.streams``."""
     check_range("rate_hz", rate_hz, 0, 1000, above=True)
     tasks = BackgroundTasks(session.connection.fail)
     with ExitStack() as cleanup:
@@ -84,10 +83,6 @@ def every_stream(session: VehicleSession, rate_hz: float) -> Iterator[None]:
 
 
 async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: _StreamMonitor) -> None:
-    """Request all streams by REQUEST_DATA_STREAM.
-
-    The request is repeated while no stream arrives, and after events such as a reboot, see `_StreamMonitor`.
-    """
     retry_interval_s = FIRST_MESSAGE_TIMEOUT_S
     request = m.RequestDataStream(
         target_system=session.system_id,
@@ -110,7 +105,6 @@ async def _request_repeatedly(session: VehicleSession, rate_hz: float, monitor: 
 
 
 async def _request_missing(session: VehicleSession, rate_hz: float, cleanup: ExitStack) -> None:
-    """Request those common states that the vehicle does not stream by itself."""
     await anyio.sleep(FIRST_MESSAGE_TIMEOUT_S)
     telemetry = session.telemetry
     missing = [name for name in REQUIRED_STATES if not telemetry.cells[name].is_known]
@@ -134,7 +128,6 @@ class _StreamMonitor:
             cleanup.callback(bus.attach_event(event_type, self._on_event))
 
     def reset(self) -> None:
-        """Clear both attributes before a new request."""
         self.has_received = False
         self.must_request = asyncio.Event()
 

@@ -101,14 +101,13 @@ def subjects_of(message: Message) -> tuple[Subject, ...]:
 
 
 def is_worse_failsafe(state: int, state_before: int | None) -> bool:
-    """Return True if MAV_STATE changed to a failsafe, or to a more severe one. ``state_before`` is None at first."""
+    """Return True if MAV_STATE changed to a failsafe, or to a more severe one."""
     if state not in FAILSAFE_STATES:
         return False
     return state_before is None or state_before not in FAILSAFE_STATES or state > state_before
 
 
 def failsafe_text(state: int) -> str:
-    """Return a part of an error text that names the failsafe."""
     name = MavState(state).name
     return f"a failsafe became active (MAV_STATE_{name}) and keeps control; no hold was ordered"
 
@@ -214,7 +213,6 @@ class Order:
 
     @property
     def is_newest(self) -> bool:
-        """Return True while no newer order supersedes this one."""
         return self._is_newest(self)
 
     @property
@@ -228,19 +226,18 @@ class Order:
 
     @property
     def is_effect_due(self) -> bool:
-        """True while the vehicle may have accepted the order, although HEARTBEAT does not report the effect yet."""
+        """True while HEARTBEAT may still report the effect of the order."""
         return self.was_sent and not (self.is_confirmed or self.was_refused or self.takeover_reason)
 
     def is_own(self, mode: Mode) -> bool:
-        """Return True if this mode may be the effect of the order itself."""
         return mode.custom_mode in self._own_modes
 
     def expect(self, modes: Collection[Mode]) -> None:
-        """Also accept these modes as effects of the order, because the program will order one of them."""
+        """Also accept these modes as effects of the order."""
         self._own_modes |= {mode.custom_mode for mode in modes}
 
     def withdraw(self) -> None:
-        """Record that the order was refused or not acknowledged, so that the device's previous order is valid again."""
+        """Make the device's previous order valid again, because this one was refused or not acknowledged."""
         self.is_withdrawn = True
 
     def commit(self) -> None:
@@ -248,21 +245,14 @@ class Order:
         self.previous = None
 
     def close(self) -> None:
-        """End the posted order, because its `with` block was left."""
         self.is_closed = True
 
     def clear_failsafe(self) -> None:
-        """Ignore the reported failsafe, because the program has reclaimed the vehicle."""
         self.failsafe = ""
 
     # -------------------------------------------------------------------- vehicle reports
 
     def on_mode(self, mode: Mode, reported_at: float) -> None:
-        """Update the order from a mode reported at this time; the class docstring describes the kinds of modes.
-
-        The order has taken effect once one of its own modes is reported; with ``requires_mode_change``, once the mode
-        has changed to one of them. After that, a return to the mode before the order is a takeover.
-        """
         number = mode.custom_mode
         is_first_report = self._mode_now is None
         is_change = not is_first_report and number != self._mode_now
@@ -297,16 +287,13 @@ class Order:
         self._mode_now = number
 
     def on_system_status(self, state: int) -> None:
-        """Record a failsafe if MAV_STATE is worse than when it was last reported, even if that was before the order.
-
-        A failsafe does not end an order to land, to return or to disarm.
-        """
-        if is_worse_failsafe(state, self._last_state):  # `end` ignores a failsafe if the order ends the flight.
+        # A failsafe that was active before the order does not end it. `end` ignores a failsafe if the order ends the
+        # flight.
+        if is_worse_failsafe(state, self._last_state):
             self.failsafe = self.failsafe or failsafe_text(state)
         self._last_state = state
 
     def on_armed(self, armed: bool, reported_at: float) -> None:
-        """Update the order from the armed state that HEARTBEAT reports."""
         armed_before, self._armed_now = self._armed_now, armed
         has_changed = armed_before is not None and armed_before is not armed
         if has_changed and armed is self.armed:  # The order to arm or disarm has taken effect.
@@ -315,7 +302,6 @@ class Order:
             self.takeover_reason = self.takeover_reason or "the vehicle disarmed"
 
     def on_reboot(self) -> None:
-        """End the order, because the vehicle has rebooted."""
         self.takeover_reason = self.takeover_reason or "the vehicle rebooted"
 
 
@@ -356,7 +342,6 @@ class SentCommand:
 
     @property
     def is_confirmed(self) -> bool:
-        """True once the command's effect was reported."""
         self._is_effect_reported = self._is_effect_reported or self._is_done()
         return self._is_effect_reported
 
@@ -370,18 +355,15 @@ class SentCommand:
         return self.order.end or (SUPERSEDED if self._is_overruled else "") or self.order.unexplained
 
     def on_newer_command(self, armed: bool | None) -> None:
-        """Process a newer command of the program: arming supersedes disarming, and disarming supersedes arming."""
         if armed is not None and self.arms is not None and armed is not self.arms:
             self._is_overruled = True
 
     def on_mode(self, mode: Mode, reported_at: float) -> None:
-        """Process the reported mode."""
         mode_before, self._mode_now = self._mode_now, mode.custom_mode
         if self._mode_now != mode_before and self._mode_now in self._modes:
             self._is_effect_reported = True
 
     def on_armed(self, armed: bool, reported_at: float) -> None:
-        """Process the reported armed state."""
         armed_before, self._armed_now = self._armed_now, armed
         if armed is not armed_before and armed is self.arms:
             self._is_effect_reported = True

@@ -131,10 +131,7 @@ class PostedOrder:
             return
 
     async def _is_valid_at_next_heartbeat(self, timeout: float) -> bool:
-        """Pause for `MODE_RETRY_INTERVAL_S`, then wait for a HEARTBEAT from after this call.
-
-        Return False if the order has ended by then, or if no HEARTBEAT arrives within ``timeout`` seconds.
-        """
+        """Return False if the order has ended by then, or if no HEARTBEAT arrives in time."""
         started_at, armed = self._session.connection.now(), self._session.telemetry.armed
         await anyio.sleep(MODE_RETRY_INTERVAL_S)
         with (
@@ -178,8 +175,8 @@ class PostedOrder:
         await self._sender.run_command(order, send, command, *params, modes=order.modes, armed=order.armed, **options)
 
     def _begin_command(self, command: int) -> None:
-        """Check that the block is open, and collect refusals: the vehicle may refuse a command after accepting it."""
         if self._was_left:
             raise InvalidArgument(f"the `with` block of this order was left: {command_name(command)} was not sent")
+        # The vehicle may refuse a command after accepting it.
         self._refusal_watch.close()
         self._refusals = self._refusal_watch.enter_context(self._session.refusals_of(command))

@@ -102,14 +102,12 @@ async def await_progress(
 
 
 def _reasons(session: VehicleSession, reason: str, since: float) -> tuple[str, ...]:
-    """Return the status texts that may explain a failure. Texts about normal progress do not explain an impact."""
     texts = session.telemetry.texts_since(since)
-    is_impact = reason.startswith(HIT_GROUND)
+    is_impact = reason.startswith(HIT_GROUND)  # Texts about normal progress do not explain an impact.
     return tuple(text.text for text in texts if not is_impact or text.severity < MavSeverity.INFO)
 
 
 def _height_when_disarmed(session: VehicleSession) -> str:
-    """Return a text with the height of a vehicle that is disarmed in the air; empty otherwise."""
     height_m = height_above_home(session.telemetry)
     is_falling = session.telemetry.is_confirmed_disarmed and height_m is not None and height_m > 1.0
     return f" {height_m:.1f} m above home" if is_falling else ""
@@ -134,7 +132,6 @@ class ChangeSignal:
             detach()
 
     async def next(self, at_most_s: float) -> None:
-        """Wait for the next change, at most this many seconds."""
         self._changed.clear()
         # No cancel scope is used, because on Python 3.10 an expiring scope swallows a cancellation in the same
         # iteration of the event loop.
@@ -164,14 +161,11 @@ class StallDetector:
 
     @property
     def follows_fast_descent(self) -> bool:
-        """True if the vehicle stands still, and sank at ``FALL_SINK_M_S`` or faster right before that."""
+        """True if the vehicle stands still, and sank fast right before that."""
         return self._place is not None and self._there_since - self._sank_fast_at <= FALL_STOP_S
 
     def __call__(self, timeout_s: float = STALL_TIMEOUT_S) -> str | None:
-        """Return an error text if the vehicle has not moved for ``timeout_s`` seconds, otherwise None.
-
-        While the position is unknown, the result is None.
-        """
+        """Return an error text if the vehicle has not moved for ``timeout_s`` seconds, otherwise None."""
         now, cell = self._session.connection.now(), self._session.telemetry.position
         here = cell.latest
         if here is None or cell.age > POSITION_MAX_AGE_S:
@@ -185,7 +179,6 @@ class StallDetector:
         return None
 
     def _record_descent(self, here: Position) -> None:
-        """Update the greatest height and sink rate, and the time of a fast descent, after a move to ``here``."""
         velocity = self._session.telemetry.velocity.latest
         if here.altitude_relative_m is not None:
             self._max_height_m = max(self._max_height_m, here.altitude_relative_m)
@@ -195,7 +188,6 @@ class StallDetector:
             self._sank_fast_at = self._there_since
 
     def _describe_descent(self, here: Position) -> str:
-        """Return a text about a fast descent before the standstill; empty if there was none."""
         height_m = here.altitude_relative_m
         if height_m is None or self._max_sink_m_s < FALL_SINK_M_S or self._max_height_m - height_m <= 1.0:
             return ""
@@ -203,10 +195,8 @@ class StallDetector:
 
 
 def _approximate_distance_m(here: Position, place: Position) -> float:
-    """Return horizontal plus vertical distance, in a tenth of the time that an exact distance takes.
-
-    The horizontal distance is exact to one per cent.
-    """
+    """Return the horizontal distance, exact to one per cent, plus the vertical distance."""
+    # An exact distance takes ten times as long to compute.
     north_m = (here.latitude_deg - place.latitude_deg) * _METRES_PER_DEGREE
     east_at_equator_m = math.remainder(here.longitude_deg - place.longitude_deg, 360.0) * _METRES_PER_DEGREE
     horizontal_m = math.hypot(north_m, east_at_equator_m * math.cos(math.radians(here.latitude_deg)))
@@ -240,12 +230,12 @@ class VehiclePosition:
         session.telemetry.mode.observe(lambda *_: self.record_circle(0.0))
 
     def record_circle(self, radius_m: float) -> None:
-        """Record the ordered radius. ArduPlane keeps this radius for further places until it leaves GUIDED."""
+        # ArduPlane keeps this radius for further places until it leaves GUIDED.
         self._circle_m = radius_m
 
     @property
     def arrival_radius_m(self) -> float:
-        """Distance from the target in metres at which the vehicle counts as arrived, even if it circles the target."""
+        """Distance from the target at which the vehicle counts as arrived."""
         return max(self._autopilot.arrival_radius_m, CIRCLE_MARGIN * self._circle_m)
 
     def distance_to(self, target: Position) -> float:
@@ -264,10 +254,10 @@ class VehiclePosition:
     def check_reach(
         self, name: str, places: Iterable[Position | None], max_distance_m: float, *, are_items: bool = False
     ) -> None:
-        """Raise InvalidArgument for a place farther away than ``max_distance_m`` from the last reported position.
+        """Raise InvalidArgument for a place farther away than ``max_distance_m``.
 
-        While the vehicle's position is unknown, all places are accepted. With ``are_items``, ``places`` has one entry
-        for each item of a plan: None for an item without a place.
+        While the vehicle's position is unknown, all places are accepted. With ``are_items``, the error text has the
+        index of the place, and None stands for an item without a place.
         """
         check_range("max_distance_m", max_distance_m, 0, math.inf, above=True)
         here = self._telemetry.position.latest
@@ -292,20 +282,14 @@ class VehiclePosition:
                 )
 
     def remaining_distance(self, target: Position) -> float:
-        """Return the remaining distance to ``target`` in metres.
-
-        For ground vehicles this is the horizontal distance, because their altitude has no fixed origin.
-        """
-        if self._autopilot.is_surface_vehicle:
+        """Return the distance to ``target`` in metres; for ground vehicles the horizontal one."""
+        if self._autopilot.is_surface_vehicle:  # The altitude of such a vehicle has no fixed origin.
             return self.distance_to(Position(target.latitude_deg, target.longitude_deg))
         return self.distance_to(target)
 
     @staticmethod
     def height_above(here: Position, target: Position) -> float:
-        """Return how many metres ``here`` is above ``target``.
-
-        Return 0 if they have no altitude of the same kind (above home, or above mean sea level).
-        """
+        """Return how many metres ``here`` is above ``target``; 0 without altitudes of the same kind."""
         for here_m, target_m in (
             (here.altitude_relative_m, target.altitude_relative_m),
             (here.altitude_amsl_m, target.altitude_amsl_m),
@@ -315,7 +299,6 @@ class VehiclePosition:
         return 0.0
 
     def was_received_since(self, started: float) -> bool:
-        """Return True if the last position is recent and was received at or after ``started``."""
         position = self._telemetry.position
         return position.updated_at >= started and position.age <= POSITION_MAX_AGE_S
 
@@ -325,17 +308,14 @@ class VehiclePosition:
         return -math.inf if altitude is None else altitude
 
     def home_altitude(self) -> float:
-        """Return the altitude of home above mean sea level in metres; raise ValueUnknownError while it is unknown."""
+        """Return the altitude above mean sea level in metres. Raises ValueUnknownError if it is unknown."""
         return self._telemetry.home.value.altitude_amsl_m
 
     def global_target(self, target: Position, name: str = "target") -> tuple[int, int, float, MavFrame]:
         """Return latitude and longitude in 1e-7 degrees, the altitude in metres, and the frame of the altitude.
 
-        The frame is MAV_FRAME_GLOBAL_RELATIVE_ALT_INT or MAV_FRAME_GLOBAL_INT. If the target has both altitudes, the
-        relative one counts. A target without an altitude gets the vehicle's present one. ``name`` is the caller's
-        argument, for error texts.
-
-        PX4 accepts only altitudes above mean sea level, so an altitude relative to home requires a known home.
+        If the target has both altitudes, the relative one counts. If it has none, the vehicle's present altitude is
+        used. ``name`` is the caller's argument, for error texts.
         """
         relative_m, amsl_m = target.altitude_relative_m, target.altitude_amsl_m
         if relative_m is None and amsl_m is None:
@@ -348,6 +328,7 @@ class VehiclePosition:
                 f" is unknown; give the {name} altitude_relative_m or altitude_amsl_m"
             )
         check_range("altitude", altitude, -12_000, 100_000)
+        # PX4 accepts only altitudes above mean sea level, so home must be known.
         if is_relative and not self.accepts_relative_altitude:
             altitude += self.home_altitude()
             is_relative = False
@@ -360,7 +341,6 @@ class VehiclePosition:
         return {"frame": frame, "x": latitude, "y": longitude, "z": altitude}
 
     def is_on_ground(self) -> bool:
-        """Return True if a vehicle that can fly was recently reported on the ground."""
         landed = self._telemetry.landed_state
         can_fly = self._autopilot.mode_for("take_off", is_vtol=self._telemetry.is_vtol) is not None
         return can_fly and landed.latest == MavLandedState.ON_GROUND and landed.age <= POSITION_MAX_AGE_S
@@ -376,5 +356,4 @@ class VehiclePosition:
 
     @property
     def accepts_relative_altitude(self) -> bool:
-        """True if the autopilot supports altitudes relative to home."""
         return self._autopilot.reposition is None or self._autopilot.reposition.relative_altitude

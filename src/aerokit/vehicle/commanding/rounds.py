@@ -97,8 +97,8 @@ class RoundFlight:
     ) -> None:
         """Send the command, and wait until the rounds are flown and another ``stay_s`` seconds have passed.
 
-        At the end, the vehicle is ordered to hold if ``holds_at_end``; otherwise it continues to circle. ``radius_m``
-        is the ordered radius, 0 if the command has none.
+        With ``holds_at_end``, the vehicle then holds. Otherwise it continues to circle. ``radius_m`` is the ordered
+        radius; 0 if the command has none.
         """
         context, cleanup = self._context, self._context.flight_cleanup
         hold_mode = context.sender.mode_for(self._operation, "hold")
@@ -124,24 +124,20 @@ class RoundFlight:
             raise
 
     async def _await_rounds(self, order: Order, mode: Mode, stay_s: float, radius_m: float) -> None:
-        """Wait until the rounds are flown and another ``stay_s`` seconds have passed.
-
-        With 0 rounds, wait until the vehicle has been at the place for ``stay_s`` seconds.
-        """
+        """Wait until the rounds are flown and another ``stay_s`` seconds have passed."""
         session, started = self._session, self._session.connection.now()
         detect_stall, mode_failure = StallDetector(session), self._context.sender.mode_failure(order, mode)
         wrong_radius = ""  # error text about the last reported radius; empty if it is the ordered one
 
         def on_status(status: OrbitExecutionStatus) -> None:
-            """Recognise a wrong radius: PX4 accepts a radius above its limit, but then flies another radius."""
             nonlocal wrong_radius
             flown_m = abs(status.radius)
             wrong_radius = ""
+            # PX4 accepts a radius above its limit, but then flies another radius.
             if radius_m > 0 and abs(flown_m - radius_m) > RADIUS_ERROR_M:
                 wrong_radius = f"the vehicle flies a circle of {flown_m:.1f} m instead of {radius_m:g} m"
 
         def failure_reason() -> str | None:
-            """Return why the rounds cannot succeed: the mode, a status text that refuses them, or a wrong radius."""
             if reason := mode_failure():
                 return reason
             texts = session.telemetry.texts_since(order.given_at)
@@ -178,10 +174,6 @@ class RoundFlight:
             detach()
 
     def _are_rounds_flown(self, started: float) -> bool:
-        """Return True if the rounds are flown; with 0 rounds, if the vehicle is in place.
-
-        Only a recent position that was received since ``started`` counts.
-        """
         is_known = self._context.vehicle_position.was_received_since(started)
         if not is_known or self._count_rounds() < self._rounds:
             return False
@@ -189,14 +181,12 @@ class RoundFlight:
 
     @property
     def _is_in_place(self) -> bool:
-        """True while the vehicle is on its path or, if rounds are not counted, at the center."""
         position = self._context.vehicle_position
         if self._counter is not None:
             return self._counter.is_on_path
         return position.remaining_distance(self._center) <= position.arrival_radius_m
 
     def _count_rounds(self) -> float:
-        """Pass the present position to the counter, and return the rounds flown."""
         here = self._telemetry.position.latest
         if self._counter is None or here is None:
             return 0.0
@@ -209,14 +199,14 @@ class RoundFlight:
         return f"{flown}the vehicle is {distance_m:.1f} m from the place"
 
     def _offset(self, place: Position) -> Vector:
-        """Return how far the place is north and east of the center, in metres."""
+        """Return how many metres the place is north and east of the center."""
         center = self._center
         return geo.north_east_m(center.latitude_deg, center.longitude_deg, place.latitude_deg, place.longitude_deg)
 
     # ------------------------------------------------------------------------------ by set-points
 
     async def fly_by_setpoints(self, path: ClosedPath, speed_m_s: float, facing: str) -> None:
-        """Stream the set-points of a path; leaving the stream makes the vehicle hold."""
+        """Stream the set-points of a path. At the end, the vehicle holds."""
         try:
             with self._session.streaming("position", "local_position"), anyio.move_on_after(self._timeout) as scope:
                 mode = self._context.sender.mode_for(self._operation, "setpoint")
@@ -230,12 +220,9 @@ class RoundFlight:
             raise OperationTimeout(f"{self._operation}: not done within {self._timeout:g} s; {self._describe()}")
 
     async def _path_flight(self, path: ClosedPath, speed_m_s: float, facing: str) -> PathFlight:
-        """Return the flight along the path, with the center in the local frame.
-
-        The vehicle's position is known in both frames, so the center can be converted from the global to the local one.
-        Both positions must be new: while the vehicle moves, older ones may belong to different places.
-        """
         position, local_position = self._telemetry.position, self._telemetry.local_position
+        # The vehicle's position is known in both frames, so the center can be converted from the global to the local
+        # one. Both positions must be new: while the vehicle moves, older ones may belong to different places.
         since = self._session.connection.now()
         await position.wait_until(lambda _: position.updated_at >= since, timeout=FRAME_TIMEOUT_S)
         local = await local_position.wait_until(lambda _: local_position.updated_at >= since, timeout=FRAME_TIMEOUT_S)
@@ -247,7 +234,6 @@ class RoundFlight:
         return PathFlight(path, self._rounds, speed_m_s, start, local_center, heading)
 
     def _heading_function(self, facing: str) -> Callable[[Vector, Vector], float | None]:
-        """Return a function that returns the heading in degrees; None leaves the heading to the autopilot."""
         initial_deg = self._telemetry.heading_deg.latest
 
         def heading(place: Vector, velocity: Vector) -> float | None:
@@ -262,10 +248,6 @@ class RoundFlight:
         return heading
 
     async def _stream(self, flight: PathFlight, order: Order) -> None:
-        """Stream the set-points of the flight until the vehicle, which lags behind them, has flown the rounds.
-
-        The last ``LAG_ROUNDS``, a small part of a round, need not be flown.
-        """
         stream = Guided(self._context).trajectory(
             flight.advance(0.0), rate_hz=SETPOINT_RATE_HZ, valid_for_s=VALID_FOR_S, max_lag_s=VALID_FOR_S
         )

@@ -94,18 +94,14 @@ class OrderSender:
         await self.run_command(order, self._session.commands.send_long, command, *params, **options)
 
     def raise_if_ended(self, order: Order) -> None:
-        """Raise OperationRejected if the order has ended, so that its remaining commands are not sent."""
         if order.end:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 
     async def await_recent_state(self, order: Order | None = None) -> None:
-        """Wait for the next HEARTBEAT if the last one is not recent; called before each further command of an order.
+        """Wait for a recent HEARTBEAT before a further command of an order.
 
-        The event loop may have been blocked since the previous command. Without ``order``, nothing was sent yet.
-
-        Raises:
-            OperationRejected: the order has ended meanwhile, or the computer slept since it was given.
-            HeartbeatTimeout: no HEARTBEAT was received for ``MAX_SILENCE_S``.
+        Without ``order``, nothing was sent yet. Raises OperationRejected if the order has ended or the computer slept,
+        and HeartbeatTimeout if there is no HEARTBEAT for ``MAX_SILENCE_S``.
         """
         if order:
             self.raise_if_slept(order)
@@ -124,24 +120,17 @@ class OrderSender:
             self.raise_if_slept(order)
 
     def raise_if_slept(self, order: Order) -> None:
-        """Raise OperationRejected if the computer slept after the order was given: a further step would be too late.
-
-        Steps that only stop the vehicle are never too late.
-        """
+        # A step that only stops the vehicle is never too late.
         if not order.only_stops and self._arbiter.slept_since(order.given_at) > 0:
             raise OperationRejected("the computer slept; the rest of the order was not sent")
 
     def _unanswered(self, error: CommandTimeout, order: Order) -> Exception:
-        """Return the error for a command without an answer: the time-out or, after a takeover, OperationRejected.
-
-        A failsafe that ended the order counts as a takeover, too.
-        """
-        if order.takeover_reason or (order.failsafe and order.end):
+        """Return the error to raise for a command without an answer."""
+        if order.takeover_reason or (order.failsafe and order.end):  # Another party has ended the order.
             return OperationRejected(str(error), reasons=self._session.texts_since(order.given_at))
         return error
 
     async def send_arm(self, order: Order, *, armed: bool, force: bool = False) -> None:
-        """Send the command to arm or disarm."""
         # `ArmCleanup` must not take the ack of an earlier command for the ack of this one.
         self._session.commands.forget_result(MavCmd.COMPONENT_ARM_DISARM)
         params = (float(armed), FORCE if force else 0)
@@ -152,17 +141,14 @@ class OrderSender:
     async def change_mode(
         self, mode: Mode, order: Order, timeout: float = 6.0, *, reported_since: float = -math.inf
     ) -> None:
-        """Order the mode and wait until a message received after ``reported_since`` reports it.
-
-        If the result of an earlier mode change is unknown, only messages received after the acknowledgement count.
-        """
+        """Order the mode and wait until a message received after ``reported_since`` reports it."""
         started = self._session.connection.now()
         was_in_doubt = self._arbiter.mode_is_in_doubt
         with self._session.refusals_of(MavCmd.DO_SET_MODE) as refusals, self._arbiter.changing_mode():
             # The request is sent up to four times, and all four attempts must fit into the time-out.
             await self.request_mode(mode, order, attempt_timeout=min(1.0, timeout / 4))
             acknowledged_at = self._session.connection.now()
-            if was_in_doubt:
+            if was_in_doubt:  # Earlier reports may be effects of an earlier mode change.
                 reported_since = acknowledged_at
             remaining_s = timeout - (acknowledged_at - started)
             await self.await_mode(mode, order, refusals, remaining_s, reported_since)
@@ -177,10 +163,7 @@ class OrderSender:
         base_mode: int | None = None,
         component_id: int | None = None,
     ) -> None:
-        """Order a mode without waiting for HEARTBEAT to report it.
-
-        Firmware that does not support MAV_CMD_DO_SET_MODE gets one SET_MODE instead, if the order is still valid.
-        """
+        """Order a mode without waiting for HEARTBEAT to report it."""
         request = self._session.autopilot.mode_order(mode)
         if base_mode is not None:
             request = request.replace(base_mode=base_mode, params=(base_mode, *request.params[1:]))
@@ -198,7 +181,8 @@ class OrderSender:
             if error.result != MavResult.UNSUPPORTED or not is_for_autopilot:  # SET_MODE has no target component.
                 raise
             self.raise_if_ended(order)
-            # While the vehicle is silent, a takeover may be unreported, so the older message is not sent.
+            # Firmware that does not support the command gets one SET_MODE instead. While the vehicle is silent, a
+            # takeover may be unreported, so the older message is not sent.
             if not self._arbiter.is_state_recent:
                 raise
             self._session.send(request.legacy(self._session.system_id))
@@ -207,7 +191,7 @@ class OrderSender:
     async def await_mode(
         self, mode: Mode, order: Order, refusals: list[CommandAck], timeout: float, reported_since: float
     ) -> None:
-        """Wait until the mode is reported by a message that arrived after ``reported_since`` and is still recent."""
+        """Wait until a recent message received after ``reported_since`` reports the mode."""
         telemetry = self._session.telemetry
 
         def is_reported() -> bool:
@@ -268,22 +252,22 @@ class OrderSender:
             raise self._session.with_reasons(error, started) from None
 
     async def ensure_mode(self, mode: Mode, order: Order) -> None:
-        """Change the mode, unless a recent HEARTBEAT reports it and no earlier mode change is in doubt."""
+        """Change the mode if it is in doubt, or if no recent HEARTBEAT reports it."""
         is_reported = self._session.telemetry.is_in(mode) and self._session.telemetry.mode.age <= MODE_MAX_AGE_S
         if self._arbiter.mode_is_in_doubt or not is_reported:
             await self.change_mode(mode, order)
 
     def mode_for(self, action: str, purpose: Purpose) -> Mode:
-        """Return the autopilot's mode for this purpose. Raises NotSupported for ``action`` if there is no such mode."""
+        """Return the autopilot's mode for this purpose. Raises NotSupported if there is none."""
         mode = self._session.autopilot.mode_for(purpose, is_vtol=self._session.telemetry.is_vtol)
         if mode is None:
             raise NotSupported(f"{action}: {self._session.autopilot.firmware} has no mode for this action")
         return mode
 
     def mode_failure(self, order: Order, *modes: Mode) -> Callable[[], str | None]:
-        """Return a function that returns a text if the order cannot succeed; None while it may succeed.
+        """Return a function that returns why the order cannot succeed; None while it may succeed.
 
-        The reasons are: the order was superseded, or the vehicle has hit the ground, is disarmed or is not in one of
+        Possible reasons are a newer order, an impact on the ground, disarming, and a mode that is not one of
         ``modes``. The vehicle has three seconds to report one of the modes.
         """
         impact = self.impact_failure(order)
@@ -311,7 +295,7 @@ class OrderSender:
         return failure_reason
 
     def impact_failure(self, order: Order) -> Callable[[], str]:
-        """Return a function that describes an impact on the ground; "" if there is none, or a newer order was given."""
+        """Return a function that describes an impact on the ground; its text is empty if there is none."""
         detector = ImpactDetector(self._session.telemetry)
 
         def failure_reason() -> str:
@@ -322,7 +306,7 @@ class OrderSender:
         return failure_reason
 
     def landing_failure(self, order: Order) -> Callable[[], str | None]:
-        """Like :meth:`mode_failure` with the order's modes, for an order that the vehicle completes by disarming."""
+        """Like :meth:`mode_failure`, for an order that the vehicle completes by disarming."""
         mode_failure, armed = self.mode_failure(order, *order.modes), self._session.telemetry.armed
 
         def failure_reason() -> str | None:
@@ -349,7 +333,7 @@ class OrderSender:
         retries: int | None,
         **options: Any,
     ) -> CommandAck:
-        """Send a raw command of the program by ``send``, a method of `CommandSender`; return the acknowledgement."""
+        """Send a raw command of the program. ``send`` is a method of `CommandSender`."""
         started = self._session.connection.now()
         if retries is None:
             # Only requests are repeated. A repetition would execute any other command twice if only the acknowledgement
@@ -380,7 +364,6 @@ class OrderSender:
 
     @contextmanager
     def _raw_order(self, command: int, modes: Collection[Mode]) -> Iterator[Order]:
-        """Register a raw command as an order. A command that steers supersedes the previous steering order."""
         subjects = CHANGED_BY_COMMAND.get(command, ())
         if subjects and subjects != ARM_ALONE:
             yield self._arbiter.raw_order(subjects, modes=modes)

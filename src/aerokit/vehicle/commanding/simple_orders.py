@@ -51,7 +51,7 @@ class Argument(Snapshot):
     above: bool = False
 
     def check(self, value: float) -> float:
-        """Return the value; raise InvalidArgument if it is out of range."""
+        """Return the value. Raises InvalidArgument if it is out of range."""
         check_range(self.name, value, self.minimum, self.maximum, above=self.above)
         return float(value)
 
@@ -89,7 +89,7 @@ class SimpleOrder(Snapshot):
             )
 
     def wire_params(self, *values: float) -> tuple[float, ...]:
-        """Return the parameters of the command; raise InvalidArgument if a value is out of range."""
+        """Return the parameters of the command. Raises InvalidArgument if a value is out of range."""
         remaining_values = iter(values)
         return tuple(
             param.check(next(remaining_values)) if isinstance(param, Argument) else param for param in self.params
@@ -183,7 +183,7 @@ class SimpleOrder(Snapshot):
         target: int,
         timeout: float,
     ) -> None:
-        """Request the message until it reports the effect; return early if the vehicle does not have this message.
+        """Request the message until it reports the effect. Returns early if the vehicle does not have it.
 
         ``target`` is the id of the component that sends the message.
         """
@@ -200,7 +200,6 @@ class SimpleOrder(Snapshot):
                 is_reported = is_reported or effect.is_reported(message, *values)
 
         def poll_effect() -> bool:
-            """Return True once the effect is reported; until then, request the message every EFFECT_POLL_S."""
             nonlocal requested_at
             if not is_reported and session.connection.now() - requested_at >= EFFECT_POLL_S:
                 requested_at = session.connection.now()
@@ -224,12 +223,11 @@ class SimpleOrder(Snapshot):
 
 
 def _supersession(order: Order | None) -> str | None:
-    """Return the part of an error text that says that a newer order has replaced this order; None if none has."""
     return SUPERSEDED if order is not None and not order.is_newest else None
 
 
 async def _has_message(context: VehicleContext, message_id: int, component_id: int) -> bool:
-    """Request a message; return False if the vehicle refuses, because then it probably does not have it."""
+    """Request a message. Returns False if the vehicle refuses."""
     with suppress(CommandTimeout):  # A vehicle that does not answer may still have the message.
         try:
             await context.session.commands.send_long(
@@ -243,10 +241,7 @@ async def _has_message(context: VehicleContext, message_id: int, component_id: i
 async def receive_once(
     context: VehicleContext, message_type: type[MessageT], component_id: int | None = None
 ) -> MessageT | None:
-    """Request one message and return it; None if the vehicle refuses, or sends nothing after three requests.
-
-    After each request, it waits up to 0.5 s for the acknowledgement, and then up to 0.5 s for the message.
-    """
+    """Request one message. Returns None if the vehicle refuses or does not send it."""
     session = context.session
     target = session.component_id if component_id is None else component_id
     with session.connection.subscribe(message_type, system_id=session.system_id, capacity=8) as messages:

@@ -123,7 +123,6 @@ class StickStream(SteeringStream[StickInput]):
         return self._chosen_mode or self._context.sender.mode_for("sticks", "sticks")
 
     async def _check_support(self) -> None:
-        """Read the parameters that decide whether the vehicle accepts stick positions, and raise if it ignores them."""
         if self._session.autopilot.name == "PX4":
             source = (await known_values(self._probe, "COM_RC_IN_MODE")).get("COM_RC_IN_MODE")
             if source in (RC_ONLY, DISABLED):
@@ -153,7 +152,6 @@ class StickStream(SteeringStream[StickInput]):
             raise OperationRejected("sticks: bit 1 of RC_OPTIONS makes ArduPilot ignore overrides; clear this bit")
 
     def _message_of(self, sticks: StickInput) -> Message:
-        """Return the MANUAL_CONTROL for these positions; raise InvalidArgument if one of them is out of range."""
         for name in ("forward", "right", "throttle", "yaw"):
             check_range(name, getattr(sticks, name), -1, 1)
         check_range("buttons", sticks.buttons, 0, MAX_BUTTONS)
@@ -175,7 +173,6 @@ class StickStream(SteeringStream[StickInput]):
         self._has_sent = True
 
     def _release(self) -> None:
-        """Release the channels to the transmitter; does nothing for PX4, which has no message for that."""
         if not self._has_sent or self._rules is None or not self._session.connection.is_open:
             return
         self._has_sent = False
@@ -190,6 +187,6 @@ class StickStream(SteeringStream[StickInput]):
             unchanged_count = 18 - SUB_CHANNELS
             values = [RELEASED] * 8 + [RELEASED_UPPER] * released_upper_count + [UNCHANGED] * unchanged_count
             message = RcChannelsOverride(self._session.system_id, self._session.component_id, *values)
-        if message is not None:
+        if message is not None:  # PX4 has no message that releases the sticks.
             with contextlib.suppress(AerokitError):  # The overrides expire by themselves.
                 self._session.connection.send(message)

@@ -105,7 +105,7 @@ class ValueStream(Generic[ValueT]):
         self._replace_value(value)
 
     async def _supply_for(self, value: ValueT, duration_s: float) -> None:
-        """Supply the same value repeatedly for ``duration_s`` seconds, so that it does not expire in this time."""
+        """Supply the value for ``duration_s`` seconds, so that it does not expire in this time."""
         until = self._now() + duration_s
         while (remaining_s := until - self._now()) > 0:
             self._set(value)
@@ -119,9 +119,8 @@ class ValueStream(Generic[ValueT]):
     # ---------------------------------------------------------------------------- the stream
 
     def _replace_value(self, value: ValueT) -> None:
-        """Replace the value. It is encoded at once, so that an invalid value is refused here, not when it is sent."""
         message = self._encode(value)
-        message.encode()
+        message.encode()  # An invalid value is refused here, and not when it is sent.
         self._value = value
         self._message = message
         self._set_at = self._now()
@@ -132,7 +131,7 @@ class ValueStream(Generic[ValueT]):
         self._tick(self._now())
 
     def _tick(self, due: float) -> None:
-        """Send the value once more, or stop the stream; ``due`` is the time for which this call was scheduled."""
+        """Send the value once more, or stop the stream. This call was scheduled for the time ``due``."""
         self._timer = None
         if reason := self._takeover_reason():
             self._stop(reason, hold=False)
@@ -155,11 +154,11 @@ class ValueStream(Generic[ValueT]):
         self._session.connection.send(self._message)
 
     def _takeover_reason(self) -> str | None:
-        """Return a text if a pilot, a failsafe or another program took over, else None."""
+        """Return a text if another party took over."""
         return None
 
     def _stop_reason(self, lag: float) -> str | None:
-        """Return a text if the stream must stop, or None; ``lag`` is the delay of this tick in seconds."""
+        """Return a text if the stream must stop. ``lag`` is the delay of this tick in seconds."""
         # A value does not expire while the mode is changed, because the program cannot supply values then.
         age = 0.0 if self._is_changing_mode else self._now() - self._set_at
         slept_s = self._session.connection._slept_since(self._began_sending_at)
@@ -175,7 +174,6 @@ class ValueStream(Generic[ValueT]):
         return None
 
     def _stop(self, reason: str, *, hold: bool = True) -> None:
-        """Stop the stream for this reason; with ``hold``, order the vehicle to hold."""
         self._end()
         is_state_recent = self._context.arbiter.is_state_recent
         hold_text = "a hold was ordered" if is_state_recent else "a hold will be ordered after the next HEARTBEAT"
@@ -186,14 +184,13 @@ class ValueStream(Generic[ValueT]):
         )
 
     def _hold(self) -> bool:
-        """Order the vehicle to hold, without waiting; return True if the order was sent."""
+        """Order the vehicle to hold, without waiting. Returns False if no hold was ordered."""
         return False
 
     def _release(self) -> None:
         """End the effect of the last value, if the vehicle would otherwise keep executing it."""
 
     def _end(self) -> None:
-        """Stop sending."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -232,11 +229,11 @@ class SteeringStream(ValueStream[ValueT]):
         return self._session.autopilot.setpoints.stream_before_mode
 
     def _stream_mode(self) -> Mode:
-        """Return the mode in which the vehicle executes the values; raise NotSupported if there is no such mode."""
+        """Return the mode in which the vehicle executes the values. Raises NotSupported if there is none."""
         raise NotImplementedError
 
     async def _check_support(self) -> None:
-        """Before any value is sent, raise if the vehicle would ignore the values."""
+        """Raise if the vehicle would ignore the values. Called before any value is sent."""
 
     async def __aenter__(self) -> Self:
         """Give the steering order, change to the stream's mode, and begin to send the initial value."""
@@ -284,7 +281,6 @@ class SteeringStream(ValueStream[ValueT]):
             raise self._stop_error
 
     async def _leave(self, exc: BaseException | None) -> None:
-        """End the running stream when its `async with` block is left: make the vehicle hold."""
         self._end()
         self._stop_error = SetpointStreamStopped(f"the async with block of this {self._NAME} was left")
         if exc is not None:  # An exception leaves the block at once, without waiting for the confirmation of the hold.
@@ -307,11 +303,7 @@ class SteeringStream(ValueStream[ValueT]):
                 raise
 
     async def _enter(self, mode: Mode, order: Order) -> None:
-        """Change the mode, and begin to send values.
-
-        ArduPilot accepts values once it is in the mode. PX4 enters the mode only while it receives values.
-        """
-        if self._needs_stream_before_mode:
+        if self._needs_stream_before_mode:  # PX4 enters the mode only while it receives values.
             self._begin_sending()
             await self._supply_for(self._value, LEAD_TIME_S)
             self._is_changing_mode = True
@@ -368,15 +360,12 @@ class TakeoverCheck:
         self._end_of_take_off = (take_off_mode, hold_mode)
 
     def raise_if_changed(self, operation: str) -> None:
-        """Raise OperationRejected if an order was given, or if the mode was changed.
-
-        Two mode changes are allowed: to the mode that the caller wants to order, and from the take-off mode to the hold
-        mode, as at the end of a take-off.
-        """
+        """Raise OperationRejected if an order was given, or if the mode was changed."""
         if self._arbiter.latest(STEERING) is not self._order_before:
             raise OperationRejected(f"{operation}: {SUPERSEDED} before anything was ordered")
         before, mode = self._mode_before, self._telemetry.mode.latest
         is_unchanged = before is None or mode == before
+        # The end of a take-off, and a change to the mode that the caller wants to order, are not takeovers.
         is_end_of_take_off = (before, mode) == self._end_of_take_off
         if is_unchanged or mode == self._next_mode or is_end_of_take_off:
             return
@@ -384,7 +373,7 @@ class TakeoverCheck:
 
 
 async def known_values(probe: Probe, *names: str) -> dict[str, float]:
-    """Return the values of those parameters that the vehicle has; raise ParameterTimeout if it does not answer."""
+    """Return the values of those parameters that the vehicle has. Raises ParameterTimeout without an answer."""
     answers = await probe(*names)
     for answer in answers.values():
         if isinstance(answer, ParameterTimeout):

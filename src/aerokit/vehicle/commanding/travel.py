@@ -155,10 +155,10 @@ class TravelActions(VehicleBase):
     async def _send_target(
         self, order: Order, place: dict[str, Any], yaw: float, speed_m_s: float | None
     ) -> SetPositionTargetGlobalInt | None:
-        """Send MAV_CMD_DO_REPOSITION; return None if it was acknowledged.
+        """Send MAV_CMD_DO_REPOSITION. Returns None if it was acknowledged.
 
-        A vehicle that does not support the command gets a SET_POSITION_TARGET_GLOBAL_INT. This message is returned,
-        because it must be repeated on the way: the vehicle does not acknowledge it.
+        A vehicle that does not support the command gets a SET_POSITION_TARGET_GLOBAL_INT. The vehicle does not
+        acknowledge this message, so it is returned and must be repeated on the way.
         """
         # -1 leaves the speed to the vehicle.
         speed = speed_m_s if speed_m_s is not None and self._speeds_by_reposition else -1
@@ -202,20 +202,15 @@ class TravelActions(VehicleBase):
         timeout: float | None,
         max_silence_s: float | None,
     ) -> None:
-        """Wait for the arrival. Meanwhile, repeat ``unacknowledged_target``, see :meth:`_send_target`."""
         started = self.connection.now()
         sent_at = started  # when `unacknowledged_target` was last sent
 
         def resend_if_due() -> None:
-            """Send the target again if RESEND_INTERVAL_S has passed since the last transmission.
-
-            It is not sent while the state is not recent, or after the order has ended. Once the computer has slept, it
-            is never sent again, because it would be too late.
-            """
             nonlocal sent_at
             now = self.connection.now()
             if unacknowledged_target is None or now - sent_at < RESEND_INTERVAL_S:
                 return
+            # Once the computer has slept, the target is never sent again, because it would be too late.
             if self._arbiter.is_state_recent and not order.end and not self._arbiter.slept_since(sent_at):
                 sent_at = now
                 self.connection.send(unacknowledged_target)
@@ -323,7 +318,6 @@ class TravelActions(VehicleBase):
         order: Order,
         mode: Mode,
     ) -> None:
-        """Wait until a heading received after this call is within ``tolerance_deg`` of ``goal_deg``."""
         started = self.connection.now()
         heading = self.telemetry.heading_deg
 
@@ -402,7 +396,7 @@ class TravelActions(VehicleBase):
         return self.autopilot.reposition is not None and self.autopilot.reposition.yaw
 
     def _reposition_yaw(self, heading_deg: float | None) -> float:
-        """Return the yaw of MAV_CMD_DO_REPOSITION in radians; NaN leaves the yaw to the autopilot."""
+        """Return the yaw in radians. NaN leaves the yaw to the autopilot."""
         if heading_deg is None or not self._turns_by_reposition:
             return math.nan
         return math.remainder(math.radians(heading_deg), 2 * math.pi)
@@ -447,7 +441,7 @@ class LookActions(VehicleBase):
         await self._send_roi(MavCmd.DO_SET_ROI, *params_1_to_4, place["x"] * 1e-7, place["y"] * 1e-7, above_home_m)
 
     async def _set_roi_location(self, place: dict[str, Any]) -> bool:
-        """Send MAV_CMD_DO_SET_ROI_LOCATION; return False if the firmware does not support it as COMMAND_INT."""
+        """Return False if the firmware does not support the command as COMMAND_INT."""
         with self._new_roi_order() as order:
             try:
                 await self._sender.run_command(order, self._session.commands.send_int, ROI_LOCATION, **place)
@@ -466,7 +460,6 @@ class LookActions(VehicleBase):
         return True
 
     async def _send_roi(self, command: int, *params: float) -> None:
-        """Send a command about the region of interest. Its order ends only earlier orders about the region."""
         with self._new_roi_order() as order:
             await self._sender.send_long(order, command, *params)
 
@@ -477,7 +470,7 @@ class LookActions(VehicleBase):
 
     @staticmethod
     def _raise_if_superseded(order: Order) -> None:
-        """Raise if the order has ended. A takeover does not count, because a ROI applies in any mode."""
+        # A takeover does not count, because a ROI applies in any mode.
         if order.end and not order.takeover_reason:
             raise OperationRejected(f"{order.end}; the rest of the order was not sent")
 

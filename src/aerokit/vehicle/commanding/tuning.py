@@ -89,7 +89,7 @@ class TuningActions(VehicleBase):
             detach()
 
     async def _poll(self, answers: list[CommandAck]) -> CommandAck:
-        """Send the command once; return PX4's answer, which has the progress. `answers` gets each COMMAND_ACK."""
+        """Send the command once, and return PX4's answer. ``answers`` collects every COMMAND_ACK."""
         self._session.end.raise_if_ended()
         answers.clear()
         self._session.commands.send_unconfirmed(MavCmd.DO_AUTOTUNE_ENABLE, 1)

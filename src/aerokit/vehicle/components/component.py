@@ -341,7 +341,6 @@ METADATA_TYPES = {metadata_type.name.lower(): int(metadata_type) for metadata_ty
 
 
 async def _general_uri(component: Component, timeout: float) -> str:
-    """Return the address of the general metadata, from COMPONENT_METADATA or the older COMPONENT_INFORMATION."""
     try:
         return (await component.request(m.ComponentMetadata, timeout=timeout)).uri
     except CommandRejected:  # The component may only support COMPONENT_INFORMATION.
@@ -355,7 +354,6 @@ async def _general_uri(component: Component, timeout: float) -> str:
 
 
 async def _read_json(component: Component, uri: str) -> dict[str, Any]:
-    """Read a metadata file by MAVFTP, decompress it if necessary, and return its JSON object."""
     if uri.lower().startswith(WEB_SCHEMES):
         raise NotSupported(f"{uri} is on the web, not on the vehicle: download it with another program")
     try:
@@ -408,7 +406,7 @@ class Components:
                 self._on_heartbeat(heartbeat)
 
     def component(self, component_id: int) -> Component:
-        """Return the object for a component id, always the same object. The component need not have been discovered."""
+        """Return the object for a component id. The component need not have been discovered."""
         if not 1 <= component_id <= 255:
             raise InvalidArgument(f"component_id = {component_id} is not allowed: it must be 1 to 255")
         if component_id not in self._by_id:
@@ -416,12 +414,11 @@ class Components:
         return self._by_id[component_id]
 
     def _new(self, component_id: int) -> Component:
-        """Create a component with a session of its own; the autopilot shares the session of the vehicle."""
         from aerokit.vehicle.files.files import Files
         from aerokit.vehicle.parameters.parameters import Parameters
 
         sender = self._context.sender
-        if component_id == self._session.component_id:
+        if component_id == self._session.component_id:  # The autopilot shares the session of the vehicle.
             return Component(self._session, sender, self._files, self._parameters, self.component)
         session = ComponentSession(self._session, component_id)
         files = Files(session.transfers)
@@ -433,8 +430,6 @@ class Components:
             self._record(frame, device_id=0, kind=kind_of(heartbeat, frame.component_id))
 
     def _device_listener(self, id_field: str, kind: str) -> Callable[[Any], None]:
-        """Return a callback that records the device whose id is in ``id_field`` of a message."""
-
         def on_message(message: Any) -> None:
             device_id, frame = getattr(message, id_field), message.received_frame
             if frame is not None and device_id in DEVICE_IDS:
