@@ -163,7 +163,7 @@ class CameraDefinition(Snapshot):
         return options
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
-        """Return the options that a setting has now, and what restricts them, e.g. ``CAM_EXPMODE = Auto``."""
+        """Return a setting's present options, and what restricts them, e.g. ``CAM_EXPMODE = Auto``."""
         options = self.settings[name].options if name in self.settings else ()
         reasons: list[str] = []
         for setting, selected in self._selected(values):
@@ -255,7 +255,10 @@ def parse_definition(data: bytes, source: str = "camera definition") -> CameraDe
 def _check_option(
     setting: SettingDefinition, value: object, options: tuple[SettingOption, ...], restricted_by: list[str]
 ) -> SettingValue:
-    """Return the value of the option that has this name or value; raise InvalidArgument if there is none."""
+    """Return the value of the option with this name or value.
+
+    Raises InvalidArgument if there is none.
+    """
     by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
@@ -276,10 +279,7 @@ def _check_option(
 
 
 def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
-    """Return the value in the setting's type; raise InvalidArgument if it is not allowed.
-
-    It must be in range. An integer must also be a multiple of the step, counted from the minimum.
-    """
+    """Return the value in the setting's type. Raises InvalidArgument if it is not allowed."""
     number = checked_setting(setting.name, value, setting.wire_type)
     if isinstance(number, (str, bytes)):
         return number
@@ -294,6 +294,7 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
     if is_below or is_above:
         lowest, highest = ("" if limit is None else f"{limit:g}" for limit in (low, high))
         raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: it must be {lowest}..{highest}")
+    # An integer must be a multiple of the step, counted from the minimum.
     if isinstance(number, int) and isinstance(step, int) and step > 1:
         first = low if isinstance(low, int) else 0
         if (number - first) % step:
@@ -343,7 +344,7 @@ def _evaluate(condition: str, values: Values) -> bool:
 
 
 def _compare(value: SettingValue, operator: str, text: str) -> bool:
-    """Evaluate one test. Texts can be compared by = and != only; comparing a number with a text gives False."""
+    """Evaluate one test. Comparing a number with a text gives False."""
     if isinstance(value, (str, bytes)):
         if operator not in ("=", "!="):
             return False
@@ -396,7 +397,7 @@ class _Reader:
         )
 
     def _setting(self, node: Element) -> SettingDefinition | None:
-        """Read one ``<parameter>`` element; return None if its name or type is invalid."""
+        """Read one ``<parameter>`` element. Return None if its name or type is invalid."""
         name, kind = node.get("name", ""), node.get("type", "")
         if not _is_name(name) or kind not in TYPES:
             return None
@@ -419,7 +420,6 @@ class _Reader:
         )
 
     def _options(self, nodes: Iterable[Element], wire_type: int) -> Iterator[SettingOption]:
-        """Yield those options of a setting whose values are valid for the setting's type."""
         for node in nodes:
             value = _parse_value(node.get("value"), wire_type)
             if value is not None:
@@ -462,7 +462,7 @@ def _is_name(name: str) -> bool:
 
 
 def _number(text: str | None) -> int | float | None:
-    """Parse a number; return None if there is none, or it is not finite."""
+    """Parse a finite number. Return None for anything else."""
     try:
         number = None if text is None else parse_number(text.strip())
         return None if number is None or not math.isfinite(number) else number
@@ -476,7 +476,7 @@ def _int_or_zero(text: str) -> int:
 
 
 def _parse_value(text: str | None, wire_type: int) -> SettingValue | None:
-    """Parse a value of this MAV_PARAM_EXT_TYPE; return None if it is missing or does not fit."""
+    """Parse a value of this MAV_PARAM_EXT_TYPE. Return None if it does not fit."""
     value: object = text if wire_type == MavParamExtType.CUSTOM else _number(text)
     try:
         return None if value is None else checked_setting("", value, wire_type)

@@ -247,7 +247,6 @@ def _range(text: str) -> tuple[float | None, float | None]:
 
 # ------------------------------------------------------------------------------------------- PX4
 def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
-    """Yield the parameters of PX4's parameters.xml."""
     for group in root.iter("group"):
         for param in group.iter("parameter"):
             values: Mapping[float, str] = _names_by_number(
@@ -275,7 +274,6 @@ def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 
 def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
-    """Convert one entry of PX4's parameters.json."""
     return ParameterMetadata(
         _text(entry["name"]),
         short_description=_text(entry.get("shortDesc", "")),
@@ -308,7 +306,7 @@ def _int_or_none(value: Any) -> int | None:
 
 
 def _number(value: Any) -> int | float | None:
-    """Parse a number; return None for anything else."""
+    """Parse a number. Return None for anything else."""
     if not isinstance(value, (int, float, str)):
         return None
     try:

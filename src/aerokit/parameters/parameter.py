@@ -279,9 +279,9 @@ _FLOAT = _STRUCTS[MavParamExtType.REAL32]
 
 
 def setting_key(value: SettingValue) -> object:
-    """Return a key that is the same for values that are equal according to :func:`settings_equal`.
+    """Return the same key for values that are equal according to :func:`settings_equal`.
 
-    There is one exception: an int beyond ±2**24 may equal a float according to that function, but have another key.
+    An int beyond ±2**24 may have another key than a float to which it is equal.
     """
     if isinstance(value, (str, bytes)):
         return _encoded(value)
