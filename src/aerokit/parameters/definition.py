@@ -255,10 +255,6 @@ def parse_definition(data: bytes, source: str = "camera definition") -> CameraDe
 def _check_option(
     setting: SettingDefinition, value: object, options: tuple[SettingOption, ...], restricted_by: list[str]
 ) -> SettingValue:
-    """Return the value of the option with this name or value.
-
-    Raises InvalidArgument if there is none.
-    """
     by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
@@ -279,7 +275,6 @@ def _check_option(
 
 
 def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
-    """Return the value in the setting's type. Raises InvalidArgument if it is not allowed."""
     number = checked_setting(setting.name, value, setting.wire_type)
     if isinstance(number, (str, bytes)):
         return number
@@ -397,7 +392,6 @@ class _Reader:
         )
 
     def _setting(self, node: Element) -> SettingDefinition | None:
-        """Read one ``<parameter>`` element. Return None if its name or type is invalid."""
         name, kind = node.get("name", ""), node.get("type", "")
         if not _is_name(name) or kind not in TYPES:
             return None
@@ -431,7 +425,6 @@ class _Reader:
                 )
 
     def _ranges(self, nodes: Iterable[Element]) -> Iterator[SettingRange]:
-        """Yield the valid restrictions that an option imposes on other settings."""
         for node in nodes:
             setting = node.get("parameter", "")
             wire_type = self._types.get(setting)

@@ -142,7 +142,6 @@ def _with_exact_bits(message: _M, exact_type: type[_ExactParamSet] | type[_Exact
 
 
 def _exact_bits(message: ParamSet | ParamValue) -> bytes:
-    """Return the bytes of ``param_value``."""
     if isinstance(message, (_ExactParamSet, _ExactParamValue)):
         return message.bits
     if message.received_frame is None:

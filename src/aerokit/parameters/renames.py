@@ -202,7 +202,6 @@ def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
 
 
 def _is_mask(value: float) -> bool:
-    """Return True if a value is an integer of 32 bits."""
     # Another value cannot be converted to the opposite mask.
     return -(2**31) <= value < 2**31 and value == int(value)
 

@@ -153,7 +153,6 @@ class FileChannel:
         raise AssertionError("the loop returns or raises")
 
     async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
-        """Open a file. Wait once if another session is in the way."""
         may_wait = True
         may_be_own_session = True
         while True:
@@ -201,7 +200,6 @@ class FileChannel:
         return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
-        """Close a session and wait for the confirmation."""
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, idle_timeout_s)
         try:
             await self.transfers.run(request)
@@ -224,7 +222,6 @@ class FileChannel:
             await self.transfers.run(request)
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
-        """Wait until a session of `_close_soon` is closed."""
         request, task = self._closing[session]
         await asyncio.wait((task,))
         if not request.is_answered:

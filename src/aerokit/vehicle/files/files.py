@@ -361,7 +361,6 @@ class Files:
         await self._transfers.run(transfer)
 
     async def _verify(self, path: str, data: bytes, idle_timeout_s: float) -> None:
-        """Raise VerificationFailed if the vehicle computes another CRC-32 for its file."""
         own_crc = _crc32(data)
         try:
             reply = await self._channel.request(MavFtpOpcode.CALCFILECRC, path, idle_timeout_s=idle_timeout_s)

@@ -81,7 +81,6 @@ class UlogAssembler:
         return prefix + self._pop_complete()
 
     def _pop_complete(self) -> bytes:
-        """Remove and return the complete ULog messages."""
         end = 0
         while len(self._buffer) >= end + 3:
             # A ULog message has 2 bytes of length, 1 byte of type, and the content.

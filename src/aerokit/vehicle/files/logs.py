@@ -333,7 +333,6 @@ def _entry_of(log: LogMessage | ListedLog) -> LogEntry:
 
 
 def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
-    """Return True if two entries with the same id cannot be of the same log."""
     # A log grows while it is written. If it is smaller or much older than before, it is another log.
     if new.size < old.size:
         return True
@@ -425,7 +424,6 @@ async def listed_logs(
 
 
 async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -> tuple[ListedLog, ...]:
-    """Read PX4's list file. Return an empty tuple if there is none."""
     root = directory.rpartition("/")[0]
     try:
         text = await files.read(f"{root}/{PX4_LIST}", idle_timeout_s=idle_timeout_s)

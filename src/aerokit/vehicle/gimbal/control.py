@@ -111,7 +111,6 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
-        """Wait for the ack of the command that was just sent."""
         with self._orders.context.arbiter.auxiliary_order() as order:
             await self._orders.context.sender.send_long(
                 order,
@@ -346,7 +345,6 @@ class GimbalControl:
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 
     def _finish(self) -> None:
-        """Release control without waiting, because the vehicle's block ends."""
         release = self._release_command()
         self._end()
         release.send_soon()

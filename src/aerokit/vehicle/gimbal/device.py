@@ -253,7 +253,6 @@ class GimbalDevice:
             self._status_ms = 0  # The time stamps of the new manager are from another clock.
 
     def reset(self) -> None:
-        """Forget what the gimbal and its manager have reported before a reboot."""
         self.reboots += 1
         self._status_ms = 0
         self._manager_rank = 0
@@ -285,7 +284,6 @@ class ControlRequest:
         self.must_release = False
 
     def is_released_with(self, other: ControlRequest) -> bool:
-        """Return True if one command releases the control of both requests."""
         has_same_role = (self.manager_id, self.is_primary) == (other.manager_id, other.is_primary)
         is_same_gimbal = self.gimbal_id_param == other.gimbal_id_param
         is_for_all_gimbals = 0 in (self.gimbal_id_param, other.gimbal_id_param)

@@ -76,7 +76,6 @@ class GimbalRegistry:
         return (not device.is_in_use and self._is_device_gone(device), device.key)
 
     def silent_for_s(self, component_id: int) -> float:
-        """Return the seconds since the last message of a component, or inf if there was none."""
         return self._session.connection.now() - self._received_at.get(component_id, -math.inf)
 
     def _is_device_gone(self, device: GimbalDevice) -> bool:

@@ -68,21 +68,18 @@ class GimbalOrders:
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        """The device that has the gimbal's attitude."""
         # Until a gimbal reports its attitude, the placeholder has it.
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 
     @property
     def manager_id(self) -> int:
-        """Component id that orders are sent to."""
         manager_id = self.device.manager_id
         # The autopilot counts as the manager until one is known.
         return self.session.component_id if manager_id is None else manager_id
 
     @property
     def gimbal_id_param(self) -> int:
-        """Gimbal device id for commands."""
         if self._device is None and self.manager_id == self.session.component_id:
             # 0 stands for the first gimbal of an autopilot.
             return 0
@@ -96,18 +93,15 @@ class GimbalOrders:
 
     @property
     def roi_parameter(self) -> int:
-        """Parameter of region-of-interest commands that selects the gimbal."""
         return self.gimbal_id_param if self.rules.roi_per_gimbal else 0
 
     def check_roi(self) -> None:
-        """Raise if region-of-interest commands cannot be sent to this gimbal now."""
         if not self.rules.roi_per_gimbal and self.gimbal_id_param not in (0, 1):
             raise self.not_supported("supports a region of interest for its first gimbal only")
         self.raise_if_taken()
 
     @property
     def own_ids(self) -> tuple[int, int]:
-        """System id and component id of this program."""
         return self.session.connection.source_system, self.session.connection.source_component
 
     @property
@@ -120,7 +114,6 @@ class GimbalOrders:
             await self.context.sender.send_long(sent_order, command, *params, component_id=self.manager_id)
 
     def begin_order(self) -> Order:
-        """Create an order to the gimbal. It supersedes the previous one."""
         return self.context.arbiter.device_order(self.device.topic)
 
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
@@ -156,8 +149,6 @@ class GimbalOrders:
         return True
 
     async def send_roi(self, order: Order, command: int, *params: float, **place: Any) -> None:
-        """Send a region-of-interest command, as COMMAND_INT if it has a position."""
-
         async def send() -> None:
             with self.context.arbiter.auxiliary_order(order) as sent_order:
                 commands = self.session.commands
@@ -234,8 +225,6 @@ class GimbalOrders:
         return heading
 
     def ask_in_background(self, message_id: int) -> None:
-        """Request a message from the manager. Errors are ignored."""
-
         async def ask() -> None:
             with suppress(AerokitError):
                 await self.ask(message_id, self.manager_id)
@@ -243,7 +232,6 @@ class GimbalOrders:
         self.session.background.start(ask, "aerokit gimbal")
 
     async def ask(self, message_id: int, component_id: int, *, attempts: int = 3) -> None:
-        """Request one copy of a message from a component."""
         await self.session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )
@@ -281,7 +269,6 @@ class GimbalOrders:
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        """Return the parameters that claim or release control."""
         # PX4 takes the value -2 ("the sender") for PX4 itself, so our ids are sent.
         controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
@@ -318,7 +305,6 @@ class GimbalOrders:
 
     @property
     def is_taken(self) -> bool:
-        """True if :meth:`raise_if_taken` would raise."""
         blocks = self.device.control_blocks.values()
         return bool(blocks) and not any(block.is_held for block in blocks)
 

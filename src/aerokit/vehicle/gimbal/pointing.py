@@ -118,7 +118,6 @@ class RestTarget:
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Request the attitudes of vehicle and gimbal during a `with` block."""
     session = orders.session
     with ExitStack() as requests:
         # The vehicle's attitude is needed to convert yaw angles.
@@ -173,7 +172,6 @@ async def wait_until_reached(
 
 
 def _describe_state(orders: GimbalOrders, since: float) -> str:
-    """Describe the gimbal for an error text. The order was given at ``since``."""
     source, device = orders.attitude_source, orders.device
     attitude = source.attitude
     if not attitude.is_known:

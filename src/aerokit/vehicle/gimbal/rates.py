@@ -175,7 +175,6 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._stop_error = self._taken
 
     def _zero_rates_command(self) -> ReleaseCommand:
-        """Return the command that stops the gimbal."""
         orders, order = self._orders, self._order
         no_angles, zero_rates, reserved = (NAN, NAN), (0.0, 0.0), 0
         params = (*no_angles, *zero_rates, self._flags, reserved, orders.gimbal_id_param)

@@ -125,7 +125,6 @@ class PlanContext:
         return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
-        """Wait for a MISSION_CURRENT with this plan id. Return False if none arrives in time."""
         received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:
@@ -237,7 +236,6 @@ class MissionTracker:
         self.discard_completion()
 
     def discard_completion(self) -> None:
-        """Forget that the mission is complete, if it is not being flown."""
         if not self._was_active:
             self.is_complete = False
             # Reports of completion are about the previous flight until then.

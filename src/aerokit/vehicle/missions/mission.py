@@ -183,7 +183,6 @@ class MissionEndDetector:
         return f"the vehicle is not flying its mission but is in {session.telemetry.mode_name}"
 
     def describe(self) -> str:
-        """Return e.g. ``at item 3 of 7``."""
         current, count = self._tracker.current.latest, self._tracker.count.latest
         place = "before its first item" if current is None else f"at item {current}"
         return f"{place} of {'?' if count is None else count}"

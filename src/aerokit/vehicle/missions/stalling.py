@@ -79,7 +79,6 @@ class MissionStallDetector:
         return self._stall(MISSION_STALL_TIMEOUT_S) if is_late else None
 
     def _should_move(self, current: int | None) -> bool:
-        """Return True if the vehicle flies its mission and the current item requires movement."""
         if current is None or current >= len(self._items):
             return False
         if self._tracker.is_complete or not self._session.telemetry.is_in(self._mode):

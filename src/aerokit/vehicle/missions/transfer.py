@@ -78,7 +78,6 @@ class PlanChannel:
         return result
 
     async def receive(self, only: Sequence[int] | None = None) -> DownloadResult:
-        """Request all items, or only those with the numbers in ``only``."""
         received = await self._run(
             MissionDownload(
                 *self._target,
@@ -140,7 +139,6 @@ class PlanChannel:
     async def _new_upload(
         self, items: Sequence[MissionItem], *, window: int, first_seq: int | None = None
     ) -> MissionUpload:
-        """Create an upload of these items. ``first_seq`` is None for a whole plan."""
         return MissionUpload(
             *self._target,
             items,
@@ -271,7 +269,6 @@ class PlanTransfer(Generic[PlanT]):
             raise self._mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
-        """Read the plan into the cache, and return it."""
         while True:
             changes = self._cache.changes
             items, plan_id = await self._receive(method)

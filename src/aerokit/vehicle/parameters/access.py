@@ -69,7 +69,6 @@ class ParameterAccess:
 
     @property
     def _read_round_trip(self) -> RoundTrip:
-        """Estimate of the time from a read to its answer."""
         if self._cached_read_round_trip is None:
             link_s = self._transfers.round_trip.smoothed_s
             # This is longer than the link's round trip, because ArduPilot answers at most five reads every 0.1 s.
@@ -160,7 +159,6 @@ class ParameterAccess:
             raise FileTimeout(f"the vehicle did not answer MAVFTP requests within {timeout_s:.1f} s")
 
     async def has_pack(self) -> bool:
-        """Return True if the vehicle has MAVFTP and has not refused ``@PARAM/param.pck``."""
         if self._has_pack is not None:
             return self._has_pack
         capabilities = await self._transfers.capabilities()
@@ -351,7 +349,6 @@ class ParameterAccess:
             self.store.unmark_replaced(name)
 
     def _recently_written(self) -> set[str]:
-        """Return the names of parameters whose last write may still be answered."""
         # A late answer could be taken for the answer to the next write, so the next write is verified by a read.
         earliest = self._transfers.connection.now() - ECHO_WINDOW_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
@@ -425,7 +422,6 @@ class _CachedList:
         self._hash: int | None = None
 
     async def load_if_current(self, refresh: bool) -> bool:
-        """Load the cached list into the store if its hash is the vehicle's. Return True if it was loaded."""
         store = self._access.store
         key = await self._key()
         updates_before = store.updates

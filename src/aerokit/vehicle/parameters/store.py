@@ -186,7 +186,6 @@ class ParameterCache:
         self.directory: Path = default_directory() if directory is None else Path(directory)
 
     def load(self, vehicle: str, hash_: int) -> ParameterTable | None:
-        """Return the cached list of a vehicle, or None if it has another hash."""
         try:
             content = json.loads(self._path(vehicle).read_text(encoding="utf-8"))
             if (content["format"], content["vehicle"], content["hash"]) != (CACHE_FORMAT, vehicle, hash_):
@@ -214,7 +213,6 @@ class ParameterCache:
 
 
 def vehicle_key(autopilot: str, system_id: int, version: AutopilotVersion | None) -> str:
-    """Return the file name for a vehicle, made from its hardware id and its firmware."""
     # Without a hardware id, the system id identifies the vehicle.
     unit = f"uid-{version.uid:016x}" if version is not None and version.uid else f"system-{system_id}"
     firmware = "unknown" if version is None else f"{version.firmware}-{version.git_hash}"

@@ -123,7 +123,6 @@ class NameResolver:
         return to_read
 
     def _resolve_one(self, name: str, answers: Mapping[str, ParameterAnswer]) -> ResolvedParameter | ParameterFailure:
-        """Find the parameter by any of its names, in the answers or in the store."""
         direct = answers.get(name, self._access.store.get(name))
         if isinstance(direct, Parameter):
             return ResolvedParameter(name, direct, is_fresh=name in answers)
@@ -199,7 +198,6 @@ def _failed_write(name: str, requested: float, known: Parameter | None, error: A
 
 
 def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
-    """Return the outcome of a write, or the error if the write failed."""
     if not isinstance(answer, Parameter):
         return answer
     is_old_value = old is not None and same_value(old.value, answer.value)
@@ -327,7 +325,6 @@ class ParameterWriter:
         return plans, errors
 
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
-        """Return the result of one write, with the name and the unit of the request."""
         name, requested = plan.resolved.requested, plan.requested
         answer = answers[plan.to_send.name]
         outcome = outcome_of(plan.to_send, plan.old, answer)

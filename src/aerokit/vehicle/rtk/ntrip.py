@@ -120,7 +120,6 @@ class _Response:
 
     @classmethod
     async def read(cls, reader: asyncio.StreamReader) -> _Response:
-        """Read the status line and the headers."""
         status = (await reader.readline()).decode("latin-1").strip()
         headers: dict[str, str] = {}
         # In NTRIP 1, the data follow "ICY 200 OK" at once or after an empty line. RtcmReader skips that line.
@@ -309,7 +308,6 @@ class NtripClient:
     # -------------------------------------------------------------------------------------- caster
 
     async def _open(self, mount: str) -> _Response:
-        """Request a mount point. Raises OperationRejected if the caster refuses."""
         response = await self._request(mount)
         if response.is_stream:
             return response

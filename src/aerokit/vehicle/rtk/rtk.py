@@ -136,7 +136,6 @@ class Rtk:
         return NtripClient(self._session, self._send, Caster.parse(url), send_position, timeout)
 
     def _send(self, message: bytes) -> None:
-        """Send one RTCM message and update the statistics."""
         if self._session.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
         # One transmission reaches all vehicles of the connection, so this sends nothing if the object of another

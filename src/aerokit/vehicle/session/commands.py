@@ -163,7 +163,6 @@ class CommandSender:
         return is_addressed_to(ack, self._connection.source_system, self._connection.source_component)
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
-        """Return the last MAV_RESULT received for this command, or None."""
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
     def is_unsupported(self, command: int, component_id: int | None = None) -> bool:
@@ -256,7 +255,6 @@ class CommandSender:
             self._runs[key].abort(CommandTimeout(text))
 
     def _min_attempt_timeout_s(self) -> float:
-        """Return the minimum time to wait for an ack, which is a few round trips."""
         # A round trip that was measured while the link was stalled would make the wait too long.
         return min(MIN_ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 

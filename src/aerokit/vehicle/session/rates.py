@@ -96,7 +96,6 @@ class _Stream:
         return received_in_window / ((len(self.counts_at_checks) - 1) * WATCH_PERIOD_S)
 
     def mark_requested(self, now: float, hz: float) -> None:
-        """Record that this rate was requested, and restart its measurement."""
         self.requested_hz = hz
         self.counts_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
         self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
@@ -315,7 +314,7 @@ class MessageRates:
         else:
             stream.retry_interval_s = RETRY_INTERVAL_S
             stream.retry_at = self._connection.now() + RETRY_INTERVAL_S
-        self._check_rate(stream)
+        self._publish_if_slow(stream)
 
     def _retry_if_due(self, stream: _Stream) -> None:
         if self._connection.now() >= stream.retry_at:
@@ -323,8 +322,7 @@ class MessageRates:
             stream.requested_hz = None
             self._has_due_streams.set()
 
-    def _check_rate(self, stream: _Stream) -> None:
-        """Publish StreamSlow when a stream becomes slow."""
+    def _publish_if_slow(self, stream: _Stream) -> None:
         if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()

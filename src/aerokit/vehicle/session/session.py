@@ -282,7 +282,6 @@ class VehicleSession:
         )
 
     def is_answer(self, ack: CommandAck, command: int) -> bool:
-        """Return True if this is the autopilot's ack to us for this command."""
         frame = ack.received_frame
         is_from_autopilot = frame is not None and self.telemetry.accepts(frame)
         return is_from_autopilot and ack.command == command and self.commands.is_for_us(ack)

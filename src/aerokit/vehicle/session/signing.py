@@ -49,7 +49,6 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
 
 
 def _check_vehicle(session: VehicleSession) -> None:
-    """Raise if one side uses MAVLink 1, or if the vehicle may be armed."""
     heartbeat = session.connection.heartbeats.get((session.system_id, session.component_id))
     frame = None if heartbeat is None else heartbeat.received_frame
     sends_mavlink_1 = session.connection.mavlink_version == 1

@@ -180,7 +180,6 @@ class Telemetry(States):
         return self._cells[name]
 
     def _time_of_arrival(self) -> float:
-        """Return the arrival time of the message that is being processed."""
         return self._clock() if self._arrived_at is None else self._arrived_at
 
     def _source(self, class_name: str) -> Source:
