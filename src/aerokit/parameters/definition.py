@@ -5,7 +5,6 @@ https://mavlink.io/en/services/camera_def.html
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
@@ -17,7 +16,7 @@ from aerokit._internal.formatting import did_you_mean, short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
-from aerokit.parameters.encoding import parse_number
+from aerokit.parameters.encoding import number_or_none
 from aerokit.parameters.parameter import SettingValue, checked_setting, setting_key, settings_equal
 
 if TYPE_CHECKING:
@@ -345,7 +344,7 @@ def _compare(value: SettingValue, operator: str, text: str) -> bool:
             return False
         is_equal = settings_equal(value, text)
         return is_equal if operator == "=" else not is_equal
-    number = _number(text)
+    number = number_or_none(text)
     if number is None:
         return False
     # Do not use ==, because a value sent as a 32-bit float differs a little from the decimal number in the file.
@@ -403,9 +402,9 @@ class _Reader:
             wire_type,
             description=_text(node.find("description")),
             default=bool(default) if kind == "bool" and default is not None else default,
-            minimum=_number(node.get("min")),
-            maximum=_number(node.get("max")),
-            step=_number(node.get("step")),
+            minimum=number_or_none(node.get("min")),
+            maximum=number_or_none(node.get("max")),
+            step=number_or_none(node.get("step")),
             options=tuple(self._options(node.iterfind("options/option"), wire_type)),
             updates=tuple(filter(_is_name, _texts(node.iterfind("updates/update")))),
             is_control=node.get("control", "1") not in ("0", "false"),
@@ -454,23 +453,14 @@ def _is_name(name: str) -> bool:
     return name.isascii() and name.isprintable() and 0 < len(name) <= MAX_NAME_LENGTH
 
 
-def _number(text: str | None) -> int | float | None:
-    """Parse a finite number. Return None for anything else."""
-    try:
-        number = None if text is None else parse_number(text.strip())
-        return None if number is None or not math.isfinite(number) else number
-    except (ValueError, OverflowError):  # OverflowError means that the number is too large for a float.
-        return None
-
-
 def _int_or_zero(text: str) -> int:
-    number = _number(text)
+    number = number_or_none(text)
     return number if isinstance(number, int) else 0
 
 
 def _parse_value(text: str | None, wire_type: int) -> SettingValue | None:
     """Parse a value of this MAV_PARAM_EXT_TYPE. Return None if it does not fit."""
-    value: object = text if wire_type == MavParamExtType.CUSTOM else _number(text)
+    value: object = text if wire_type == MavParamExtType.CUSTOM else number_or_none(text)
     try:
         return None if value is None else checked_setting("", value, wire_type)
     except InvalidArgument:

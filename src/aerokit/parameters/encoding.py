@@ -194,3 +194,15 @@ def parse_number(text: str) -> int | float:
     if math.isinf(number):  # The text is for example "1e999".
         raise ValueError(text)
     return number
+
+
+def number_or_none(value: object) -> int | float | None:
+    """Parse a number. Return None for anything else."""
+    if not isinstance(value, (int, float, str)):
+        return None
+    try:
+        number = parse_number(str(value).strip())
+        float(number)
+        return number
+    except (ValueError, OverflowError):  # OverflowError means that the number is too large for a float.
+        return None

@@ -180,5 +180,4 @@ class Transfers:
                 await self._version.wait_until(lambda _: True)
             # There is no `request_version` for an autopilot, because its session requests the version until it arrives.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
-        version = self._version.latest
-        return None if version is None else version.capabilities
+        return self.known_capabilities
