@@ -225,7 +225,7 @@ def _select_component(requested: int | None, values: Mapping[int, object], sourc
 
 
 def _add_value(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
-    """Add a parameter. Raises FileFormatError for an invalid value or a second one."""
+    """Add a parameter. Raises FileFormatError for an invalid value or a repeated name."""
     try:
         number = parse_number(text)
     except ValueError:

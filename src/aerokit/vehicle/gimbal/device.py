@@ -231,7 +231,7 @@ class GimbalDevice:
         self.failures = message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
-        """Set the controllers. Return False for a late status (see ``REORDER_WINDOW_MS``)."""
+        """Record the controllers of the gimbal. Return False if the message arrived late."""
         older_by_ms = self._status_ms - message.time_boot_ms
         if 0 < older_by_ms < REORDER_WINDOW_MS:
             return False
@@ -290,7 +290,7 @@ class ControlRequest:
         return has_same_role and (is_same_gimbal or is_for_all_gimbals)
 
     def leave_release_to(self, requests: Iterable[ControlRequest]) -> bool:
-        """Leave the release to other blocks that need the same control. Return False if there are none."""
+        """Let other blocks with the same control release it later. Return False if there are none."""
         shared = [request for request in requests if request is not self and request.is_released_with(self)]
         # Releasing now would take the control from these blocks, so they release it when they end.
         for request in shared:

@@ -399,7 +399,7 @@ class PlanTransfer(Generic[PlanT]):
 
     @staticmethod
     def _is_worthwhile(changed_seqs: Collection[int] | None, count: int) -> bool:
-        """Return True if the parts take fewer messages than all ``count`` items."""
+        """Return True if sending only the changed items takes fewer messages than sending all."""
         if changed_seqs is None:
             return False
         parts = list(_consecutive_ranges(changed_seqs))

@@ -97,7 +97,7 @@ class NameResolver:
         return translated
 
     def without_duplicates(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
-        """Drop the values of parameters that are also given under the name that the vehicle uses."""
+        """Drop each value that is also given under the vehicle's own name of the parameter."""
         from aerokit.parameters.renames import resolve_rename
 
         remaining = {}

@@ -197,7 +197,7 @@ class CommandSender:
         order_status: OrderStatus | None,
         was_just_sent: bool = False,
     ) -> CommandAck:
-        """Send a command and return its ACCEPTED ack. Waits for earlier calls with the same key."""
+        """Send a command and return its ACCEPTED ack. Waits for earlier calls of the same command."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_run_of_ended_order(key)
