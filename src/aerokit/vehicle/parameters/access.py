@@ -344,6 +344,7 @@ class ParameterAccess:
         return answers
 
     def _forget_written(self, names: Iterable[str]) -> None:
+        # The vehicle may have other values from now on.
         for name in names:
             self.written.pop(name, None)
             self.store.unmark_replaced(name)

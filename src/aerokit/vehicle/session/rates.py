@@ -260,6 +260,7 @@ class MessageRates:
             stream.requested_hz = None
 
     def _mark_refused(self, stream: _Stream, hz: float, reason: str) -> None:
+        # Lower rates are requested next, if they are needed.
         stream.refused_hz.add(hz)
         if stream.requested_hz is None or not hz:
             stream.mark_requested(self._connection.now(), AUTOPILOT_DEFAULT)
