@@ -277,11 +277,10 @@ _ALL_ONES = 0xFFFFFFFF
 def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
     """Compute the ``_HASH_CHECK`` that PX4 would report for this table.
 
-    The hash is a CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name.
-    PX4 ignores volatile parameters, which it changes itself. Pass their names as ``volatile``
-    (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`), otherwise the result differs. If these
-    names are unknown, use the hash that the vehicle has reported.
+    PX4 ignores volatile parameters. Pass their names as ``volatile`` (:attr:`ParameterMetadata.volatile
+    <aerokit.parameters.ParameterMetadata>`). If these names are unknown, use the hash that the vehicle has reported.
     """
+    # The hash is a CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name.
     data = bytearray()
     for name in sorted(table):
         if name not in volatile:

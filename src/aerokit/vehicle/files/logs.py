@@ -342,7 +342,7 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
 
 
 def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
-    """Return those entries of a newer list whose logs are also in ``logs``."""
+    """Return the entries in a newer list of the logs in ``logs``."""
     # Logs are compared by time and size, because a new log may get the id of an erased one. Only the newest log may
     # have grown since, so it is found by its id.
     newest = logs[-1]

@@ -76,11 +76,12 @@ class ParameterStore:
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
     def unmark_replaced(self, name: str) -> None:
-        """Undo `mark_replaced` before a new write, which may set the replaced value again."""
+        """Undo `mark_replaced` before a new write."""
+        # The new write may set the parameter to the replaced value again.
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
-        """Return the value whose messages are ignored, or None."""
+        """Return the value that is ignored in messages, or None."""
         if name not in self._replaced:
             return None
         value, ignored_until = self._replaced[name]

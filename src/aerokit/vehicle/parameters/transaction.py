@@ -66,10 +66,9 @@ class _Block:
     async def _resolve_and_save(
         self, names: Iterable[str], idle_timeout_s: float
     ) -> dict[str, ResolvedParameter | ParameterFailure]:
-        """Resolve names, and save the parameters as they are before their first write.
-
-        The writer calls this before each round of writes, because some parameters appear only after the first round.
-        """
+        """Resolve names, and save the parameters as they are before their first write."""
+        # The writer calls this method before each round of writes, because some parameters appear only after the first
+        # round.
         results = await self._writer.names.resolve(names, idle_timeout_s)
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}

@@ -59,7 +59,7 @@ class StatusTextAssembler:
         return truncated_texts + texts
 
     def expire(self, now: float) -> list[StatusText]:
-        """Remove the incomplete texts whose next chunk is overdue. Return them as truncated."""
+        """Remove and return incomplete texts, if their next chunk is overdue."""
         overdue = [key for key, text in self._incomplete.items() if now - text.last_chunk_at > CHUNK_TIMEOUT_S]
         texts = [self._incomplete.pop(key).truncated(now) for key in overdue]
         self._store(texts)
