@@ -85,6 +85,7 @@ def test_same_value_of_numbers_equal_as_float32() -> None:
     assert same_value(0.1, struct.unpack("<f", struct.pack("<f", 0.1))[0])
     assert not same_value(2**24, 2**24 + 1)  # whole numbers are compared exactly
     assert not same_value(1e300, 1.0)
+    assert not same_value(10**400, 1.0)  # too large for any float
 
 
 TABLE = ParameterTable(

@@ -5,7 +5,6 @@ https://mavlink.io/en/services/camera_def.html
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
@@ -17,7 +16,7 @@ from aerokit._internal.formatting import did_you_mean, short_repr
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError, InvalidArgument
 from aerokit.mavlink.enums import MavParamExtType
-from aerokit.parameters.encoding import parse_number
+from aerokit.parameters.encoding import number_or_none
 from aerokit.parameters.parameter import SettingValue, checked_setting, setting_key, settings_equal
 
 if TYPE_CHECKING:
@@ -163,7 +162,7 @@ class CameraDefinition(Snapshot):
         return options
 
     def _options(self, name: str, values: Values) -> tuple[tuple[SettingOption, ...], list[str]]:
-        """Return the options that a setting has now, and what restricts them, e.g. ``CAM_EXPMODE = Auto``."""
+        """Return a setting's present options, and what restricts them, e.g. ``CAM_EXPMODE = Auto``."""
         options = self.settings[name].options if name in self.settings else ()
         reasons: list[str] = []
         for setting, selected in self._selected(values):
@@ -255,7 +254,6 @@ def parse_definition(data: bytes, source: str = "camera definition") -> CameraDe
 def _check_option(
     setting: SettingDefinition, value: object, options: tuple[SettingOption, ...], restricted_by: list[str]
 ) -> SettingValue:
-    """Return the value of the option that has this name or value; raise InvalidArgument if there is none."""
     by_name = {option.name: option.value for option in options}
     if isinstance(value, str) and value in by_name:
         return by_name[value]
@@ -276,10 +274,6 @@ def _check_option(
 
 
 def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
-    """Return the value in the setting's type; raise InvalidArgument if it is not allowed.
-
-    It must be in range. An integer must also be a multiple of the step, counted from the minimum.
-    """
     number = checked_setting(setting.name, value, setting.wire_type)
     if isinstance(number, (str, bytes)):
         return number
@@ -294,6 +288,7 @@ def _check_range(setting: SettingDefinition, value: object) -> SettingValue:
     if is_below or is_above:
         lowest, highest = ("" if limit is None else f"{limit:g}" for limit in (low, high))
         raise InvalidArgument(f"{setting.name} = {short_repr(value)} is not allowed: it must be {lowest}..{highest}")
+    # An integer must be a multiple of the step, counted from the minimum.
     if isinstance(number, int) and isinstance(step, int) and step > 1:
         first = low if isinstance(low, int) else 0
         if (number - first) % step:
@@ -343,13 +338,13 @@ def _evaluate(condition: str, values: Values) -> bool:
 
 
 def _compare(value: SettingValue, operator: str, text: str) -> bool:
-    """Evaluate one test. Texts can be compared by = and != only; comparing a number with a text gives False."""
+    """Evaluate one test. Comparing a number with a text gives False."""
     if isinstance(value, (str, bytes)):
         if operator not in ("=", "!="):
             return False
         is_equal = settings_equal(value, text)
         return is_equal if operator == "=" else not is_equal
-    number = _number(text)
+    number = number_or_none(text)
     if number is None:
         return False
     # Do not use ==, because a value sent as a 32-bit float differs a little from the decimal number in the file.
@@ -396,7 +391,6 @@ class _Reader:
         )
 
     def _setting(self, node: Element) -> SettingDefinition | None:
-        """Read one ``<parameter>`` element; return None if its name or type is invalid."""
         name, kind = node.get("name", ""), node.get("type", "")
         if not _is_name(name) or kind not in TYPES:
             return None
@@ -408,9 +402,9 @@ class _Reader:
             wire_type,
             description=_text(node.find("description")),
             default=bool(default) if kind == "bool" and default is not None else default,
-            minimum=_number(node.get("min")),
-            maximum=_number(node.get("max")),
-            step=_number(node.get("step")),
+            minimum=number_or_none(node.get("min")),
+            maximum=number_or_none(node.get("max")),
+            step=number_or_none(node.get("step")),
             options=tuple(self._options(node.iterfind("options/option"), wire_type)),
             updates=tuple(filter(_is_name, _texts(node.iterfind("updates/update")))),
             is_control=node.get("control", "1") not in ("0", "false"),
@@ -419,7 +413,6 @@ class _Reader:
         )
 
     def _options(self, nodes: Iterable[Element], wire_type: int) -> Iterator[SettingOption]:
-        """Yield those options of a setting whose values are valid for the setting's type."""
         for node in nodes:
             value = _parse_value(node.get("value"), wire_type)
             if value is not None:
@@ -431,7 +424,6 @@ class _Reader:
                 )
 
     def _ranges(self, nodes: Iterable[Element]) -> Iterator[SettingRange]:
-        """Yield the valid restrictions that an option imposes on other settings."""
         for node in nodes:
             setting = node.get("parameter", "")
             wire_type = self._types.get(setting)
@@ -461,23 +453,14 @@ def _is_name(name: str) -> bool:
     return name.isascii() and name.isprintable() and 0 < len(name) <= MAX_NAME_LENGTH
 
 
-def _number(text: str | None) -> int | float | None:
-    """Parse a number; return None if there is none, or it is not finite."""
-    try:
-        number = None if text is None else parse_number(text.strip())
-        return None if number is None or not math.isfinite(number) else number
-    except (ValueError, OverflowError):  # OverflowError means that the number is too large for a float.
-        return None
-
-
 def _int_or_zero(text: str) -> int:
-    number = _number(text)
+    number = number_or_none(text)
     return number if isinstance(number, int) else 0
 
 
 def _parse_value(text: str | None, wire_type: int) -> SettingValue | None:
-    """Parse a value of this MAV_PARAM_EXT_TYPE; return None if it is missing or does not fit."""
-    value: object = text if wire_type == MavParamExtType.CUSTOM else _number(text)
+    """Parse a value of this MAV_PARAM_EXT_TYPE. Return None if it does not fit."""
+    value: object = text if wire_type == MavParamExtType.CUSTOM else number_or_none(text)
     try:
         return None if value is None else checked_setting("", value, wire_type)
     except InvalidArgument:

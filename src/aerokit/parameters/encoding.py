@@ -52,9 +52,9 @@ def to_bits(value: float, type: ParameterType, bytewise: bool) -> bytes:  # noqa
 
 
 def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode the four bytes of ``param_value``; return an int for integer types.
+    """Decode the four bytes of ``param_value``.
 
-    Never raises: if a vehicle sends a fraction or NaN for an integer type, the result is this float.
+    Never raises. If a vehicle sends a fraction or NaN for an integer type, the result is this float.
     """
     if bytewise and type in _FORMATS:
         return int(_FORMATS[type].unpack_from(bits)[0])
@@ -62,12 +62,12 @@ def from_bits(bits: bytes, type: ParameterType, bytewise: bool) -> int | float: 
 
 
 def to_wire(value: float, type: ParameterType, bytewise: bool) -> float:  # noqa: A002
-    """Encode a value as ``param_value``. The bits of a signalling NaN change; see the description of this module."""
+    """Encode a value as ``param_value``. The bits of a signalling NaN change."""
     return float(_FLOAT.unpack(to_bits(value, type, bytewise))[0])
 
 
 def from_wire(param_value: float, type: ParameterType, bytewise: bool) -> int | float:  # noqa: A002
-    """Decode a ``param_value``. The bits of a signalling NaN have changed; see the description of this module."""
+    """Decode a ``param_value``. The bits of a signalling NaN have changed."""
     if bytewise and type in _FORMATS:
         return from_bits(_FLOAT.pack(param_value), type, bytewise)
     return _cast(param_value, type)
@@ -107,7 +107,6 @@ def set_message(
 
 
 def value_message(parameter: Parameter, count: int, bytewise: bool) -> ParamValue:
-    """Create the PARAM_VALUE for a parameter of a vehicle with ``count`` parameters."""
     bits = to_bits(parameter.value, parameter.type, bytewise)
     index = UNKNOWN_INDEX if parameter.index is None else parameter.index
     message = ParamValue(parameter.name, _FLOAT.unpack(bits)[0], int(parameter.type), count, index)
@@ -134,7 +133,7 @@ class _ExactParamValue(ParamValue):
 
 
 def _with_exact_bits(message: _M, exact_type: type[_ExactParamSet] | type[_ExactParamValue], bits: bytes) -> _M:
-    """Return the message if ``param_value`` is encoded as ``bits``; otherwise a copy that is encoded so."""
+    """Return the message, or a copy of it, with ``param_value`` encoded as ``bits``."""
     if _FLOAT.pack(message.param_value) == bits:
         return message
     exact = exact_type(**message.to_dict())
@@ -143,11 +142,11 @@ def _with_exact_bits(message: _M, exact_type: type[_ExactParamSet] | type[_Exact
 
 
 def _exact_bits(message: ParamSet | ParamValue) -> bytes:
-    """Return the bytes of ``param_value``, the first field of both messages."""
     if isinstance(message, (_ExactParamSet, _ExactParamValue)):
         return message.bits
     if message.received_frame is None:
         return _FLOAT.pack(message.param_value)
+    # ``param_value`` is the first field of both messages.
     return message.received_frame.body[HEADER_LENGTH : HEADER_LENGTH + 4].ljust(4, b"\0")
 
 
@@ -195,3 +194,15 @@ def parse_number(text: str) -> int | float:
     if math.isinf(number):  # The text is for example "1e999".
         raise ValueError(text)
     return number
+
+
+def number_or_none(value: object) -> int | float | None:
+    """Parse a number. Return None for anything else."""
+    if not isinstance(value, (int, float, str)):
+        return None
+    try:
+        number = parse_number(str(value).strip())
+        float(number)
+        return number
+    except (ValueError, OverflowError):  # OverflowError means that the number is too large for a float.
+        return None

@@ -155,7 +155,7 @@ def parameter_file_text(
 
 
 def _parse_names_and_values(lines: list[tuple[str, str]], comments: list[str]) -> ParameterFile:
-    """Parse a file of Mission Planner or MAVProxy. ``lines`` has (place, text) pairs; error texts name the place."""
+    """Parse a file of Mission Planner or MAVProxy. ``lines`` has (place, text) pairs."""
     values: dict[str, int | float] = {}
     places: dict[str, str] = {}
     for place, line in lines:
@@ -211,7 +211,7 @@ def _parse_columns(place: str, line: str) -> tuple[int, str, str, ParameterType]
 
 
 def _select_component(requested: int | None, values: Mapping[int, object], source: str) -> int:
-    """Return the id of the requested component, by default the autopilot or the only component in the file."""
+    """Return the requested component, by default the autopilot or the only one."""
     if requested is not None and requested in values:
         return requested
     if requested is None and _AUTOPILOT in values:
@@ -225,7 +225,7 @@ def _select_component(requested: int | None, values: Mapping[int, object], sourc
 
 
 def _add_value(values: dict[str, int | float], place: str, name: str, text: str, kind: ParameterType) -> None:
-    """Add a parameter to ``values``. FileFormatError if the value is invalid, or the name was added before."""
+    """Add a parameter. Raises FileFormatError for an invalid value or a repeated name."""
     try:
         number = parse_number(text)
     except ValueError:
@@ -249,7 +249,7 @@ def _directive_hint(fields: list[str]) -> str:
 
 
 def _rows(values: ParameterValues) -> Iterator[tuple[str, str, ParameterType]]:
-    """Yield name, formatted value and type of each parameter, after checking them."""
+    """Check the parameters, and yield name, formatted value and type of each."""
     file_types = values.types if isinstance(values, ParameterFile) else {}
     for name, number in plain_values(values).items():
         parameter = values[name]

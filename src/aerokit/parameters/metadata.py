@@ -30,7 +30,7 @@ from defusedxml import ElementTree as DefusedXml
 from aerokit._internal.files import decompress, read_bounded
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError, InvalidArgument
-from aerokit.parameters.encoding import parse_number
+from aerokit.parameters.encoding import number_or_none
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -201,7 +201,7 @@ def _ardupilot_xml(root: Element) -> Iterator[ParameterMetadata]:
                 unit=fields.get("Units", ""),
                 minimum=low,
                 maximum=high,
-                increment=_number(fields.get("Increment")),
+                increment=number_or_none(fields.get("Increment")),
                 values=_names_by_number((value.get("code"), value.text) for value in param.iter("value")),
                 bitmask=_names_by_bit((bit.get("code"), bit.text) for bit in param.iter("bit")),
                 reboot_required=_is_true(fields.get("RebootRequired")),
@@ -224,9 +224,9 @@ def _ardupilot_json(content: Mapping[str, Any]) -> Iterator[ParameterMetadata]:
                 short_description=_text(fields["DisplayName"]),
                 description=_text(fields.get("Description", "")),
                 unit=_text(fields.get("Units", "")),
-                minimum=_number(limits.get("low")),
-                maximum=_number(limits.get("high")),
-                increment=_number(fields.get("Increment")),
+                minimum=number_or_none(limits.get("low")),
+                maximum=number_or_none(limits.get("high")),
+                increment=number_or_none(fields.get("Increment")),
                 values=_names_by_number(fields.get("Values", {}).items()),
                 bitmask=_names_by_bit(fields.get("Bitmask", {}).items()),
                 reboot_required=_is_true(fields.get("RebootRequired")),
@@ -242,12 +242,11 @@ def _range(text: str) -> tuple[float | None, float | None]:
     if len(bounds) != 2:
         return None, None
     low, high = bounds
-    return _number(low), _number(high)
+    return number_or_none(low), number_or_none(high)
 
 
 # ------------------------------------------------------------------------------------------- PX4
 def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
-    """Yield the parameters of PX4's parameters.xml."""
     for group in root.iter("group"):
         for param in group.iter("parameter"):
             values: Mapping[float, str] = _names_by_number(
@@ -260,10 +259,10 @@ def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
                 short_description=param.findtext("short_desc", ""),
                 description=param.findtext("long_desc", "").strip(),
                 unit=param.findtext("unit", ""),
-                minimum=_number(param.findtext("min")),
-                maximum=_number(param.findtext("max")),
-                increment=_number(param.findtext("increment")),
-                default=_number(param.get("default")),
+                minimum=number_or_none(param.findtext("min")),
+                maximum=number_or_none(param.findtext("max")),
+                increment=number_or_none(param.findtext("increment")),
+                default=number_or_none(param.get("default")),
                 values=values,
                 bitmask=_names_by_bit((bit.get("index"), bit.text) for bit in param.iter("bit")),
                 reboot_required=_is_true(param.findtext("reboot_required")),
@@ -275,16 +274,15 @@ def _px4_xml(root: Element) -> Iterator[ParameterMetadata]:
 
 
 def _px4_entry(entry: Mapping[str, Any]) -> ParameterMetadata:
-    """Convert one entry of PX4's parameters.json."""
     return ParameterMetadata(
         _text(entry["name"]),
         short_description=_text(entry.get("shortDesc", "")),
         description=_text(entry.get("longDesc", "")).strip(),
         unit=_text(entry.get("units", "")),
-        minimum=_number(entry.get("min")),
-        maximum=_number(entry.get("max")),
-        increment=_number(entry.get("increment")),
-        default=_number(entry.get("default")),
+        minimum=number_or_none(entry.get("min")),
+        maximum=number_or_none(entry.get("max")),
+        increment=number_or_none(entry.get("increment")),
+        default=number_or_none(entry.get("default")),
         values=_names_by_number((value["value"], value["description"]) for value in entry.get("values", ())),
         bitmask=_names_by_bit((bit["index"], bit["description"]) for bit in entry.get("bitmask", ())),
         reboot_required=bool(entry.get("rebootRequired", False)),
@@ -303,24 +301,12 @@ def _text(value: Any) -> str:
 
 
 def _int_or_none(value: Any) -> int | None:
-    number = _number(value)
+    number = number_or_none(value)
     return int(number) if number is not None and number == int(number) else None
 
 
-def _number(value: Any) -> int | float | None:
-    """Parse a number; return None for anything else."""
-    if not isinstance(value, (int, float, str)):
-        return None
-    try:
-        number = parse_number(str(value).strip())
-        float(number)
-        return number
-    except (ValueError, OverflowError):  # OverflowError means that the number is too large for a float.
-        return None
-
-
 def _names_by_number(pairs: Iterable[tuple[Any, Any]]) -> Mapping[float, str]:
-    numbers = ((_number(code), str(text or "").strip()) for code, text in pairs)
+    numbers = ((number_or_none(code), str(text or "").strip()) for code, text in pairs)
     return {number: text for number, text in numbers if number is not None}
 
 

@@ -141,9 +141,7 @@ def pack_for_download(
     """Encode ``@PARAM/param.pck`` for these parameters, without validating their values.
 
     ``block_size`` is the number of data bytes per read (a block). ``count`` 0 means all parameters from ``start`` on.
-    An entry may be split between two blocks, but PX4 keeps its value and its default in the same block. ArduPilot
-    (``whole_defaults=False``) only keeps the last of them unsplit: a value may be split if a default follows it
-    (AP_Filesystem_Param.cpp). InvalidArgument is raised if ``start`` is beyond the list.
+    InvalidArgument is raised if ``start`` is beyond the list.
     """
     rows = list(_rows(parameters))
     if not 0 <= start < len(rows):
@@ -158,6 +156,8 @@ def pack_for_download(
         name, code = parameter.name.encode(), _code_of(parameter)
         entry = _entry(name, previous_name, code, *values)
         # The last `unsplit_size` bytes of the entry, its value or values, must not be split between two blocks.
+        # PX4 keeps a value and its default in the same block. ArduPilot (``whole_defaults=False``) only keeps the last
+        # of them unsplit, so a value may be split if a default follows it (AP_Filesystem_Param.cpp).
         _, value_format = _CODES[code]
         unsplit_size = value_format.size * (len(values) if whole_defaults else 1)
         size_in_next_block = (len(file) + len(entry)) % block_size
@@ -170,19 +170,16 @@ def pack_for_download(
 
 # --------------------------------------------------------------------------------------- reading
 def read_header(data: bytes) -> PackHeader:
-    """Decode the header of a downloaded or uploaded file."""
     if len(data) < HEADER.size:
         raise RemoteProtocolError(f"param.pck has {len(data)} bytes, fewer than the {HEADER.size} of its header")
     return PackHeader(*HEADER.unpack_from(data))
 
 
 def read_entry(data: bytes, position: int, previous_name: bytes) -> PackEntry | None:
-    """Decode the entry at ``position``; return None if the data ends inside the entry.
+    """Decode the entry at ``position``. Return None if the data ends inside the entry.
 
-    ``previous_name`` is the name in the entry before, empty for the first entry.
-
-    Raises:
-        RemoteProtocolError: the data is not an entry: the type or flags are undefined, or the name is too long.
+    ``previous_name`` is the name in the entry before, empty for the first entry. Raises RemoteProtocolError if the
+    data is not an entry.
     """
     code, flags = data[position] & 0x0F, data[position] & 0xF0
     has_default = bool(flags & _HAS_DEFAULT)
@@ -261,10 +258,8 @@ def _entry(name: bytes, previous_name: bytes, code: int, *values: float) -> byte
 
 
 def _common_length(name: bytes, previous_name: bytes) -> int:
-    """Return the length of the prefix that a name shares with the previous name, without the name's last character.
-
-    The last character is left out, because the format requires at least one character after the prefix.
-    """
+    """Return the length of the prefix that a name shares with the previous name."""
+    # The name's last character does not count, because the format requires at least one character after the prefix.
     common = 0
     for char, previous_char in zip(name[:-1], previous_name):  # noqa: B905 - the lengths may differ
         if char != previous_char:
@@ -282,11 +277,10 @@ _ALL_ONES = 0xFFFFFFFF
 def px4_hash(table: ParameterTable, volatile: Container[str] = ()) -> int:
     """Compute the ``_HASH_CHECK`` that PX4 would report for this table.
 
-    The hash is a CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name.
-    PX4 ignores volatile parameters, which it changes itself. Pass their names as ``volatile``
-    (:attr:`ParameterMetadata.volatile <aerokit.parameters.ParameterMetadata>`), otherwise the result differs. If these
-    names are unknown, use the hash that the vehicle has reported.
+    PX4 ignores volatile parameters. Pass their names as ``volatile`` (:attr:`ParameterMetadata.volatile
+    <aerokit.parameters.ParameterMetadata>`). If these names are unknown, use the hash that the vehicle has reported.
     """
+    # The hash is a CRC-32 without inversions over the name and the four value bytes of each parameter, sorted by name.
     data = bytearray()
     for name in sorted(table):
         if name not in volatile:

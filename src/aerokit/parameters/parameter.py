@@ -6,7 +6,6 @@ A setting is a parameter of a component in the extended protocol: https://mavlin
 from __future__ import annotations
 
 import math
-import struct
 from enum import IntEnum
 from struct import Struct
 from typing import SupportsFloat, SupportsIndex
@@ -155,7 +154,7 @@ def number_of(name: str, value: object) -> int | float:
 
 def to_float32(value: float) -> float:
     """Round to the nearest 32-bit float. Raises OverflowError if the value is too large."""
-    return float(_FLOAT32.unpack(_FLOAT32.pack(value))[0])
+    return float(_FLOAT32.unpack(_FLOAT32.pack(float(value)))[0])
 
 
 def same_value(left: float, right: float) -> bool:
@@ -264,24 +263,13 @@ def settings_equal(left: SettingValue, right: SettingValue) -> bool:
     """Return True if the values are equal, equal as 32-bit floats, or both NaN."""
     if isinstance(left, (str, bytes)) or isinstance(right, (str, bytes)):
         return _encoded(left) == _encoded(right)
-    are_both_nan = left != left and right != right
-    if left == right or are_both_nan:
-        return True
-    if not isinstance(left, float) and not isinstance(right, float):
-        return False  # Large integers may differ although they are equal as 32-bit floats.
-    try:
-        return _FLOAT.pack(left) == _FLOAT.pack(right) and math.isfinite(left)
-    except (OverflowError, struct.error):
-        return False
-
-
-_FLOAT = _STRUCTS[MavParamExtType.REAL32]
+    return same_value(left, right)
 
 
 def setting_key(value: SettingValue) -> object:
-    """Return a key that is the same for values that are equal according to :func:`settings_equal`.
+    """Return the same key for values that are equal according to :func:`settings_equal`.
 
-    There is one exception: an int beyond ±2**24 may equal a float according to that function, but have another key.
+    An int beyond ±2**24 may have another key than a float to which it is equal.
     """
     if isinstance(value, (str, bytes)):
         return _encoded(value)
@@ -290,8 +278,8 @@ def setting_key(value: SettingValue) -> object:
     if math.isnan(value):
         return "NaN"  # A float NaN would differ from itself.
     try:
-        return _FLOAT.unpack(_FLOAT.pack(value))[0]
-    except (OverflowError, struct.error):
+        return to_float32(value)
+    except OverflowError:
         return value
 
 

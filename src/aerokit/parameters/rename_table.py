@@ -47,10 +47,8 @@ _VERTICAL_ACCELERATION = "FF FLTT FLTE FLTD SMAX PDMX D_FF NTF NEF"
 
 
 def _position_controller(prefix: str) -> tuple[tuple[int, str], ...]:
-    """Return the renames of the position controller, each with its divisor; see `GROUPS`.
-
-    The controller changed from north-east-up in centimetres to north-east-down in metres.
-    """
+    """Return the renames of the position controller, each with its divisor."""
+    # The controller changed from north-east-up in centimetres to north-east-down in metres.
     moved = (
         _change_prefix(f"{prefix}VELXY_", f"{prefix}NE_VEL_", _VELOCITY_CONTROLLER),
         _change_prefix(f"{prefix}VELZ_", f"{prefix}D_VEL_", _VELOCITY_CONTROLLER),
@@ -127,10 +125,8 @@ _OLDER_COPTER, _OLDER_PLANE, _ROVER = ("Copter",), ("Plane",), ("Rover",)
 
 
 def _moved(old: str, new: str, names: str) -> str:
-    """Make pairs from names by adding prefixes: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``.
-
-    The names may also be pairs such as ``A>B``.
-    """
+    """Make pairs of names by adding prefixes: ``TYPE`` becomes ``RNGFND_TYPE>RNGFND1_TYPE``."""
+    # A name may also be a pair such as ``A>B``.
     halves = (name.partition(">") for name in names.split())
     return " ".join(f"{old}{old_name}>{new}{new_name or old_name}" for old_name, _, new_name in halves)
 

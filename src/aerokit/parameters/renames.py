@@ -194,7 +194,7 @@ def translate_values(
 
 
 def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
-    """Return the converted value, computed with decimal numbers and only with the digits that a 32-bit float has."""
+    """Return the converted value, with as many digits as a 32-bit float has."""
     try:
         return float(scale(Decimal(number_text(value))))
     except (ArithmeticError, ValueError):  # The value is infinite, NaN or beyond 32 bits, which no vehicle accepts.
@@ -202,18 +202,15 @@ def _scaled(value: float, scale: Callable[[Decimal], Decimal]) -> float:
 
 
 def _is_mask(value: float) -> bool:
-    """Return True if a value is an integer of 32 bits. Another value cannot be converted to the opposite mask."""
+    # Another value cannot be converted to the opposite mask.
     return -(2**31) <= value < 2**31 and value == int(value)
 
 
 def _checks_to_skip(checks: int) -> int:
-    """Convert ARMING_CHECK to ARMING_SKIPCHK.
-
-    If all checks are enabled, none are skipped. If none are enabled, all are skipped, including future checks.
-    Otherwise the checks that are not enabled are skipped.
-    """
+    """Convert ARMING_CHECK to ARMING_SKIPCHK."""
     if checks & _ALL_BIT:
         return 0
+    # If no checks are enabled, all are skipped, including future checks.
     return ~checks & _SINGLE_CHECKS if checks & _SINGLE_CHECKS else _SKIP_ALL
 
 
@@ -223,7 +220,7 @@ def _checks_to_make(skipped: int) -> int:
 
 @lru_cache(maxsize=1)
 def _by_name() -> Mapping[str, tuple[Rename, ...]]:
-    """Map each name, old or new, to its renames; renames in `ONE_WAY` are found only by the old name."""
+    """Map each old or new name to its renames."""
     two_way: dict[str, Rename] = {}
     for vehicles, divisor, pairs in GROUPS:
         for old, new in _pairs(pairs):
@@ -245,6 +242,7 @@ def _by_name() -> Mapping[str, tuple[Rename, ...]]:
                 rename = rename.replace(other_old=(*rename.other_old, old))
             two_way.update(dict.fromkeys(rename.names, rename))
     by_name: dict[str, tuple[Rename, ...]] = {name: (rename,) for name, rename in two_way.items()}
+    # These renames are found only by the old name.
     for since, vehicles, divisor, pairs in ONE_WAY:
         for old, new in _pairs(pairs):
             rename = Rename(old, new, divisor, vehicles=vehicles, since=since)

@@ -118,7 +118,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
 
 def _merged(old: Parameter | None, new: Parameter) -> Parameter:
-    """Return the new parameter; a default or an index that it lacks is taken from the old one."""
+    """Return the new parameter. A missing default or index is taken from the old one."""
     if old is None or (new.default is not None and new.index is not None):
         return new
     default = old.default if new.default is None else new.default
@@ -176,7 +176,6 @@ def _same(left: float | None, right: float | None, tolerance: float) -> bool:
 
 
 def _text(value: float | None) -> str:
-    """Return the text of a value in the description of a difference."""
     if value is None:
         return "missing"
     try:

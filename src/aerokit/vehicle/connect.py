@@ -169,7 +169,7 @@ async def connect(
 
 
 def _create_hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub | None:
-    """Validate ``share`` and create the hub for it, without opening a link. Return None if ``share`` is empty."""
+    """Create the hub without opening its links. Return None if ``share`` is empty."""
     endpoints = tuple(share)
     if not endpoints:
         return None
@@ -180,7 +180,6 @@ def _create_hub(share: Iterable[str | Endpoint | Link], dialect: Dialect) -> Hub
 
 @asynccontextmanager
 async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None]:
-    """Let the hub share the connection with its clients during an `async with` block; do nothing without a hub."""
     if hub is None:
         yield
         return
@@ -192,7 +191,6 @@ async def _shared(connection: Connection, hub: Hub | None) -> AsyncIterator[None
 def _check_arguments(
     system_id: int | None, timeout: float, rates: Mapping[type[Message], float] | None, dialect: Dialect
 ) -> None:
-    """Raise InvalidArgument for an argument that is not allowed; called before anything is opened."""
     if system_id is not None and not 1 <= system_id <= 255:
         raise InvalidArgument(
             f"system_id = {system_id} is not allowed: it must be 1 to 255, or None for the first vehicle found"
@@ -203,7 +201,6 @@ def _check_arguments(
 
 
 def _check_rates(rates: Mapping[type[Message], float] | None, dialect: Dialect) -> None:
-    """Raise InvalidArgument for a rate that cannot be requested."""
     for message_type, hz in (rates or {}).items():
         check_rate(message_type, hz)
         if dialect.get(message_type.ID) is not message_type:
@@ -217,7 +214,7 @@ async def _attached(
     timeout: float,
     rates: Mapping[type[Message], float] | None,
 ) -> AsyncIterator[Vehicle]:
-    """Find a vehicle on an open connection. Its session ends with the `async with` block; the connection stays open."""
+    """Find a vehicle on an open connection. The connection stays open when the block ends."""
     context, vehicle, heartbeat = await _find_vehicle(connection, system_id, timeout)
     was_left_by_exception = False
     try:
@@ -239,13 +236,11 @@ async def _attached(
 
 
 def warn_if_left_flying(vehicle: Vehicle) -> None:
-    """Log a warning if the vehicle may still execute the program's orders when its `async with` block is left."""
     if vehicle._arbiter.may_be_executing and not vehicle.is_confirmed_disarmed:
         logger.warning("the async with block of vehicle %d was left: %s", vehicle.system_id, vehicle.describe_now())
 
 
 async def _find_vehicle(connection: Connection, system_id: int | None, timeout: float) -> _Found:
-    """Create the vehicle at the first acceptable heartbeat; return it with its context and this heartbeat."""
     connection.raise_if_ended()
     search = _Search(connection, system_id)
     # A recent heartbeat may have arrived before this call.
@@ -292,7 +287,6 @@ class _Search:
         self.description = "an autopilot" if system_id is None else f"the autopilot of system {system_id}"
 
     def on_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Create the vehicle if this heartbeat is of an acceptable autopilot. Later heartbeats are ignored."""
         frame = heartbeat.received_frame
         if frame is None or self._ended.is_set() or not self._is_wanted(frame, heartbeat):
             return
@@ -310,7 +304,7 @@ class _Search:
         self._ended.set()
 
     def _has_sent_enough(self, frame: Frame) -> bool:
-        """Count the heartbeats of an autopilot other than component 1; return True after ``MIN_LONE_HEARTBEATS``."""
+        """Count a heartbeat. Return True after ``MIN_LONE_HEARTBEATS`` of the same sender."""
         source = (frame.system_id, frame.component_id)
         counts = self._lone_heartbeats
         if source not in counts and len(counts) >= MAX_ROUTES:  # A faulty sender may use many ids.
@@ -319,13 +313,11 @@ class _Search:
         return counts[source] >= MIN_LONE_HEARTBEATS
 
     def abort(self, error: Exception) -> None:
-        """End the search without a vehicle, because the connection has ended."""
         if not self._ended.is_set():
             self._error = copy_exception(error)
             self._ended.set()
 
     async def result(self) -> _Found:
-        """Return the vehicle, which the caller must close, and its first heartbeat."""
         await self._ended.wait()
         if self._found is None:
             assert self._error is not None
@@ -334,8 +326,8 @@ class _Search:
         return result
 
     def close(self) -> None:
-        """End the search. Close a vehicle that was found, unless :meth:`result` has returned it to the caller."""
         self._ended.set()
+        # `result` has not returned this vehicle to the caller.
         if self._found is not None:
             context, vehicle, _ = self._found
             context.session.close()
@@ -376,7 +368,6 @@ async def vehicles_on(
     tasks = BackgroundTasks(connection.fail)
 
     async def stay_connected(system_id: int) -> None:
-        """Connect to one vehicle, and keep it connected until `vehicles_on` ends."""
         try:
             async with connect(connection, system_id=system_id, rates=rates) as vehicle:
                 vehicles[system_id] = vehicle
@@ -391,7 +382,6 @@ async def vehicles_on(
             logger.info("the connection to system %d failed or ended: %s", system_id, error)
 
     async def search() -> None:
-        """Start a task for each vehicle that is found."""
         try:
             async for event in connection.vehicles():
                 if event.system_id not in vehicles:

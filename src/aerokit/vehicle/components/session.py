@@ -111,7 +111,7 @@ SHUT_RDWR = 2
 
 
 async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, idle_timeout_s: float) -> bytes:
-    """Return the content of a file, at most 16 MB; errors as for `Component.fetch`."""
+    """Return the content of a file. Raises the errors of `Component.fetch`."""
     match = _MAVFTP.fullmatch(uri)
     if match is not None:
         owner = int(match[1]) if match[1] else component_id  # id of the component that stores the file
@@ -124,7 +124,6 @@ async def fetch(uri: str, files_of: Callable[[int], Files], component_id: int, i
 
 
 async def _read_limited(files: Files, path: str, idle_timeout_s: float) -> bytes:
-    """Read a file by MAVFTP, but cancel the download as soon as the size is known to exceed MAX_FILE_SIZE."""
     with anyio.CancelScope() as scope:
 
         def check_size(progress: TransferProgress) -> None:
@@ -146,7 +145,6 @@ class _WebDownload:
         self._is_aborted = False
 
     async def content(self) -> bytes:
-        """Return the content of the file. Cancellation and the time-out ``WEB_TIMEOUT_S`` abort the download."""
         try:
             with anyio.move_on_after(WEB_TIMEOUT_S):
                 return await asyncio.to_thread(self._download)
@@ -163,7 +161,7 @@ class _WebDownload:
                     connection.sock.shutdown(SHUT_RDWR)
 
     def _connect_with(self, connection_type: type[HTTPConnection]) -> Callable[..., HTTPConnection]:
-        """Return a factory like ``connection_type`` that records each connection, so that `_abort` can close it."""
+        """Return a factory of connections that `_abort` can close."""
 
         def connect(host: str, **options: Any) -> HTTPConnection:
             if self._is_aborted:
@@ -175,11 +173,6 @@ class _WebDownload:
         return connect
 
     def _opener(self) -> OpenerDirector:
-        """Return an opener of urllib for http: and https:, whose connections `_abort` can close.
-
-        The default opener also has handlers for file: and ftp:, so that an address could make aerokit read a local
-        file.
-        """
         from http.client import HTTPConnection, HTTPSConnection
         from urllib import request
 
@@ -193,6 +186,8 @@ class _WebDownload:
             def https_open(self, req: request.Request) -> Any:
                 return self.do_open(connect_with(HTTPSConnection), req)
 
+        # The default opener of urllib also has handlers for file: and ftp:. An address could then make aerokit read a
+        # local file.
         opener = request.OpenerDirector()
         for handler in (
             request.ProxyHandler(),
@@ -206,7 +201,7 @@ class _WebDownload:
         return opener
 
     def _download(self) -> bytes:
-        """Return the content of the file; runs in the thread."""
+        """Return the content of the file. Blocks, so it runs in a thread."""
         from http.client import HTTPException
 
         try:

@@ -254,7 +254,6 @@ class Settings:
                 return self._with_definition(confirmed)
 
     async def _write_undefined(self, name: str, value: object, idle_timeout_s: float) -> Setting:
-        """Write a setting that no definition describes; its type on the wire is that of its present value."""
         known = self._known.get(name)
         if known is None:
             known = _setting_or_raise((await self._read([name], idle_timeout_s))[name])
@@ -264,10 +263,6 @@ class Settings:
     async def _write_defined(
         self, setting_definition: SettingDefinition, value: object, idle_timeout_s: float
     ) -> Setting:
-        """Check the value against the definition of the setting, and write it.
-
-        Settings that restrict this setting are read first if their values are unknown.
-        """
         definition, name = self._definition, setting_definition.name
         assert definition is not None
         # Before anything is sent, refuse a value that the known values of other settings exclude already.
@@ -294,7 +289,6 @@ class Settings:
     async def _write(
         self, name: str, value: SettingValue, wire_type: int, old_value: SettingValue | None, idle_timeout_s: float
     ) -> Setting:
-        """Send PARAM_EXT_SET, and return the setting that the component confirms."""
         transfers = self._transfers
         exchange = SettingWrite(
             transfers.system_id,
@@ -309,7 +303,6 @@ class Settings:
         return await transfers.run(exchange)
 
     async def _read(self, names: Iterable[str], idle_timeout_s: float) -> dict[str, SettingAnswer]:
-        """Request settings; return a setting or an error for each name."""
         transfers = self._transfers
         exchange = SettingReads(
             transfers.system_id,
@@ -321,7 +314,6 @@ class Settings:
         return await transfers.run(exchange)
 
     async def _read_again(self, names: Iterable[str], idle_timeout_s: float) -> None:
-        """Read settings that may have changed, except write-only ones. If a read fails, discard the known value."""
         assert self._definition is not None
         settings = self._definition.settings
         readable = [name for name in names if name in settings and not settings[name].write_only]
@@ -340,7 +332,7 @@ class Settings:
         return None if self._definition is None else self._definition.settings.get(name)
 
     def _with_definition(self, setting: Setting) -> Setting:
-        """Return the setting with its value converted to the type in the definition, if there is one."""
+        """Convert the setting's value to the type in its definition, if there is one."""
         setting_definition = self._definition_of(setting.name)
         if setting_definition is None:
             return setting
@@ -357,7 +349,6 @@ class Settings:
             self._store(known.replace(value=message.mode_id))
 
     def _store(self, setting: Setting) -> None:
-        """Add a received setting to the table, and publish a change."""
         old = self._known.get(setting.name)
         if not setting.name or (old is None and len(self._known) >= MAX_PARAMETERS):
             return  # A faulty component may send empty names, or new names without end.

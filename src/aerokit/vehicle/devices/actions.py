@@ -164,18 +164,15 @@ class DeviceActions(VehicleBase):
 
 
 def _chunks(text: str) -> list[str]:
-    """Split a text into chunks of at most 50 bytes, between characters.
-
-    A receiver treats a chunk of less than 50 bytes as the last chunk. A chunk that cannot hold the next character is
-    therefore padded with spaces, and an empty chunk follows if the last of several chunks is full. A text of one chunk
-    has the id 0, and needs no end mark.
-    """
+    """Split a text into chunks of at most 50 bytes, between characters."""
     chunks = [""]
     for character in text:
         if len((chunks[-1] + character).encode()) > CHUNK_LENGTH:
+            # A receiver treats a chunk of less than 50 bytes as the last chunk, so this one is padded.
             chunks[-1] += " " * (CHUNK_LENGTH - len(chunks[-1].encode()))
             chunks.append("")
         chunks[-1] += character
+    # The last of several chunks must have less than 50 bytes. A text of one chunk has the id 0, and needs no end mark.
     if len(chunks) > 1 and len(chunks[-1].encode()) == CHUNK_LENGTH:
         chunks.append("")
     return chunks

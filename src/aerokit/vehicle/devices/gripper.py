@@ -51,7 +51,6 @@ class Gripper(ReadOnly):
         await self._move(GripperActions.RELEASE)
 
     async def _move(self, action: GripperActions) -> None:
-        """Send the command, and wait until the autopilot reports the end of the movement."""
         context, topic = self._context, ("gripper", self._number)
         order = SimpleOrder(f"gripper {action.name.lower()}", MavCmd.DO_GRIPPER, (NUMBER, action))
         if not context.session.autopilot.reports_gripper_by_text:

@@ -71,10 +71,11 @@ class Shell(ReadOnly):
         self._close(ConnectionClosed("the async with block of this vehicle was left"))
 
     def _close(self, error: Exception | None = None) -> None:
-        """Close the shell by a message that requests no response. A waiting reader raises ``error``."""
+        """Close the shell. A waiting reader raises ``error``."""
         self._detach_finish()
         self._output.close(error)
         if self._is_open and self._session.is_open:
+            # A message that requests no response closes the shell.
             self._send(b"", flags=0)
         self._is_open = False
 

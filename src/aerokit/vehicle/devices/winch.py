@@ -169,7 +169,6 @@ class Winch(ReadOnly):
     async def _send_until(
         self, flag: MavWinchStatusFlag, action: WinchActions, timeout: float = ACTION_TIMEOUT_S
     ) -> None:
-        """Send a command, and wait until WINCH_STATUS has this flag."""
         await self._send(action, is_done=lambda status: bool(status.status & flag), timeout=timeout)
 
     async def _send(
@@ -181,10 +180,7 @@ class Winch(ReadOnly):
         timeout: float = 5.0,
         order: Order | None = None,
     ) -> None:
-        """Send a command. With ``is_done``, wait until ``is_done`` returns True for a WINCH_STATUS.
-
-        ``order`` is the device order to which the command belongs; None creates one.
-        """
+        """Send a command as a part of ``order``, or as a new order."""
         self._check_supported(action)
         params = (self._number, action, length_m, rate_m_s)
         effect = None if is_done is None else Effect("WinchStatus", is_done)

@@ -52,7 +52,6 @@ class MeasurementEncoder:
         self._session = session
 
     def odometry(self, value: v.OdometryMeasurement) -> tuple[Message, ...]:
-        """Return ODOMETRY, converted from the axes of ROS to those of MAVLink if necessary."""
         check_range("quality", value.quality, -1, 100)
         orientation = value.orientation
         quaternion = orientation.quaternion if isinstance(orientation, Attitude) else orientation
@@ -97,21 +96,19 @@ class MeasurementEncoder:
         )
 
     def vision_position(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
-        """Return VISION_POSITION_ESTIMATE."""
         time_us, position, covariance = self._pose(value)
         attitude, reset_count = value.attitude, _reset_counter(value.reset_counter)
         roll, pitch, yaw = map(math.radians, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))
         return (m.VisionPositionEstimate(time_us, *position, roll, pitch, yaw, covariance, reset_count),)
 
     def motion_capture(self, value: v.PoseMeasurement) -> tuple[Message, ...]:
-        """Return ATT_POS_MOCAP, or VISION_POSITION_ESTIMATE for an autopilot that does not read ATT_POS_MOCAP."""
         if not self._session.autopilot.external.has_mocap:
             return self.vision_position(value)
         time_us, position, covariance = self._pose(value)
         return (m.AttPosMocap(time_us, value.attitude.quaternion, *position, covariance),)
 
     def _pose(self, value: v.PoseMeasurement) -> tuple[int, Vector, list[float]]:
-        """Check a pose; return its time stamp, its position and its covariance."""
+        """Return the time stamp in microseconds, the position and the covariance of a pose."""
         position = (value.north_m, value.east_m, value.down_m)
         check_finite("position", *position)
         check_finite("attitude", value.attitude.roll_deg, value.attitude.pitch_deg, value.attitude.yaw_deg)
@@ -119,7 +116,6 @@ class MeasurementEncoder:
         return self._time_us(value.measured_at), position, covariance
 
     def vision_speed(self, value: v.SpeedMeasurement) -> tuple[Message, ...]:
-        """Return VISION_SPEED_ESTIMATE. For an autopilot that does not read it, return ODOMETRY without a pose."""
         speeds = (value.north_m_s, value.east_m_s, value.down_m_s)
         check_finite("velocity", *speeds)
         time_us, reset_count = self._time_us(value.measured_at), _reset_counter(value.reset_counter)
@@ -152,7 +148,6 @@ class MeasurementEncoder:
         )
 
     def gps(self, value: v.GpsMeasurement) -> tuple[Message, ...]:
-        """Return GPS_INPUT."""
         for name, limit in (("latitude_deg", 90), ("longitude_deg", 180)):
             check_range(name, getattr(value, name), -limit, limit)
         check_finite("altitude_amsl_m", value.altitude_amsl_m)
@@ -202,7 +197,6 @@ class MeasurementEncoder:
         )
 
     def obstacles(self, value: v.ObstacleSectors) -> tuple[Message, ...]:
-        """Return OBSTACLE_DISTANCE with angles from the vehicle's nose."""
         check_range("step_deg", value.step_deg, 0, 360, above=True)
         check_range("first_deg", value.first_deg, -360, 360)
         count = len(value.distances_m)
@@ -230,7 +224,6 @@ class MeasurementEncoder:
         )
 
     def obstacle_points(self, value: v.ObstaclePoints) -> tuple[Message, ...]:
-        """Return one OBSTACLE_DISTANCE_3D for each point, all with the same time stamp."""
         check_range("min_m", value.min_m, 0, 1e5)
         check_range("max_m", value.max_m, 0, 1e5, above=True)
         time_ms = (self._time_us(value.measured_at) // 1000) & 0xFFFFFFFF  # The field has 32 bits.
@@ -243,7 +236,6 @@ class MeasurementEncoder:
         )
 
     def range_finder(self, value: v.RangeMeasurement) -> tuple[Message, ...]:
-        """Return DISTANCE_SENSOR."""
         if value.direction not in ORIENTATIONS:
             directions = ", ".join(ORIENTATIONS)
             raise InvalidArgument(f"direction = {value.direction!r} is not allowed: it must be one of {directions}")
@@ -271,7 +263,6 @@ class MeasurementEncoder:
         )
 
     def landing_target(self, value: v.TargetMeasurement) -> tuple[Message, ...]:
-        """Return LANDING_TARGET relative to the vehicle, or converted to the local frame for PX4."""
         offset = (value.forward_m, value.right_m, value.down_m)
         check_finite("target", *offset)
         check_range("number", value.number, 0, 255)
@@ -306,7 +297,6 @@ class MeasurementEncoder:
         )
 
     def optical_flow(self, value: v.FlowMeasurement) -> tuple[Message, ...]:
-        """Return OPTICAL_FLOW_RAD for PX4, or OPTICAL_FLOW scaled as ArduPilot reads it."""
         check_finite("flow", value.x_rad, value.y_rad, *(value.gyro_rad or ()))
         check_range("interval_s", value.interval_s, 0, 10, above=True)
         check_range("quality", value.quality, 0, 255)
@@ -352,7 +342,7 @@ class MeasurementEncoder:
         )
 
     def _in_local_frame(self, offset: Vector, *, is_level: bool) -> Vector:
-        """Return a position in the local frame; ``offset`` is relative to the vehicle, along its body axes."""
+        """Convert an offset from the vehicle, along its body axes, to a position in the local frame."""
         telemetry = self._session.telemetry
         if max(telemetry.attitude.age, telemetry.local_position.age) > POSITION_MAX_AGE_S:
             raise ValueUnknownError(
@@ -365,7 +355,7 @@ class MeasurementEncoder:
         return (own_position.north_m + north, own_position.east_m + east, own_position.down_m + down)
 
     def _time_us(self, measured_at: float | None) -> int:
-        """Return a time on the event loop's clock as a time stamp in microseconds. None means the present time."""
+        """Convert a time of the event loop to microseconds. None is the present."""
         now = self._session.connection.now()
         seconds = now if measured_at is None else measured_at
         check_range("measured_at", seconds, 0, now)
@@ -373,7 +363,6 @@ class MeasurementEncoder:
 
 
 def multiply(left: Quaternion, right: Quaternion) -> Quaternion:
-    """Return the product of two quaternions (w, x, y, z)."""
     (aw, ax, ay, az), (bw, bx, by, bz) = left, right
     return (
         aw * bw - ax * bx - ay * by - az * bz,
@@ -392,7 +381,7 @@ def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
 
 
 def _normalized(quaternion: Quaternion) -> Quaternion:
-    """Return the quaternion of the same rotation that has length 1 and a w that is not negative."""
+    """Return the same rotation as a quaternion with length 1 and w ≥ 0."""
     length = math.hypot(*quaternion)
     if not 0.9 < length < 1.1:
         raise InvalidArgument(f"orientation = {quaternion!r} is not allowed: its length must be 1")
@@ -402,19 +391,17 @@ def _normalized(quaternion: Quaternion) -> Quaternion:
 
 
 def _triangle(linear_variance: float | None, angular_variance: float | None) -> list[float]:
-    """Return the upper triangle of a 6x6 covariance matrix with three linear and three angular variances.
-
-    Only the diagonal is not 0. An unknown linear variance is sent as NaN in the first element. An unknown angular
-    variance is sent as 0: both autopilots then use the minimum in their parameters, and ArduPilot does not accept NaN
-    there.
-    """
+    """Return the upper triangle of a 6x6 covariance matrix with these variances on its diagonal."""
     _check_variance(linear_variance)
     _check_variance(angular_variance)
     triangle = [0.0] * TRIANGLE_SIZE
     for indexes, variance in ((POSITION_DIAGONAL, linear_variance), (ORIENTATION_DIAGONAL, angular_variance)):
         for index in indexes:
+            # For an angular variance of 0, both autopilots use the minimum in their parameters. ArduPilot does not
+            # accept NaN there.
             triangle[index] = variance or 0.0
     if linear_variance is None:
+        # NaN in the first element means that the linear variance is unknown.
         triangle[0] = NAN
     return triangle
 
@@ -435,7 +422,7 @@ def _centimetres(name: str, metres: float) -> int:
 
 
 def _gps_time(unix_time_s: float | None) -> tuple[int, int]:
-    """Return the number of the GPS week, and the milliseconds since this week began; zeros if the time is unknown."""
+    """Return the GPS week and the milliseconds since its start, or zeros if the time is unknown."""
     if unix_time_s is None:
         return 0, 0
     check_range("unix_time_s", unix_time_s, GPS_EPOCH_S, GPS_EPOCH_S + 65535 * SECONDS_PER_WEEK)

@@ -174,7 +174,6 @@ class External:
         await self._await_origin(origin, timeout)
 
     async def _await_origin(self, origin: Position, timeout: float) -> None:
-        """Request GPS_GLOBAL_ORIGIN every POLL_INTERVAL_S until it reports this origin."""
         cell, connection = self._session.telemetry.origin, self._session.connection
         until = connection.now() + timeout
         while (remaining_s := until - connection.now()) > 0:
@@ -203,7 +202,6 @@ class External:
 
 
 def _are_close(reported: Position, ordered: Position) -> bool:
-    """Return True if both origins are the same except for rounding."""
     if reported.altitude_amsl_m is None or ordered.altitude_amsl_m is None:
         return False
     has_same_altitude = abs(reported.altitude_amsl_m - ordered.altitude_amsl_m) <= ORIGIN_TOLERANCE_M

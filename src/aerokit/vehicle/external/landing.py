@@ -125,7 +125,7 @@ class TargetLanding:
         self._source_error: Exception | None = None
 
     async def read(self, source: TargetSource, period_s: float) -> None:
-        """Read the source until it ends or fails. Its error is raised by `acquire` or `await_disarmed`, not here."""
+        """Read the source until it ends. Its error is kept for `acquire` and `await_disarmed`."""
         try:
             if isinstance(source, AsyncIterable):
                 async for target in source:
@@ -142,7 +142,7 @@ class TargetLanding:
                 await source.aclose()
 
     async def acquire(self, reader: asyncio.Task[None], timeout: float) -> None:
-        """Wait until the target is visible for the first time, before the landing is ordered."""
+        """Wait until the target is visible for the first time."""
         started = self._now()
         while self._last is None:
             self._raise_if_source_failed()
@@ -153,7 +153,6 @@ class TargetLanding:
             await anyio.sleep(min(POLL_INTERVAL_S, timeout))
 
     async def await_disarmed(self, order: Order, timeout: float | None, max_silence_s: float | None) -> None:
-        """Wait until the vehicle is on the ground and disarmed."""
         telemetry, ground = self._session.telemetry, GroundCheck(self._session)
         landing_failure = self._context.sender.landing_failure(order)
 
@@ -181,7 +180,6 @@ class TargetLanding:
         )
 
     def report(self, *, was_target_sent: bool, texts: tuple[str, ...]) -> LandingReport:
-        """Return the report, once the landing has ended."""
         unseen_s = self._now() - self._seen_at
         return LandingReport(self._last, unseen_s, tuple(self._losses), self._climbed_m, was_target_sent, texts)
 
@@ -193,7 +191,6 @@ class TargetLanding:
             raise self._source_error
 
     def _on_target(self, target: TargetMeasurement | None) -> None:
-        """Send the target, if it is visible, and record it for the report."""
         if target is None:
             return
         check_kind("target", target, TargetMeasurement)

@@ -55,7 +55,6 @@ class TimesyncAnswers:
             self._detach = bus.attach(Timesync, self._on_timesync, system_id=self._session.system_id)
 
     def close(self) -> None:
-        """Stop answering requests if this was the last open stream."""
         self._open_streams -= 1
         if self._open_streams == 0 and self._detach is not None:
             self._detach()
@@ -196,7 +195,6 @@ class MeasurementStream(Generic[MeasurementT]):
             self._timer = asyncio.get_running_loop().call_at(self._next_at, self._flush)
 
     def _flush(self) -> None:
-        """Send the waiting measurement, unless it is too old or the vehicle is silent."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -235,7 +233,7 @@ class MeasurementStream(Generic[MeasurementT]):
         self._timesync_answers.close()
 
     async def _check_support(self) -> dict[str, float]:
-        """Return the parameters that decide whether the vehicle uses these measurements; raise if it ignores them."""
+        """Raise if the vehicle ignores these measurements. Return the parameters that decide this."""
         firmware, rule = self._session.autopilot.firmware, self._session.autopilot.external.kinds.get(self._kind)
         measurement = self._kind.replace("_", " ")
         if rule is None:

@@ -45,11 +45,8 @@ class RemoteFile(NamedTuple):
 def _limit(
     description: str, timeout: float | None, missing: Callable[[], tuple[tuple[int, int], ...]]
 ) -> Iterator[None]:
-    """Raise FileTimeout if the body of the `with` statement takes more than ``timeout`` seconds.
-
-    The error has the missing ranges of the file, which ``missing()`` returns. A TimeoutError that the body itself
-    raises, for example because of the disk, is not changed.
-    """
+    """Raise FileTimeout with the missing ranges if the block takes more than ``timeout`` seconds."""
+    # A TimeoutError that the block itself raises, for example because of the disk, is not changed.
     with anyio.move_on_after(timeout) as scope:
         yield
     if scope.cancelled_caught:
@@ -84,9 +81,9 @@ class FileChannel:
         idle_timeout_s: float,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Run one operation in a block, after the previous operations have ended and their sessions are closed.
+        """Run one operation in a block, after the previous operations have ended.
 
-        Raises FileTimeout after ``timeout`` seconds; the error has the ranges that ``missing()`` returns.
+        Raises FileTimeout after ``timeout`` seconds, with the ranges that ``missing()`` returns.
         """
         with _limit(description, timeout, missing):
             async with self._lock:
@@ -103,7 +100,7 @@ class FileChannel:
         offset: int = 0,
         data: bytes | None = None,
     ) -> FtpMessage:
-        """Send a request with a single reply; only in an :meth:`operation` block. ``data`` defaults to the path."""
+        """Send a request with a single reply. Call this only in an `operation` block."""
         request = FtpRequest(
             self.client,
             opcode,
@@ -123,9 +120,10 @@ class FileChannel:
         *,
         idle_timeout_s: float,
     ) -> T:
-        """Open a file, await ``use(file)`` and close the file; only in an :meth:`operation` block.
+        """Open a file, await ``use(file)`` and close the file.
 
-        If the vehicle itself closes the file, open it again and call ``use`` again.
+        Call this only in an `operation` block. If the vehicle closes the file, it is opened again and ``use`` is
+        called again.
         """
         for attempt in range(1, MAX_OPEN_ATTEMPTS + 1):
             file = await self._open(opcode, path, idle_timeout_s)
@@ -155,7 +153,6 @@ class FileChannel:
         raise AssertionError("the loop returns or raises")
 
     async def _open(self, opcode: MavFtpOpcode, path: str, idle_timeout_s: float) -> RemoteFile:
-        """Open a file. If another session is in the way, wait once until the vehicle times that session out."""
         may_wait = True
         may_be_own_session = True
         while True:
@@ -187,7 +184,6 @@ class FileChannel:
     def _session_request(
         self, opcode: MavFtpOpcode, path: str, session: int, idle_timeout_s: float, *, is_sent: bool = False
     ) -> FtpRequest:
-        """Create a request that opens or closes the session of a file."""
         return FtpRequest(
             self.client,
             opcode,
@@ -200,11 +196,10 @@ class FileChannel:
         )
 
     def _possible_sessions(self, request: FtpRequest) -> tuple[int, ...]:
-        """Return the ids that the session of a file may have if the reply to opening the file was lost."""
+        """Return the ids of the session that an unanswered request may have opened."""
         return (request.session,) if self.transfers.autopilot.accepts_ftp_session_ids else (request.session, 0)
 
     async def _close(self, session: int, path: str, idle_timeout_s: float) -> None:
-        """Close a session and wait for the confirmation; if that fails, continue in the background."""
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, idle_timeout_s)
         try:
             await self.transfers.run(request)
@@ -213,7 +208,7 @@ class FileChannel:
             raise
 
     def _close_soon(self, session: int, path: str) -> None:
-        """Close a session without waiting; the next operation waits for the confirmation."""
+        """Close a session without waiting. The next operation waits for the confirmation."""
         # The request is sent at once. The background task waits for the reply, and sends the request only to repeat it.
         request = self._session_request(MavFtpOpcode.TERMINATESESSION, path, session, IDLE_TIMEOUT_S, is_sent=True)
         with suppress(AerokitError):  # The connection may be closed.
@@ -223,12 +218,10 @@ class FileChannel:
                 self._closing[session] = (request, task)
 
     async def _confirm(self, request: FtpRequest) -> None:
-        """Wait for the reply, and repeat the request until then."""
         with suppress(AerokitError):  # If closing fails, the vehicle closes the session after its own time-out.
             await self.transfers.run(request)
 
     async def _finish_closing(self, session: int, idle_timeout_s: float) -> None:
-        """Wait for the reply to the request of :meth:`_close_soon`; if there is none, close the session again."""
         request, task = self._closing[session]
         await asyncio.wait((task,))
         if not request.is_answered:
@@ -248,7 +241,7 @@ class LogChannel:
     async def list(
         self, idle_timeout_s: float, only_id: int | None, *, max_unanswered: int | None
     ) -> tuple[LogEntry, ...]:
-        """Request all entries of the log list, or the entry of one log; only in an :meth:`operation` block."""
+        """Request the log list, or one entry of it. Call this only in an `operation` block."""
         transfers = self._transfers
         exchange = LogList(
             transfers.system_id,
@@ -271,7 +264,6 @@ class LogChannel:
         timeout: float | None,
         on_progress: OnProgress,
     ) -> None:
-        """Request ``size`` bytes of a log as one operation, and write them to ``into``."""
         transfers = self._transfers
         exchange = LogDownload(
             transfers.system_id,
@@ -293,9 +285,9 @@ class LogChannel:
         timeout: float | None,
         missing: Callable[[], tuple[tuple[int, int], ...]] = tuple,
     ) -> AsyncIterator[None]:
-        """Run one operation in a block, after the previous one. If it fails, tell the vehicle to stop sending.
+        """Run one operation in a block, after the previous one.
 
-        Raises FileTimeout after ``timeout`` seconds; the error has the ranges that ``missing()`` returns.
+        Raises FileTimeout after ``timeout`` seconds, with the ranges that ``missing()`` returns.
         """
         with _limit(description, timeout, missing):
             async with self._lock:
@@ -308,10 +300,7 @@ class LogChannel:
                     raise
 
     def _end(self) -> None:
-        """Send LOG_REQUEST_END, and repeat it in a background task until it is confirmed or the task gives up.
-
-        The next operation waits until this task has ended.
-        """
+        """Tell the vehicle to stop sending. The next operation waits for the confirmation."""
         transfers = self._transfers
         # LOG_REQUEST_END is sent at once. The background task sends it only to repeat it.
         exchange = LogStop(transfers.system_id, transfers.component_id, is_sent=True, round_trip=transfers.round_trip)

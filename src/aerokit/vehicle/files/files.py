@@ -274,13 +274,12 @@ class Files:
         offset: int = 0,
         data: bytes | None = None,
     ) -> FtpMessage:
-        """Send a request with a single reply, as one operation."""
         path_bytes(path)  # Raises InvalidArgument before anything is sent.
         async with self._channel.operation(path, timeout=timeout, idle_timeout_s=idle_timeout_s):
             return await self._channel.request(opcode, path, idle_timeout_s=idle_timeout_s, offset=offset, data=data)
 
     async def _list_from(self, path: str, offset: int, idle_timeout_s: float) -> FtpMessage | None:
-        """Return the entries in one message of a listing; None after the end of the listing."""
+        """Return one message of a listing, or None after its end."""
         try:
             return await self._channel.request(
                 MavFtpOpcode.LISTDIRECTORY, path, idle_timeout_s=idle_timeout_s, offset=offset
@@ -298,12 +297,10 @@ class Files:
         timeout: float | None,
         on_progress: OnProgress | None,
     ) -> None:
-        """Read a file into ``into``, beginning at ``into.start``."""
         path_bytes(path)  # Raises InvalidArgument before anything is sent.
         channel = self._channel
 
         async def read_file(file: RemoteFile) -> None:
-            """Read the opened file from the last received byte on; called again if the vehicle closes the file."""
             if file.size < into.start:  # The file is shorter than what an interrupted download has already read.
                 raise _ShorterError
             # A file that the vehicle closes during the read is opened again, so its size may have changed.
@@ -335,13 +332,12 @@ class Files:
         timeout: float | None,
         on_progress: OnProgress | None,
     ) -> None:
-        """Read a file into a local one, from byte ``start`` on."""
         with part.writing(start) as disk:
             into = Reassembly(disk.write, block_size=DATA_SIZE, start=start)
             await self._fetch(path, into, idle_timeout_s, timeout, on_progress)
 
     async def _has_same_crc(self, path: str, part: PartFile, idle_timeout_s: float, timeout: float | None) -> bool:
-        """Return True if the copy and the vehicle's file have the same CRC-32, or the vehicle cannot compute it."""
+        """Compare the CRC-32 of both files. Return True if the vehicle cannot compute it."""
         try:
             vehicle_crc = await self.crc32(path, idle_timeout_s=idle_timeout_s, timeout=timeout)
         except FileError as error:
@@ -353,7 +349,6 @@ class Files:
     async def _upload_to(
         self, file: RemoteFile, path: str, data: bytes, idle_timeout_s: float, on_progress: OnProgress | None
     ) -> None:
-        """Write the content of a file that the vehicle has opened."""
         transfer = FtpUpload(
             self._channel.client,
             path,
@@ -366,10 +361,6 @@ class Files:
         await self._transfers.run(transfer)
 
     async def _verify(self, path: str, data: bytes, idle_timeout_s: float) -> None:
-        """Raise VerificationFailed if the vehicle computes another CRC-32 for its file.
-
-        Does nothing if the vehicle cannot compute it.
-        """
         own_crc = _crc32(data)
         try:
             reply = await self._channel.request(MavFtpOpcode.CALCFILECRC, path, idle_timeout_s=idle_timeout_s)
@@ -394,7 +385,7 @@ def _content_of(source: str | os.PathLike[str]) -> bytes:
 
 
 def _parse_entry(text: bytes) -> FileEntry | None:
-    """Parse one entry of a listing; return None for an entry that is not a file or a subdirectory."""
+    """Parse one entry of a listing. Return None for an entry to skip."""
     # The kind is D for a directory and F for a file. MAVFTP also has S for an entry to skip.
     kind, name_and_size = text[:1], text[1:].decode("utf-8", "replace")
     name, _, size_text = name_and_size.partition("\t")
@@ -413,7 +404,7 @@ def _crc32_in(path: str, reply: FtpMessage) -> int:
 
 
 def _crc32(data: bytes, previous_crc: int = 0) -> int:
-    """Return the CRC-32 as MAVFTP defines it. Unlike zlib, MAVFTP does not invert the start value and the result."""
+    # Unlike zlib, MAVFTP does not invert the start value and the result.
     return zlib.crc32(data, previous_crc ^ CRC_INVERSION) ^ CRC_INVERSION
 
 

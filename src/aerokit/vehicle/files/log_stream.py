@@ -52,7 +52,7 @@ class UlogAssembler:
         """Time of the last message that was used."""
 
     def add(self, message: LoggingData | LoggingDataAcked, now: float) -> bytes:
-        """Add a message of the stream; return the bytes to append to the file. Incomplete messages are kept."""
+        """Add a message of the stream, and return the bytes to append to the file."""
         gap = 0 if self._next_sequence is None else (message.sequence - self._next_sequence) % SEQUENCE_RANGE
         if gap >= SEQUENCE_RANGE // 2:  # PX4 repeats a message if our acknowledgement was lost.
             return b""
@@ -81,9 +81,9 @@ class UlogAssembler:
         return prefix + self._pop_complete()
 
     def _pop_complete(self) -> bytes:
-        """Remove and return the complete messages: 2 bytes of length, 1 byte of type, content."""
         end = 0
         while len(self._buffer) >= end + 3:
+            # A ULog message has 2 bytes of length, 1 byte of type, and the content.
             message_size = 3 + int.from_bytes(self._buffer[end : end + 2], "little")
             if len(self._buffer) < end + message_size:
                 break
@@ -144,14 +144,14 @@ class LogStream(ReadOnly):
         self._detach_finish()
 
     def _stop_soon(self) -> None:
-        """Stop the stream without waiting. The command is sent now, because the vehicle's block may end next."""
         session = self._context.session
         if session.is_open:
+            # The command is sent now, because the vehicle's block may end next.
             session.commands.send_unconfirmed(MavCmd.LOGGING_STOP)
             session.transfers.command_in_background(MavCmd.LOGGING_STOP, was_just_sent=True)
 
     def _acknowledge(self, message: LoggingDataAcked) -> None:
-        """Acknowledge a message at once. PX4 repeats it every 50 ms until then, and ends the stream after 50 times."""
+        # PX4 repeats a message every 50 ms until it is acknowledged, and ends the stream after 50 times.
         session = self._context.session
         session.send(LoggingAck(session.system_id, session.component_id, message.sequence))
 

@@ -75,7 +75,6 @@ class GrowthReporter:
             self._on_progress(progress)
 
     def report(self) -> None:
-        """Log an INFO message if the flight log has grown since it was listed; called at the end of a download."""
         if self._present_size > self._entry.size:
             logger.info(
                 "flight log %d was still being written: listed with %d bytes, downloaded with %d",
@@ -251,8 +250,7 @@ class Logs:
     ) -> tuple[str | None, LogEntry]:
         """Return the path of a log for MAVFTP, and the entry of the log.
 
-        If the path is None, the caller must download the log by LOG_* messages. The entry was then just received, so
-        that its size is right.
+        If the path is None, the caller must download the log by LOG_* messages.
         """
         prefers_messages = method == "log" or (method == "auto" and self._transfers.autopilot.prefers_log_messages)
         if isinstance(log, LogEntry) and not prefers_messages:
@@ -277,7 +275,7 @@ class Logs:
         return path, entry
 
     async def _path(self, entry: LogEntry, idle_timeout_s: float) -> str | None:
-        """Return the path of a log for MAVFTP; None without MAVFTP, or if the file cannot be identified."""
+        """Return the path of a log for MAVFTP, or None if MAVFTP cannot be used for it."""
         directories = self._transfers.autopilot.log_directories
         if not directories or not await self._files.is_supported():
             return None
@@ -289,11 +287,10 @@ class Logs:
         """Return the current entry of a log.
 
         With ``gives_up_early``, raises FileTimeout after ``MAX_UNANSWERED_REQUESTS`` requests without an answer.
-        For a `LogEntry`, only this entry is requested. For an id, the whole list is requested, because the log may not
-        exist: ArduPilot answers the request for a single nonexistent log by a list of nonexistent logs that does not
-        end until LOG_REQUEST_END.
         """
         log_id = log if isinstance(log, int) else log.id
+        # For an id, the whole list is requested, because the log may not exist. ArduPilot answers the request for a
+        # single nonexistent log by a list of nonexistent logs that does not end until LOG_REQUEST_END.
         only_id = None if isinstance(log, int) else log.id
         max_unanswered = MAX_UNANSWERED_REQUESTS if gives_up_early else None
         async with self._channel.operation(f"log {log_id}", timeout):
@@ -308,7 +305,6 @@ class Logs:
     async def _entries(
         self, idle_timeout_s: float, only_id: int | None = None, max_unanswered: int | None = None
     ) -> tuple[LogEntry, ...]:
-        """Request the list of logs. Erased logs, which ArduPilot lists with a size of 0, are left out."""
         autopilot, request_list = self._transfers.autopilot, self._channel.list
         logs: Sequence[LogMessage | ListedLog] | None = None
         if autopilot.silent_without_logs and await self._files.is_supported():
@@ -321,6 +317,7 @@ class Logs:
                 max_unanswered = None
         if logs is None:
             logs = await request_list(idle_timeout_s, only_id, max_unanswered=max_unanswered)
+        # ArduPilot lists erased logs with a size of 0.
         return tuple(_entry_of(log) for log in logs if log.size)
 
 
@@ -336,10 +333,7 @@ def _entry_of(log: LogMessage | ListedLog) -> LogEntry:
 
 
 def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
-    """Return True if two entries with the same id, from an old and a new list, cannot be of the same log.
-
-    A log grows while it is written. If it is smaller or much older than before, it is another log.
-    """
+    # A log grows while it is written. If it is smaller or much older than before, it is another log.
     if new.size < old.size:
         return True
     if old.time_utc is None:
@@ -348,11 +342,9 @@ def _is_different_log(old: LogEntry, new: LogEntry) -> bool:
 
 
 def _still_listed(logs: tuple[LogEntry, ...], listed: tuple[LogEntry, ...]) -> tuple[LogEntry, ...]:
-    """Return the entries of ``listed``, a newer list, whose logs are also in ``logs``.
-
-    Logs are compared by time and size, because a new log may get the id of an erased one. Only the newest of ``logs``
-    may have grown since: it is found by its id, unless the entry with this id shows a different log.
-    """
+    """Return the entries in a newer list of the logs in ``logs``."""
+    # Logs are compared by time and size, because a new log may get the id of an erased one. Only the newest log may
+    # have grown since, so it is found by its id.
     newest = logs[-1]
     kinds = {(entry.time_utc, entry.size) for entry in logs}
     return tuple(
@@ -389,11 +381,9 @@ async def log_path(
     *,
     may_have_grown: bool = False,
 ) -> str | None:
-    """Return the path of a log for MAVFTP; None if the file cannot be identified.
+    """Return the path of a log for MAVFTP, or None if the file cannot be identified.
 
-    ArduPilot: log 1 is the file with the lowest number, such as ``00000001.BIN``. PX4: when its logs are requested, it
-    writes a list file, which has one path for each log id. The file must be as large as ``log`` says. On ArduPilot, it
-    may be larger if it is the newest one, or if the log was still being written at that time (``may_have_grown``).
+    The file must be as large as ``log`` says. With ``may_have_grown``, ArduPilot's file may be larger.
     """
     for directory in directories:
         try:
@@ -406,10 +396,12 @@ async def log_path(
             if match is not None:
                 numbered[int(match[1])] = entry
         if numbered:
+            # If the numbers began again from 1, the file with the lowest number is not the oldest.
             if await _have_numbers_wrapped(files, directory, max(numbered), idle_timeout_s):
                 return None
             return _numbered_path(directory, numbered, log, may_have_grown)
         if any(entry.is_directory for entry in entries):  # PX4 has a directory for each day or session.
+            # When its logs are requested, PX4 writes a list file with one path for each log id.
             logs = await _read_list_file(files, directory, idle_timeout_s)
             # Both sizes, in the list and in `log`, are from the time at which PX4 wrote the list.
             has_same_size = log.id < len(logs) and logs[log.id].size == log.size
@@ -420,7 +412,7 @@ async def log_path(
 async def listed_logs(
     files: Files, directories: tuple[str, ...], idle_timeout_s: float
 ) -> tuple[ListedLog, ...] | None:
-    """Return the logs in the list file that PX4 writes on request; None if there are logs but no list file."""
+    """Return the logs in PX4's list file. None means that there are logs but no list file."""
     for directory in directories:
         try:
             entries = await files.list(directory, idle_timeout_s=idle_timeout_s)
@@ -432,7 +424,6 @@ async def listed_logs(
 
 
 async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -> tuple[ListedLog, ...]:
-    """Read the list file next to the directory of the logs; return an empty tuple if there is none."""
     root = directory.rpartition("/")[0]
     try:
         text = await files.read(f"{root}/{PX4_LIST}", idle_timeout_s=idle_timeout_s)
@@ -452,11 +443,8 @@ async def _read_list_file(files: Files, directory: str, idle_timeout_s: float) -
 
 
 async def _have_numbers_wrapped(files: Files, directory: str, highest: int, idle_timeout_s: float) -> bool:
-    """Return True if ArduPilot has begun to number its files from 1 again.
-
-    The file with the lowest number is then not the oldest. LASTLOG.TXT contains the number of the newest log.
-    ``highest`` is the highest number among the log files in ``directory``.
-    """
+    """Return True if ArduPilot has begun to number its files from 1 again."""
+    # LASTLOG.TXT contains the number of the newest log.
     try:
         text = await files.read(f"{directory}/LASTLOG.TXT", idle_timeout_s=idle_timeout_s)
     except FileError:
@@ -466,7 +454,7 @@ async def _have_numbers_wrapped(files: Files, directory: str, highest: int, idle
 
 
 def _numbered_path(directory: str, entries: dict[int, FileEntry], log: LogEntry, may_have_grown: bool) -> str | None:
-    """Return the path of a log among ArduPilot's numbered files; log 1 is the file with the lowest number."""
+    # Log 1 is the file with the lowest number, such as ``00000001.BIN``.
     number = min(entries) + log.id - 1
     entry = entries.get(number)
     if entry is None or entry.size is None:

@@ -55,9 +55,9 @@ class ReleaseCommand:
         self._target = orders.manager_id
 
     async def send_and_wait(self, description: str) -> None:
-        """Send the command, if it is still due, and wait for the acknowledgement.
+        """Send the command and wait for its acknowledgement.
 
-        Raises OperationTimeout if the vehicle is silent.
+        Raises OperationTimeout if the vehicle is silent. The command is then sent at the next HEARTBEAT.
         """
         if not self._is_still_due():
             return
@@ -76,9 +76,9 @@ class ReleaseCommand:
             raise
 
     def send_soon(self, *, was_just_sent: bool = False) -> None:
-        """Send the command without waiting, e.g. when a block exits by an error or cancellation.
+        """Send the command without waiting, and repeat it if no ack arrives.
 
-        With ``was_just_sent``, the caller has already sent the command: it is sent again only if no ack arrives.
+        ``was_just_sent`` means that the caller has sent the command already.
         """
         if not self._session.is_open or not self._is_still_due():
             return
@@ -87,11 +87,6 @@ class ReleaseCommand:
             self._send()
 
         async def send_until_acknowledged() -> None:
-            """Wait for the acknowledgement. If the vehicle was silent, first send the command at its next HEARTBEAT.
-
-            If the gimbal manager is silent and does not acknowledge, send the command again at the manager's next
-            HEARTBEAT.
-            """
             with suppress(AerokitError):  # This task runs in the background, so no call waits for its errors.
                 if not can_send_now:
                     await self._session.wait_for_heartbeat()
@@ -116,7 +111,6 @@ class ReleaseCommand:
         self._session.commands.send_unconfirmed(self._command, *self._params, component_id=self._target)
 
     async def _confirm(self) -> None:
-        """Wait for the ack of the command that was just sent. Each retry first checks `_is_still_due`."""
         with self._orders.context.arbiter.auxiliary_order() as order:
             await self._orders.context.sender.send_long(
                 order,
@@ -134,7 +128,6 @@ class ReleaseCommand:
         return not is_autopilot and self._orders.registry.silent_for_s(self._target) > SILENT_AFTER_S
 
     async def _wait_target_heartbeat(self) -> None:
-        """Wait for the next HEARTBEAT of the gimbal manager."""
         received = asyncio.Event()
 
         def on_heartbeat(heartbeat: Heartbeat) -> None:
@@ -283,7 +276,6 @@ class GimbalControl:
             release.send_soon()
 
     async def _request_control(self) -> None:
-        """Send the command that requests control; raise NotSupported if the manager does not know it."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary)
         try:
@@ -294,7 +286,7 @@ class GimbalControl:
             raise
 
     async def _await_confirmation(self, since: float) -> None:
-        """Wait for a GIMBAL_MANAGER_STATUS, received after ``since``, that confirms our control."""
+        """Wait for a GIMBAL_MANAGER_STATUS after ``since`` that confirms our control."""
         orders, session = self._orders, self._session
         reported = orders.public_device.controllers
         if orders.manager_id == session.component_id:  # Only the autopilot is asked for messages at a rate.
@@ -321,7 +313,6 @@ class GimbalControl:
         self._detach_callbacks.append(device.controllers.observe(self._on_controllers, every_arrival=True))
 
     def _on_controllers(self, _: GimbalControllers | None, controllers: GimbalControllers) -> None:
-        """Record and publish the loss of control when the manager reports another controller."""
         controller = self._controller_in(controllers)
         if controller == self._orders.own_ids or self._taken is not None:
             return
@@ -340,7 +331,6 @@ class GimbalControl:
         return controllers.primary if self._is_primary else controllers.secondary
 
     def _release_command(self) -> ReleaseCommand:
-        """Return the command that releases control. It sends nothing if control was lost or other blocks need it."""
         orders = self._orders
         params = orders.control_params(is_primary=self._is_primary, release=True)
         requests = orders.registry.control_requests
@@ -355,13 +345,12 @@ class GimbalControl:
         return ReleaseCommand(orders, CONFIGURE, params, is_still_due)
 
     def _finish(self) -> None:
-        """Release control without waiting, because the vehicle's block ends."""
         release = self._release_command()
         self._end()
         release.send_soon()
 
     def _end(self) -> None:
-        """Forget the control that this block has requested or obtained. Sends nothing."""
+        """Forget the control that this block has. Sends nothing."""
         self._is_ended = True
         self._lost.set()  # Calls of `until_lost` end too.
         requests = self._orders.registry.control_requests

@@ -97,7 +97,7 @@ def information_of(
     manager: GimbalManagerInformation | None,
     device: GimbalDeviceInformation | None,
 ) -> GimbalInformation:
-    """Combine the messages of manager and device; the manager's capabilities and limits take precedence."""
+    """Combine the messages of manager and device. The manager's limits take precedence."""
     source = manager or device
     assert source is not None
     information = GimbalInformation(
@@ -197,9 +197,9 @@ class GimbalDevice:
         context.session.register_cell(self.controllers)
 
     def _request_attitude(self, session: VehicleSession) -> Detach | None:
-        """Request GIMBAL_DEVICE_ATTITUDE_STATUS from the autopilot, unless another component sends the attitude."""
         source = self.attitude.source
         if source is not None and source.component_id != session.component_id:
+            # Another component than the autopilot sends the attitude.
             return None
         return session.rates.request(GimbalDeviceAttitudeStatus, SUBSCRIPTION_HZ, is_optional=True)
 
@@ -213,12 +213,10 @@ class GimbalDevice:
 
     @property
     def is_in_use(self) -> bool:
-        """True while this program controls the gimbal, or while an order to the gimbal is unfinished."""
         return bool(self.control_blocks or self.pending_orders)
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Count an order as pending for the duration of the block."""
         self.pending_orders += 1
         try:
             yield
@@ -233,7 +231,7 @@ class GimbalDevice:
         self.failures = message.failure_flags
 
     def update_status(self, message: GimbalManagerStatus) -> bool:
-        """Set the controllers from a status; return False if it arrived late (see ``REORDER_WINDOW_MS``)."""
+        """Record the controllers of the gimbal. Return False if the message arrived late."""
         older_by_ms = self._status_ms - message.time_boot_ms
         if 0 < older_by_ms < REORDER_WINDOW_MS:
             return False
@@ -247,7 +245,6 @@ class GimbalDevice:
         self.controllers.set(GimbalControllers(primary, secondary), self._source(message))
 
     def update_manager(self, component_id: int, rank: int, *, is_old_gone: bool) -> None:
-        """Record a manager. It replaces the present manager if that has a lower rank, or if ``is_old_gone``."""
         if self.manager_id == component_id:
             self._manager_rank = max(self._manager_rank, rank)
         elif self.manager_id is None or rank > self._manager_rank or is_old_gone:
@@ -256,7 +253,6 @@ class GimbalDevice:
             self._status_ms = 0  # The time stamps of the new manager are from another clock.
 
     def reset(self) -> None:
-        """Forget what the gimbal and its manager have reported, because the vehicle has rebooted."""
         self.reboots += 1
         self._status_ms = 0
         self._manager_rank = 0
@@ -288,19 +284,15 @@ class ControlRequest:
         self.must_release = False
 
     def is_released_with(self, other: ControlRequest) -> bool:
-        """Return True if one release command would release the control of both requests."""
         has_same_role = (self.manager_id, self.is_primary) == (other.manager_id, other.is_primary)
         is_same_gimbal = self.gimbal_id_param == other.gimbal_id_param
         is_for_all_gimbals = 0 in (self.gimbal_id_param, other.gimbal_id_param)
         return has_same_role and (is_same_gimbal or is_for_all_gimbals)
 
     def leave_release_to(self, requests: Iterable[ControlRequest]) -> bool:
-        """Leave the release to other blocks of this program that need the same control; return False if there are none.
-
-        Releasing now would take the control from these blocks. Their requests are marked, so that these blocks release
-        the control when they end.
-        """
+        """Let other blocks with the same control release it later. Return False if there are none."""
         shared = [request for request in requests if request is not self and request.is_released_with(self)]
+        # Releasing now would take the control from these blocks, so they release it when they end.
         for request in shared:
             request.must_release = True
         return bool(shared)

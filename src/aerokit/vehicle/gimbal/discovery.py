@@ -63,21 +63,19 @@ class GimbalRegistry:
 
     @property
     def first(self) -> GimbalDevice:
-        """The gimbal that ``vehicle.gimbal`` stands for. Gimbals that are gone come after all others."""
+        """The gimbal that ``vehicle.gimbal`` stands for."""
         return min(self.devices.values(), key=self.sort_key, default=self.placeholder)
 
     @property
     def first_reporting(self) -> GimbalDevice | None:
-        """The gimbal that comes first by ``sort_key`` among those that have reported their attitude."""
         reporting = [device for device in self.devices.values() if device.attitude.is_known]
         return min(reporting, key=self.sort_key, default=None)
 
     def sort_key(self, device: GimbalDevice) -> tuple[bool, tuple[int, int]]:
-        """Key for sorting gimbals. Those that are gone come last, unless an order or a control block uses them."""
+        # Gimbals that are gone come last. A gimbal in use does not count as gone.
         return (not device.is_in_use and self._is_device_gone(device), device.key)
 
     def silent_for_s(self, component_id: int) -> float:
-        """Seconds since the last message of a component; inf if there was none."""
         return self._session.connection.now() - self._received_at.get(component_id, -math.inf)
 
     def _is_device_gone(self, device: GimbalDevice) -> bool:
@@ -94,13 +92,13 @@ class GimbalRegistry:
         return autopilot_received_at - silent_since > MAX_SILENCE_S
 
     def find(self, device_id: int) -> GimbalDevice | None:
-        """Return the gimbal with this id. A gimbal attached to the autopilot takes precedence over others."""
         matching = [device for device in self.devices.values() if device.device_id == device_id]
         autopilot_id = self._session.component_id
+        # A gimbal attached to the autopilot takes precedence over others with the same id.
         return min(matching, key=lambda device: (device.component_id != autopilot_id, device.key), default=None)
 
     def device(self, component_id: int, number: int) -> GimbalDevice | None:
-        """Return the gimbal with this component id and number, created if needed; None if there are too many."""
+        """Return this gimbal, created if needed, or None if there are too many."""
         key = (component_id, number)
         device = self.devices.get(key)
         if device is None and len(self.devices) < MAX_GIMBALS:
@@ -116,7 +114,6 @@ class GimbalRegistry:
             self._session.at_close(bus.attach(message_type, callback, system_id=self._session.system_id))
 
     def _record_received(self, message: Message) -> None:
-        """Record when the sender was last received, and when the autopilot's last silence ended."""
         frame = message.received_frame
         if frame is None:
             return
@@ -126,10 +123,7 @@ class GimbalRegistry:
         self._received_at[frame.component_id] = self._session.connection.now()
 
     def _device_of(self, message: Message, device_id: int) -> GimbalDevice | None:
-        """Return the gimbal that a message is about: the sender itself, or a gimbal attached to the sender (1 to 6).
-
-        Returns None if the message is about another component, or if there are too many gimbals.
-        """
+        """Return the gimbal that a message is about, or None if it is about no gimbal."""
         self._record_received(message)
         frame = message.received_frame
         component_id = self._session.component_id if frame is None else frame.component_id
@@ -148,7 +142,6 @@ class GimbalRegistry:
         return device
 
     def _on_device(self, message: GimbalDeviceAttitudeStatus) -> None:
-        """Set the attitude of the gimbal, and also that of `placeholder` if the gimbal is `first_reporting`."""
         device = self._device_of(message, message.gimbal_device_id)
         if device is None:
             return
@@ -181,9 +174,9 @@ class GimbalRegistry:
     def _managed_device(
         self, message: GimbalManagerStatus | GimbalManagerInformation, device_id: int
     ) -> GimbalDevice | None:
-        """Return the gimbal that a manager's message is about; record the sender as this gimbal's manager.
+        """Record the sender as the manager of a gimbal, and return the gimbal.
 
-        Returns None if another manager of this gimbal has a higher rank, or if the gimbal or the sender is unknown.
+        Returns None if another manager has a higher rank, or if the gimbal is unknown.
         """
         frame = message.received_frame
         if frame is None:
@@ -219,7 +212,7 @@ class GimbalRegistry:
             device.device_information = message
 
     def heading(self) -> float | None:
-        """Return the vehicle's heading in degrees; None while no recent one is known."""
+        """Return the vehicle's heading in degrees, or None if no recent one is known."""
         attitude = self._session.telemetry.attitude
         return attitude.value.yaw_deg if attitude.age <= HEADING_MAX_AGE_S else None
 

@@ -63,7 +63,7 @@ class _SystemTracker:
             self._detach()
 
     def direction(self) -> Angles | None:
-        """Direction from the vehicle to the other system; None while unknown."""
+        """Return the direction from the vehicle to the other system, or None while it is unknown."""
         if self._position is None or self._context.session.connection.now() - self._received_at > POSITION_MAX_AGE_S:
             return None
         return direction_to(self._context, self._position)

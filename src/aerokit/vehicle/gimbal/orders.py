@@ -58,53 +58,50 @@ class GimbalOrders:
 
     @property
     def device(self) -> GimbalDevice:
-        """The gimbal that orders go to. For ``vehicle.gimbal``, this is the gimbal that is the first at present."""
+        """The gimbal that orders go to."""
         return self.registry.first if self._device is None else self._device
 
     @property
     def public_device(self) -> GimbalDevice:
-        """The device whose state cells the program reads. For the first gimbal, it is always the placeholder."""
+        """The device whose state cells the program reads."""
         return self.registry.placeholder if self._device is None else self._device
 
     @property
     def attitude_source(self) -> GimbalDevice:
-        """The device that has the gimbal's attitude. Until a gimbal reports, ``vehicle.gimbal`` has a placeholder."""
+        # Until a gimbal reports its attitude, the placeholder has it.
         is_mount = self._device is None and self.registry.first_reporting is None
         return self.registry.placeholder if is_mount else self.device
 
     @property
     def manager_id(self) -> int:
-        """Component id that orders are sent to: the manager's, or the autopilot's until a manager is known."""
         manager_id = self.device.manager_id
+        # The autopilot counts as the manager until one is known.
         return self.session.component_id if manager_id is None else manager_id
 
     @property
     def gimbal_id_param(self) -> int:
-        """Gimbal device id for commands; 0 for the first gimbal of an autopilot."""
         if self._device is None and self.manager_id == self.session.component_id:
+            # 0 stands for the first gimbal of an autopilot.
             return 0
         return self.device.device_id
 
     @property
     def rules(self) -> GimbalRules:
-        """Capabilities of the manager. A manager other than the autopilot is expected to follow the standard."""
         is_autopilot = self.manager_id == self.session.component_id
+        # A manager other than the autopilot is expected to follow the standard.
         return self.session.autopilot.gimbals if is_autopilot else STANDARD_RULES
 
     @property
     def roi_parameter(self) -> int:
-        """Parameter of region-of-interest commands that selects the gimbal; 0 if the manager does not read it."""
         return self.gimbal_id_param if self.rules.roi_per_gimbal else 0
 
     def check_roi(self) -> None:
-        """Raise unless region-of-interest commands can be sent to this gimbal now."""
         if not self.rules.roi_per_gimbal and self.gimbal_id_param not in (0, 1):
             raise self.not_supported("supports a region of interest for its first gimbal only")
         self.raise_if_taken()
 
     @property
     def own_ids(self) -> tuple[int, int]:
-        """System id and component id of this program."""
         return self.session.connection.source_system, self.session.connection.source_component
 
     @property
@@ -112,16 +109,15 @@ class GimbalOrders:
         return f"gimbal {self.device.device_id}" if self.device.component_id else "the gimbal"
 
     async def send(self, order: Order | None, command: int, *params: float) -> None:
-        """Send a COMMAND_LONG to the manager, as a part of ``order`` if there is one."""
+        """Send a COMMAND_LONG to the manager, as a part of ``order`` or as an order of its own."""
         with self.context.arbiter.auxiliary_order(order) as sent_order:
             await self.context.sender.send_long(sent_order, command, *params, component_id=self.manager_id)
 
     def begin_order(self) -> Order:
-        """Create an order to the gimbal, which supersedes the previous one."""
         return self.context.arbiter.device_order(self.device.topic)
 
     async def send_claiming_control(self, command: int, send: Callable[[], Awaitable[None]]) -> None:
-        """Send a command. If the manager denies it because we are not in control, claim control and send it again."""
+        """Send a command. If the manager denies it, claim control and send it again."""
         self.raise_if_taken()
         self.claim_if_denied(command)  # An earlier command may have been denied.
         try:
@@ -136,7 +132,7 @@ class GimbalOrders:
     async def send_pitch_yaw(
         self, order: Order, pitch: float, yaw: float, *, rates: tuple[float, float] = (NAN, NAN), flags: int
     ) -> bool:
-        """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW; return False if the manager does not support it.
+        """Send MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW. Return False if the manager does not support it.
 
         Angles are in degrees, ``rates`` (pitch, yaw) in degrees per second. NaN leaves a value to the gimbal.
         """
@@ -153,8 +149,6 @@ class GimbalOrders:
         return True
 
     async def send_roi(self, order: Order, command: int, *params: float, **place: Any) -> None:
-        """Send a region-of-interest command, as COMMAND_INT if it has a position."""
-
         async def send() -> None:
             with self.context.arbiter.auxiliary_order(order) as sent_order:
                 commands = self.session.commands
@@ -175,7 +169,7 @@ class GimbalOrders:
     async def send_mount_mode(self, order: Order, mode: int, pitch: float = 0, roll: float = 0, yaw: float = 0) -> bool:
         """Send DO_MOUNT_CONTROL, or MOUNT_CONFIGURE to older firmware.
 
-        Returns False if MOUNT_CONFIGURE was sent, which contains the mode but no angles.
+        Returns True if the angles were sent. MOUNT_CONFIGURE contains only the mode.
         """
         self.raise_if_taken()
         if not self.session.commands.is_unsupported(MOUNT, self.manager_id):
@@ -192,15 +186,16 @@ class GimbalOrders:
         return False
 
     def _send_unanswered(self, order: Order, message: Message) -> None:
-        """Send a message that has no acknowledgement. Raises OperationRejected if a newer order was given meanwhile."""
+        """Send a message that has no ack. Raises OperationRejected after a newer order."""
         with self.context.arbiter.auxiliary_order(order):
             self.session.send(message)
 
     async def send_mount_angles(self, order: Order, pitch: float, roll: float, yaw: float, *, from_nose: bool) -> None:
-        """Send mount angles. The mount turns with the vehicle: a yaw from north is correct only at the time of sending.
+        """Send mount angles in degrees.
 
         Raises OperationTimeout if the vehicle's heading is needed and stays unknown.
         """
+        # The mount turns with the vehicle, so a yaw from north is correct only at the time of sending.
         yaw_from_nose = yaw if from_nose else math.remainder(yaw - await self._heading(), 360.0)
         were_angles_sent = await self.send_mount_mode(order, MavMountMode.MAVLINK_TARGETING, pitch, roll, yaw_from_nose)
         if not were_angles_sent:
@@ -217,7 +212,7 @@ class GimbalOrders:
             self._send_unanswered(order, message)
 
     async def _heading(self) -> float:
-        """Return the vehicle's heading in degrees; request it, and wait for it, if no recent one is known."""
+        """Return the vehicle's heading in degrees. Wait for it if no recent one is known."""
         heading = self.registry.heading()
         if heading is None:
             with self.session.streaming("attitude"):
@@ -230,8 +225,6 @@ class GimbalOrders:
         return heading
 
     def ask_in_background(self, message_id: int) -> None:
-        """Request a message from the manager once; errors are ignored."""
-
         async def ask() -> None:
             with suppress(AerokitError):
                 await self.ask(message_id, self.manager_id)
@@ -239,13 +232,12 @@ class GimbalOrders:
         self.session.background.start(ask, "aerokit gimbal")
 
     async def ask(self, message_id: int, component_id: int, *, attempts: int = 3) -> None:
-        """Request one copy of a message from a component. The request is sent at most ``attempts`` times."""
         await self.session.commands.send_long(
             MavCmd.REQUEST_MESSAGE, message_id, component_id=component_id, attempts=attempts
         )
 
     async def wait_for(self, is_done: Callable[[], bool], message_type: type[Message], within_s: float) -> None:
-        """Wait until ``is_done()``, at most ``within_s`` seconds. Each message of the type causes a check."""
+        """Wait until ``is_done()`` or for ``within_s`` seconds. Each message of the type causes a check."""
         done = asyncio.Event()
 
         def check(_: Message) -> None:
@@ -264,7 +256,10 @@ class GimbalOrders:
             detach()
 
     async def find_manager(self) -> int:
-        """Return the manager. If none is known, first ask the device whether it is its own manager."""
+        """Return the component id of the manager.
+
+        If none is known, first ask the device whether it is its own manager.
+        """
         device = self.device
         if device.manager_id is None and device.component_id:
             # If the device does not answer, the autopilot counts as the manager.
@@ -274,10 +269,7 @@ class GimbalOrders:
         return self.manager_id
 
     def control_params(self, *, is_primary: bool, release: bool = False) -> tuple[float, ...]:
-        """Return the parameters that claim or release control.
-
-        They contain our ids, because PX4 takes the value -2 ("the sender") for PX4 itself.
-        """
+        # PX4 takes the value -2 ("the sender") for PX4 itself, so our ids are sent.
         controller = (RELEASE, RELEASE) if release else self.own_ids
         unchanged = (UNCHANGED, UNCHANGED)
         primary, secondary = (controller, unchanged) if is_primary else (unchanged, controller)
@@ -287,7 +279,7 @@ class GimbalOrders:
     def claim_if_denied(self, command: int) -> bool:
         """Claim control if the manager denied this command because we are not in control.
 
-        Returns True if a claim was sent; its answer is not awaited.
+        Returns True if a claim was sent. Its answer is not awaited.
         """
         commands, manager_id = self.session.commands, self.manager_id
         # An open control block has requested control itself, and reports if it loses control.
@@ -305,7 +297,7 @@ class GimbalOrders:
             self._claimed_manager_id = None
 
     def raise_if_taken(self) -> None:
-        """Raise GimbalTaken if an open control block has lost control and no other open block is in control."""
+        """Raise GimbalTaken if the open control blocks have lost control."""
         blocks = self.device.control_blocks.values()
         if not any(block.is_held for block in blocks):
             for block in blocks:
@@ -313,12 +305,10 @@ class GimbalOrders:
 
     @property
     def is_taken(self) -> bool:
-        """True if :meth:`raise_if_taken` would raise."""
         blocks = self.device.control_blocks.values()
         return bool(blocks) and not any(block.is_held for block in blocks)
 
     def not_supported(self, predicate: str) -> NotSupported:
-        """Return the error with the text ``<gimbal>: <manager> <predicate>; nothing was sent``."""
         autopilot = self.session.autopilot
         manager = autopilot.firmware if self.manager_id == self.session.component_id else short_repr(self.manager_id)
         return NotSupported(f"{self.name}: {manager} {predicate}; nothing was sent")

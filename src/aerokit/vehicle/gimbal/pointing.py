@@ -89,7 +89,7 @@ class RestTarget:
         self._moved_at = 0.0
 
     def is_reached(self, device: GimbalDevice) -> bool:
-        """Check a new attitude; return True if the gimbal has stood still for STILL_S in its rest position."""
+        """Return True if the gimbal has stood still for STILL_S in its rest position."""
         attitude, updated_at = device.attitude.value, device.attitude.updated_at
         pitch, roll, yaw = attitude.pitch_deg or 0.0, attitude.roll_deg or 0.0, attitude.yaw_from_nose_deg or 0.0
         if self._has_moved((pitch, roll, yaw)):
@@ -118,14 +118,11 @@ class RestTarget:
 
 @contextmanager
 def attitude_stream(orders: GimbalOrders) -> Iterator[None]:
-    """Request the attitudes of vehicle and gimbal during a `with` block.
-
-    The vehicle's attitude is needed to convert yaw angles. The gimbal's attitude is requested only from an autopilot,
-    because gimbals with their own component id send it without a request.
-    """
     session = orders.session
     with ExitStack() as requests:
+        # The vehicle's attitude is needed to convert yaw angles.
         requests.enter_context(session.streaming("attitude"))
+        # Gimbals with their own component id send their attitude without a request.
         if orders.device.component_id in (0, session.component_id):
             requests.callback(session.rates.request(GimbalDeviceAttitudeStatus, ACTION_HZ, is_optional=True))
         yield
@@ -140,7 +137,10 @@ async def wait_until_reached(
     since: float,
     timeout: float,
 ) -> None:
-    """Wait until an attitude newer than ``since`` shows that the target is reached; errors as for `Gimbal.point`."""
+    """Wait until an attitude newer than ``since`` shows that the target is reached.
+
+    Raises the errors of `Gimbal.point`.
+    """
     session = orders.session
     deadline = session.connection.now() + timeout
     checked_at = since  # time of the last attitude that was checked
@@ -172,7 +172,6 @@ async def wait_until_reached(
 
 
 def _describe_state(orders: GimbalOrders, since: float) -> str:
-    """Describe the gimbal's attitude, failures and limits for an error text; the order was given at ``since``."""
     source, device = orders.attitude_source, orders.device
     attitude = source.attitude
     if not attitude.is_known:
@@ -213,15 +212,16 @@ MIN_BEARING_DISTANCE_M = 1.0
 
 
 def ordered_angles(pitch: float, yaw: float, roll: float | None, *, from_nose: bool) -> Angles:
-    """Return the angles of an order. The yaw is None if the gimbal points straight down or up: any yaw is accepted."""
+    """Return the angles of an order. None stands for any angle."""
     is_vertical = abs(pitch) > MAX_PITCH_FOR_YAW_DEG
+    # If the gimbal points straight down or up, any yaw is accepted.
     from_north_deg = None if from_nose or is_vertical else yaw
     from_nose_deg = yaw if from_nose and not is_vertical else None
     return Angles(pitch, roll, from_north_deg, from_nose_deg)
 
 
 def direction_to(context: VehicleContext, target: Position) -> Angles | None:
-    """Return the direction from the vehicle to a position; None while the vehicle's position or height is unknown."""
+    """Return the direction from the vehicle to a position, or None while it is unknown."""
     position = context.session.telemetry.position
     here = position.latest
     if here is None or position.age > POSITION_MAX_AGE_S:
@@ -238,11 +238,8 @@ def direction_to(context: VehicleContext, target: Position) -> Angles | None:
 
 
 def _height_above(here: Position, target: Position) -> float | None:
-    """Return the height of the target above the vehicle; None if unknown.
-
-    A target without an altitude counts as being at the height of the vehicle.
-    """
     if target.altitude_relative_m is None and target.altitude_amsl_m is None:
+        # A target without an altitude counts as being at the height of the vehicle.
         return 0.0
     if target.altitude_relative_m is not None and here.altitude_relative_m is not None:
         return target.altitude_relative_m - here.altitude_relative_m
@@ -369,7 +366,7 @@ class PointingMixin(GimbalMixin):
         await self._orders.release_control(order)
 
     async def _rest(self, action: str, flag: int, mode: int, *, wait: bool, timeout: float) -> None:
-        """Turn the gimbal to a rest position: by ``flag`` of the gimbal manager, or by ``mode`` of an older mount."""
+        """Turn the gimbal to a rest position. An older mount gets ``mode`` instead of ``flag``."""
         orders = self._orders
         order = orders.begin_order()
 
@@ -388,7 +385,10 @@ class PointingMixin(GimbalMixin):
             await wait_until_reached(orders, order, f"{orders.name}: {action}", target, since=since, timeout=timeout)
 
     def _check_limits(self, pitch: float, roll: float, yaw: float | None) -> None:
-        """Raise InvalidArgument for an angle beyond the limits. ``yaw`` is from the nose; None accepts any yaw."""
+        """Raise InvalidArgument for an angle beyond the limits.
+
+        ``yaw`` is from the nose. None accepts any yaw.
+        """
         device = self._orders.device
         if device.manager_information is None or not device.checks_limits:
             return  # The program has not requested the limits by `information()`.

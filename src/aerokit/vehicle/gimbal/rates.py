@@ -140,7 +140,7 @@ class GimbalRates(ValueStream[tuple[float, float]]):
         self._session.connection.send(self._encode_rates(self._value))  # The message depends on the present manager.
 
     def _encode_rates(self, rates: tuple[float, float]) -> Message:
-        """Encode these rates (pitch, yaw) in the type of message that the manager supports."""
+        """Encode pitch and yaw rates in degrees per second in the message that the manager supports."""
         orders = self._orders
         pitch_rate, yaw_rate = map(math.radians, rates)
         first_fields = (self._session.system_id, orders.manager_id, self._flags, orders.gimbal_id_param)
@@ -175,7 +175,6 @@ class GimbalRates(ValueStream[tuple[float, float]]):
             self._stop_error = self._taken
 
     def _zero_rates_command(self) -> ReleaseCommand:
-        """Return the command that stops the gimbal. It is not sent if a newer order was given or control was lost."""
         orders, order = self._orders, self._order
         no_angles, zero_rates, reserved = (NAN, NAN), (0.0, 0.0), 0
         params = (*no_angles, *zero_rates, self._flags, reserved, orders.gimbal_id_param)

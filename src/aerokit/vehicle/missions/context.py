@@ -97,7 +97,7 @@ class PlanContext:
         return self.session.connection.now()
 
     def offset_of(self, mission_type: int) -> int:
-        """Number of the plan's first item on the vehicle: 1 for a mission if item 0 is home, otherwise 0."""
+        """Return the number of the plan's first item on the vehicle: 1 if item 0 is home, else 0."""
         return int(mission_type == 0 and self.autopilot.home_is_item_0)
 
     @property
@@ -107,11 +107,10 @@ class PlanContext:
 
     @property
     def is_flying_mission(self) -> bool:
-        """True while the vehicle is in its mission mode and is not known to be disarmed."""
         return self.tracker.is_in_mission_mode and not self.session.telemetry.is_confirmed_disarmed
 
     def plan_id(self, mission_type: int, since: float) -> int:
-        """Return the plan's id from a recent MISSION_CURRENT that arrived after ``since``; 0 if there is none."""
+        """Return the plan's id from a recent MISSION_CURRENT that arrived after ``since``, or 0."""
         frame = self._current
         if frame is None or frame.received_at <= since or self.now() - frame.received_at > PLAN_ID_MAX_AGE_S:
             return 0
@@ -120,16 +119,12 @@ class PlanContext:
         return ids_by_mission_type[mission_type]
 
     def version(self, mission_type: int) -> tuple[int, int]:
-        """Return a value that changes whenever this program notices that the vehicle's plan has changed.
-
-        It is a pair: the number of transfers, which includes those of other stations on a shared link, and the plan's
-        id (0 except on PX4).
-        """
+        """Return a value that changes whenever this program notices a change of the vehicle's plan."""
         cache = self.caches[mission_type]
+        # The number of transfers includes those of other stations on a shared link. The plan's id is 0 except on PX4.
         return cache.changes, self.plan_id(mission_type, cache.updated_at) or cache.plan_id
 
     async def wait_for_plan_id(self, mission_type: int, expected_id: int) -> bool:
-        """Wait for a MISSION_CURRENT with this plan id; return False if none arrives in time."""
         received, started_at = asyncio.Event(), self.now()
 
         def check(_: MissionCurrent) -> None:
@@ -149,14 +144,12 @@ class PlanContext:
             self._current = frame
 
     def _on_ack(self, ack: MissionAck) -> None:
-        """Forget a plan when the vehicle confirms that another station has replaced or cleared it.
-
-        Such a MISSION_ACK arrives only on a shared link. The other station may use the same ids as this program (255
-        and 190 by default), so a MISSION_ACK to these ids counts too, unless this program is transferring a plan.
-        """
+        """Forget a plan that another station has replaced or cleared."""
         frame, connection = ack.received_frame, self.session.connection
         is_from_autopilot = frame is not None and self.session.telemetry.accepts(frame)
         is_addressed = is_addressed_to(ack, connection.source_system, connection.source_component)
+        # The ack of another station arrives only on a shared link. That station may use the same ids as this program
+        # (255 and 190 by default), so an ack to these ids is ours only while this program transfers a plan.
         is_ours = is_addressed and self.lock.locked()
         if is_ours or not is_from_autopilot or ack.type != MavMissionResult.ACCEPTED:
             return
@@ -166,11 +159,12 @@ class PlanContext:
                 cache.forget(self.now())
 
     def _on_finished(self, event: MissionFinished) -> None:
-        """Tell the arbiter of the change of mode at the end, which is no takeover of an order that is given now."""
         session = self.session
         hold_mode = self.autopilot.mode_for("hold", is_vtol=session.telemetry.is_vtol)
         holds = self.autopilot.holds_after_mission and self.tracker.is_in_mission_mode
         if event.system_id == session.system_id and holds and hold_mode is not None:
+            # The vehicle changes to this mode at the end of a mission. This is no takeover of an order that is given
+            # now.
             self.vehicle_context.arbiter.expect_late(hold_mode)
 
 
@@ -219,13 +213,12 @@ class MissionTracker:
 
     @property
     def last_item(self) -> int | None:
-        """Index of the last item; None if the mission is empty, or while the number of items is unknown."""
+        """Index of the last item. None if the mission is empty or its length unknown."""
         count = self.count.latest
         return count - 1 if count else None
 
     @property
     def is_last_item_reached(self) -> bool:
-        """True if the last item was reached since the last start of the mission."""
         return self.last_item is not None and self._reached_since_start == self.last_item
 
     @property
@@ -234,7 +227,6 @@ class MissionTracker:
         return self._session.connection.now() - self._last_item_current_at <= FINAL_ITEM_MAX_AGE_S
 
     def on_transfer_count(self, count: int) -> None:
-        """Set the number of items, which is known after a transfer."""
         self.count.set(count, Source(self._session.system_id, self._session.component_id, "MISSION_COUNT"))
 
     def start(self) -> None:
@@ -244,12 +236,9 @@ class MissionTracker:
         self.discard_completion()
 
     def discard_completion(self) -> None:
-        """Forget that the mission is complete, unless it is being flown.
-
-        For STALE_STATE_S, reports of completion are ignored, because they are about the previous flight.
-        """
         if not self._was_active:
             self.is_complete = False
+            # Reports of completion are about the previous flight until then.
             self._stale_until = self._session.connection.now() + STALE_STATE_S
 
     def forget(self) -> None:
@@ -264,7 +253,6 @@ class MissionTracker:
             cell.close(error)
 
     def _on_current(self, _: MissionProgress | None, reported: MissionProgress) -> None:
-        """Set the state values from MISSION_CURRENT, with the item numbers of the program, which do not count home."""
         before = self.current.latest
         current = None if reported.current is None else reported.current - self._offset
         if current is not None and current < 0:  # The current item is ArduPilot's item 0, which is home.
@@ -285,20 +273,16 @@ class MissionTracker:
         self._on_state(reported.state)
 
     def _detect_second_approach(self, before: int | None, current: int | None) -> None:
-        """Detect that the item that was reached last is current once more, so the vehicle flies to it again.
-
-        PX4 may report an item as reached just before it reports the item as current, and this is no second approach.
-        It is one if the item becomes current some time after it was reached, or directly after a later item.
-        """
+        """Detect that the vehicle flies once more to the item that it reached last."""
         if current is None or current != self.reached:
             return
+        # PX4 may report an item as reached just before it reports the item as current. This is no second approach.
         is_long_ago = self._session.connection.now() - self._reached_at > SECOND_APPROACH_S
         comes_from_later_item = before is not None and before > current
         if is_long_ago or comes_from_later_item:
             self._is_approached_again = True
 
     def _on_state(self, state: int) -> None:
-        """Record from MISSION_STATE whether the mission is being flown, or was flown to its end."""
         if state != MissionState.COMPLETE:
             self._stale_until = -math.inf
             if state == MissionState.ACTIVE and self.is_in_mission_mode and self._session.telemetry.is_armed:
@@ -312,7 +296,6 @@ class MissionTracker:
             self._complete()
 
     def _on_reached(self, _: int | None, seq: int) -> None:
-        """Publish that an item was reached, unless MISSION_ITEM_REACHED is a duplicate or is about home."""
         now = self._session.connection.now()
         item = seq - self._offset  # negative if ArduPilot reports item 0 (home), as it does at a guided target
         if self._repeats_item_reached:  # An item counts as reached again only if it was approached again.

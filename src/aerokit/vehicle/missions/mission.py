@@ -93,14 +93,14 @@ class MissionEndDetector:
         self.ground: GroundCheck = GroundCheck(session)
 
     def has_ended(self) -> bool:
-        """Return True if the mission has ended. On the ground, this also requires a landing without a fall."""
         is_reported, is_on_ground = self._is_end_reported(), self._is_on_ground
         # `confirms` must be called each time, because it watches the velocity.
         has_landed = self.ground.confirms(is_reported and is_on_ground)
+        # On the ground, the end also requires a landing without a fall.
         return has_landed if is_on_ground else is_reported
 
     def _is_end_reported(self) -> bool:
-        """Return True if the vehicle reports the end of the mission, as it may also do after a crash."""
+        """Return True if the vehicle reports the end of the mission. It may do so after a crash."""
         if self._tracker.is_complete:
             return self._is_completion_final()
         # ArduPlane leaves the mission mode for the return. This stops the mission, so its completion is not reported.
@@ -117,7 +117,7 @@ class MissionEndDetector:
         return not reports_state and self._tracker.is_last_item_reached
 
     def _is_completion_final(self) -> bool:
-        """Return True if a complete mission needs no further flight: no return, and no landing."""
+        """Return True if a complete mission needs no further return or landing."""
         if self._ends_by_return_without_landing:
             # ArduPilot reports completion at home, PX4 already when it begins to return.
             completes_at_home = self._session.autopilot.mission_completes_at_home
@@ -128,30 +128,26 @@ class MissionEndDetector:
         return self._are_items_known or self._is_on_ground or self._has_stayed_complete()
 
     def _has_stayed_complete(self) -> bool:
-        """Return True if the mission has been complete for ``END_GRACE_S``. Call this only while it is complete.
+        """Return True if the mission has been complete for ``END_GRACE_S``.
 
-        The first call starts the time. PX4 reports completion when a return or a landing begins. HEARTBEAT may report
-        the new mode a little later.
+        Call this only while it is complete. The first call starts the time.
         """
         now = self._session.connection.now()
         if self._completed_at is None:
             self._completed_at = now
+        # PX4 reports completion when a return or a landing begins. HEARTBEAT may report the new mode a little later.
         return now - self._completed_at >= END_GRACE_S
 
     @property
     def _ends_by_landing_or_return(self) -> bool:
-        """True if the last item is a landing or a return.
-
-        If the items are unknown: True once the mission is complete and the vehicle is in a landing mode, on an
-        autopilot that lands after a return.
-        """
         if self._are_items_known:
             return self._is_last_item_landing_or_return
+        # The items are unknown, so the vehicle's mode after the completion shows the landing or the return.
         is_complete, lands = self._tracker.is_complete, self._session.autopilot.lands_after_return
         return is_complete and lands and self._is_in_landing_mode
 
     def failure(self, order: Order | None, *, is_paused: bool) -> str | None:
-        """Return the reason why the vehicle will not fly the mission to its end; None if it may still do so.
+        """Return the reason why the vehicle will not fly the mission to its end, or None.
 
         ``order`` is the last order for the mission.
         """
@@ -187,18 +183,15 @@ class MissionEndDetector:
         return f"the vehicle is not flying its mission but is in {session.telemetry.mode_name}"
 
     def describe(self) -> str:
-        """Return e.g. ``at item 3 of 7``."""
         current, count = self._tracker.current.latest, self._tracker.count.latest
         place = "before its first item" if current is None else f"at item {current}"
         return f"{place} of {'?' if count is None else count}"
 
     @property
     def _is_landing(self) -> bool:
-        """True if the mission ends by a landing or a return, and the vehicle is in a mode for it at the last item.
-
-        If the items are unknown, the number of the current item does not matter.
-        """
+        """True if the vehicle executes the landing or the return that ends its mission."""
         current, last = self._tracker.current.latest, self._tracker.last_item
+        # If the items are unknown, the number of the current item does not matter.
         is_at_end = (current is not None and current == last) or not self._are_items_known
         return is_at_end and self._ends_by_landing_or_return and self._is_in_landing_mode
 
@@ -207,7 +200,10 @@ class MissionEndDetector:
         return self._session.telemetry.mode.latest in self._landing_modes
 
     def _has_returned(self) -> bool:
-        """Return True if the vehicle is at home, or ``RETURN_TIMEOUT_S`` have passed since the first call."""
+        """Return True if the vehicle is at home, or after ``RETURN_TIMEOUT_S``.
+
+        The first call starts this time.
+        """
         session, now = self._session, self._session.connection.now()
         if self._return_began_at is None:
             self._return_began_at = now
@@ -442,7 +438,6 @@ class MissionControl(VehiclePlan["Mission"]):
         self._tracker.on_transfer_count(count)
 
     def _check_item(self, item: int) -> None:
-        """Raise InvalidArgument unless the mission has this item. If the count is unknown, allow 0 to MAX_ITEM."""
         count = self._tracker.count.latest
         last = MAX_ITEM if count is None else count - 1
         if count == 0:
@@ -451,7 +446,10 @@ class MissionControl(VehiclePlan["Mission"]):
             raise InvalidArgument(f"item = {item!r} is not allowed: it must be 0 to {last}")
 
     async def _set_current(self, item: int, timeout: float, order: Order, *, keeps_jump_counts: bool = True) -> None:
-        """Set the current item. Item 0 also resets ArduPilot's jump counts, unless ``keeps_jump_counts``."""
+        """Set the current item.
+
+        Without ``keeps_jump_counts``, item 0 also resets ArduPilot's jump counts.
+        """
         vehicle_context, session = self._vehicle_context, self._session
         seq = item + self._context.offset_of(MavMissionType.MISSION)
         if session.autopilot.sets_current_by_command:
@@ -479,7 +477,6 @@ class MissionControl(VehiclePlan["Mission"]):
                 raise OperationRejected(str(error), reasons=session.texts_since(order.given_at)) from None
 
     async def _set_current_by_message(self, seq: int, timeout: float, sent: SentCommand | None = None) -> None:
-        """Send MISSION_SET_CURRENT until MISSION_CURRENT reports the item, as long as the order is valid."""
         from aerokit.protocols.missions import SetCurrentItem
 
         transfers = self._context.transfers
@@ -509,7 +506,6 @@ class MissionControl(VehiclePlan["Mission"]):
         return None if progress is None else progress.current
 
     async def _enter_mode(self, mode: Mode, order: Order, timeout: float) -> None:
-        """Enter the mission mode by MISSION_START, or by a mode change if the vehicle does not support this command."""
         await self._order_mode(mode, order, timeout)
         self._tracker.discard_completion()  # The vehicle may have reported the previous flight until now.
 

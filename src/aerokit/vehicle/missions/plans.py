@@ -144,7 +144,7 @@ class VehiclePlan(ReadOnly, Generic[PlanT]):
     async def _transfer(
         self, idle_timeout_s: float, timeout: float | None, on_progress: OnProgress | None
     ) -> AsyncIterator[PlanTransfer[PlanT]]:
-        """Provide a transfer for a block, after the transfers of the vehicle's other plans have ended."""
+        """Yield a transfer during the block. Waits for transfers of the vehicle's other plans."""
         from aerokit.vehicle.missions.transfer import PlanTransfer
 
         context = self._context

@@ -59,10 +59,7 @@ class MissionStallDetector:
         self._should_move_since = session.connection.now()
 
     def __call__(self) -> str | None:
-        """Return a clause for an error text if the vehicle has fallen, or does not move although it should; else None.
-
-        Always None while the vehicle is paused or disarmed.
-        """
+        """Return a clause for an error text if the vehicle has fallen or is stuck, else None."""
         progress, current = self._tracker.progress.latest, self._tracker.current.latest
         is_paused = self._is_paused() or (progress is not None and progress.state == MissionState.PAUSED)
         if is_paused or not self._session.telemetry.is_armed:
@@ -82,15 +79,12 @@ class MissionStallDetector:
         return self._stall(MISSION_STALL_TIMEOUT_S) if is_late else None
 
     def _should_move(self, current: int | None) -> bool:
-        """Return True if the vehicle flies its mission, and its current item requires movement.
-
-        Such an item is a take-off, or a waypoint without a hold.
-        """
         if current is None or current >= len(self._items):
             return False
         if self._tracker.is_complete or not self._session.telemetry.is_in(self._mode):
             return False
         item = self._items[current]
+        # A take-off or a waypoint without a hold requires movement.
         has_hold = item.param1 > 0  # False for NaN.
         return item.command in _TAKEOFFS or (item.command in _WAYPOINTS and not has_hold)
 

@@ -55,7 +55,6 @@ class PlanChannel:
         self.is_single_precision: bool = False  # True if positions are sent as 32-bit floats (MISSION_ITEM)
 
     async def send(self, items: Sequence[MissionItem]) -> UploadResult:
-        """Send all items. If a refusal does not identify the refused item, send the items again one at a time."""
         window = self._context.autopilot.mission_upload_window
         exchange = await self._new_upload(items, window=window)
         try:
@@ -63,13 +62,11 @@ class PlanChannel:
         except MissionRejected:
             if not exchange.is_refusal_ambiguous:
                 raise
+        # The refusal does not identify the refused item, so the items are sent again one at a time.
         return await self._run(await self._new_upload(items, window=1))
 
     async def send_part(self, items: Sequence[MissionItem], first_seq: int) -> UploadResult | None:
-        """Replace as many items as are given, from ``first_seq`` on. The other items of the vehicle's plan stay.
-
-        Returns None if the vehicle does not support partial uploads.
-        """
+        """Replace items from ``first_seq`` on. Return None if the vehicle supports no partial uploads."""
         exchange = await self._new_upload(items, window=1, first_seq=first_seq)
         try:
             result = await self._run(exchange)
@@ -81,7 +78,6 @@ class PlanChannel:
         return result
 
     async def receive(self, only: Sequence[int] | None = None) -> DownloadResult:
-        """Request all items, or only those with the numbers in ``only``."""
         received = await self._run(
             MissionDownload(
                 *self._target,
@@ -105,7 +101,7 @@ class PlanChannel:
         self._has_changed = True
 
     async def read_file(self) -> tuple[MissionItem, ...]:
-        """Read the plan's file; raise RemoteProtocolError if it does not contain a plan of this kind."""
+        """Read the plan's file. Raises RemoteProtocolError for a plan of another kind."""
         data = await self._context.files().read(self._path, **self._options)
         return self._normalized(unpack_items(data, self.mission_type))
 
@@ -143,7 +139,6 @@ class PlanChannel:
     async def _new_upload(
         self, items: Sequence[MissionItem], *, window: int, first_seq: int | None = None
     ) -> MissionUpload:
-        """Create the exchange that sends these items; ``first_seq`` is None for a whole plan."""
         return MissionUpload(
             *self._target,
             items,
@@ -154,7 +149,6 @@ class PlanChannel:
         )
 
     async def _run(self, exchange: MissionExchange[ResultT]) -> ResultT:
-        """Run an exchange. If the call is cancelled, also cancel the transfer on the vehicle."""
         connection = self._context.transfers.connection
         if self.mission_type != MavMissionType.MISSION and connection.mavlink_version == 1:
             raise NotSupported(
@@ -175,19 +169,19 @@ class PlanChannel:
             error.args = (f"{error}{self._describe_items_on_vehicle(exchange, is_silent=True)}",)
             raise
         finally:
+            # If this call was cancelled, the transfer is also cancelled on the vehicle.
             if not exchange.done and connection.is_open:
                 for cancellation in exchange.cancellation():
                     connection.send(cancellation)
 
     def _record_changes(self, exchange: MissionExchange[Any]) -> None:
-        """Record whether a failed upload may have changed items on the vehicle."""
         if isinstance(exchange, MissionUpload):
             self._has_changed |= exchange.may_have_changed_items
 
     def _describe_items_on_vehicle(
         self, exchange: MissionExchange[Any], *, is_silent: bool = False, refused_item: int | None = None
     ) -> str:
-        """Return the part of an upload's error text that says which items, old or new, the vehicle has now."""
+        """Return a clause for the error text of an upload: which items the vehicle has now."""
         if not isinstance(exchange, MissionUpload):
             return ""
         overwrites_in_place = self.mission_type in self._context.autopilot.overwrites_plans_in_place
@@ -249,7 +243,6 @@ class PlanTransfer(Generic[PlanT]):
         self._storage = ItemStorage(context.autopilot.mission_storage)
 
     async def upload(self, plan: PlanT, method: str, *, only_changes: bool, verify: bool) -> None:
-        """Replace the vehicle's plan: send the differences if that is possible, otherwise a file or all items."""
         items = plan.to_items()
         if self._offset:  # Item 0 must be the vehicle's own home, because older firmware may take it as its new home.
             items = with_home(items, self._context.home)
@@ -276,7 +269,6 @@ class PlanTransfer(Generic[PlanT]):
             raise self._mismatch((f"the vehicle still has items: {remaining}",))
 
     async def _read(self, method: str) -> tuple[MissionItem, ...]:
-        """Read the plan into the cache, as a file if possible; again if another station replaces it meanwhile."""
         while True:
             changes = self._cache.changes
             items, plan_id = await self._receive(method)
@@ -285,7 +277,7 @@ class PlanTransfer(Generic[PlanT]):
                 return items
 
     async def _receive(self, method: str) -> tuple[tuple[MissionItem, ...], int]:
-        """Return the plan on the vehicle and the vehicle's id of it, which is 0 if it reports none."""
+        """Return the vehicle's plan and its id, which is 0 if unknown."""
         if await self._uses_file(method):
             try:
                 items = await self._channel.read_file()
@@ -314,19 +306,17 @@ class PlanTransfer(Generic[PlanT]):
         return has_ftp and self._cache.has_file is not False and not is_refused  # `has_file` is None until tried.
 
     def _on_file_error(self, error: Exception, method: str) -> None:
-        """Transfer no files from now on. Raise the error instead if ``method`` is "ftp".
-
-        If files have worked before, only a FileError ends their use, and any other error is raised.
-        """
+        """Transfer no files from now on, or raise the error."""
+        # If files have worked before, only a FileError ends their use.
         if method == "ftp" or (self._cache.has_file and not isinstance(error, FileError)):
             raise error
         self._cache.has_file = False
 
     async def _send_items(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> None:
-        """Send all items; read them back to verify them, or if the vehicle's answers to the upload were ambiguous."""
         result = await self._channel.send(items)
         if result.is_confirmed:
             self._cache.set(items, self._context.now(), result.opaque_id)
+        # The items are read back to verify them, or if the vehicle's answers to the upload were ambiguous.
         if (result.is_confirmed and not verify) or await self._receives_checksum_of(items):
             return
         received = await self._read(method)
@@ -343,7 +333,6 @@ class PlanTransfer(Generic[PlanT]):
             ) from None
 
     async def _send_file(self, items: Sequence[MissionItem], method: str) -> None:
-        """Send the plan as a file and read it back. With "auto", send the items if that fails."""
         try:
             await self._channel.write_file(items)
         except (FileError, FileTimeout) as error:
@@ -360,11 +349,7 @@ class PlanTransfer(Generic[PlanT]):
         await self._send_items(items, method, verify=True)
 
     async def _send_changes(self, items: Sequence[MissionItem], method: str, *, verify: bool) -> bool:
-        """Send only the differences; return True if the vehicle has the plan now.
-
-        Returns False if the vehicle's plan is unknown or differs in too many items, if the vehicle does not support
-        partial uploads, or if another station replaces the plan meanwhile.
-        """
+        """Send only the differences. Return False if all items must be sent instead."""
         autopilot = self._context.autopilot
         if autopilot.reports_mission_checksum:
             reported = self._context.plan_id(self._mission_type, self._cache.updated_at)
@@ -395,7 +380,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     async def _send_part(self, items: Sequence[MissionItem], first_seq: int, *, verify: bool) -> bool:
-        """Send consecutive items; return False if the vehicle does not support partial uploads."""
+        """Send consecutive items. Return False if the vehicle does not support partial uploads."""
         result = await self._channel.send_part(items, first_seq)
         if result is None:
             return False
@@ -406,7 +391,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     def _changed_seqs(self, items: Sequence[MissionItem]) -> list[int] | None:
-        """Return the seqs of changed items; None if the vehicle's items are unknown, or their number differs."""
+        """Return the seqs of changed items, or None if the plans cannot be compared."""
         vehicle_items = self._cache.items
         if vehicle_items is None or len(vehicle_items) != len(items):
             return None
@@ -414,14 +399,17 @@ class PlanTransfer(Generic[PlanT]):
 
     @staticmethod
     def _is_worthwhile(changed_seqs: Collection[int] | None, count: int) -> bool:
-        """Return True if sending these items in parts takes fewer messages than sending all ``count`` items."""
+        """Return True if sending only the changed items takes fewer messages than sending all."""
         if changed_seqs is None:
             return False
         parts = list(_consecutive_ranges(changed_seqs))
         return not parts or len(changed_seqs) + PART_OVERHEAD_ITEMS * len(parts) < count
 
     async def _receives_checksum_of(self, items: Sequence[MissionItem]) -> bool:
-        """Wait for the checksum of these items if that is faster than reading them back; return True if it arrives."""
+        """Return True if the vehicle reports the checksum of these items.
+
+        Does not wait for it if reading the items back is faster.
+        """
         autopilot = self._context.autopilot
         round_trip_s = self._context.transfers.round_trip.smoothed_s or 0.0
         reading_takes_s = len(items) / autopilot.mission_download_window * round_trip_s
@@ -434,7 +422,7 @@ class PlanTransfer(Generic[PlanT]):
         return True
 
     def _compare(self, sent: dict[int, MissionItem], received: dict[int, MissionItem]) -> None:
-        """Raise VerificationFailed unless the items read back are those that were sent. Both are keyed by seq."""
+        """Raise VerificationFailed if the items differ. Both mappings are keyed by seq."""
         differences = []
         if len(sent) != len(received):
             sent_count, received_count = (sum(seq >= self._offset for seq in seqs) for seqs in (sent, received))

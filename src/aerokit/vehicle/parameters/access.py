@@ -69,18 +69,14 @@ class ParameterAccess:
 
     @property
     def _read_round_trip(self) -> RoundTrip:
-        """Estimate of the time from a read to its answer.
-
-        The time is longer than the round trip of the link, because ArduPilot answers at most five reads every 0.1 s.
-        """
         if self._cached_read_round_trip is None:
             link_s = self._transfers.round_trip.smoothed_s
+            # This is longer than the link's round trip, because ArduPilot answers at most five reads every 0.1 s.
             self._cached_read_round_trip = RoundTrip(None if link_s is None else link_s + ANSWER_DELAY_S)
         return self._cached_read_round_trip
 
     @property
     def has_upper_case_names(self) -> bool:
-        """True if all parameter names of this autopilot are in upper case."""
         return self._transfers.autopilot.has_upper_case_parameters
 
     def forget(self) -> None:
@@ -96,7 +92,7 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> ParameterTable:
-        """Return the whole list: the known one, a cached one with the vehicle's hash, or a new one."""
+        """Return the whole list, and download it only if necessary."""
         async with self._download_lock:
             if self.store.is_complete and not refresh:
                 return self.store.table
@@ -116,7 +112,6 @@ class ParameterAccess:
             return self.store.table
 
     async def _download(self, method: DownloadMethod, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
-        """Download the list as a file if possible, otherwise as one message for each parameter."""
         if method == "ftp" or (method == "auto" and await self.has_pack()):
             # With "auto", the probe ends the attempt if MAVFTP does not answer, and the list is downloaded instead.
             probe = nullcontext() if method == "ftp" else self._ftp_probe()
@@ -136,8 +131,9 @@ class ParameterAccess:
 
     @contextmanager
     def _ftp_probe(self) -> Iterator[None]:
-        """Cancel the block and raise FileTimeout if no MAVFTP answer arrives soon: some relays drop only MAVFTP."""
+        """Cancel the block and raise FileTimeout if no MAVFTP answer arrives soon."""
         connection, round_trip = self._transfers.connection, self._transfers.round_trip
+        # Some relays drop only MAVFTP.
         timeout_s = max(FTP_PROBE_TIMEOUT_S, FTP_PROBE_ATTEMPTS * round_trip.timeout_s())
         has_answer = False
 
@@ -163,21 +159,17 @@ class ParameterAccess:
             raise FileTimeout(f"the vehicle did not answer MAVFTP requests within {timeout_s:.1f} s")
 
     async def has_pack(self) -> bool:
-        """Return True if the vehicle has MAVFTP and has not refused ``@PARAM/param.pck``."""
         if self._has_pack is not None:
             return self._has_pack
         capabilities = await self._transfers.capabilities()
         return bool(capabilities and capabilities & MavProtocolCapability.FTP)
 
     async def _download_pack(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
-        """Read the packed file; retry if its content is inconsistent.
-
-        ArduPilot generates the file while it is read. If a parameter changes from its default value meanwhile, all data
-        after it moves by some bytes, and blocks that were read at different times do not fit together. A file without
-        defaults does not have this problem.
-        """
         from aerokit.parameters.pack import PACK_PATH, PACK_PATH_WITH_DEFAULTS, unpack_parameters
 
+        # ArduPilot generates the file while it is read. If a parameter changes from its default value meanwhile, all
+        # data after it moves by some bytes. Blocks that were read at different times then do not fit together. A file
+        # without defaults does not have this problem.
         for path in (PACK_PATH_WITH_DEFAULTS, PACK_PATH_WITH_DEFAULTS, PACK_PATH):
             updates_before = self.store.updates
             data = await self._files.read(path, idle_timeout_s=idle_timeout_s, on_progress=on_progress)
@@ -192,7 +184,7 @@ class ParameterAccess:
                 return
 
     def _with_known_defaults(self, table: ParameterTable) -> ParameterTable:
-        """Return a copy of the table; defaults that this download lacks are taken from an earlier one."""
+        """Return a copy whose missing defaults are taken from an earlier download."""
         known = self.store.table
         parameters = []
         for parameter in table.values():
@@ -202,7 +194,6 @@ class ParameterAccess:
         return ParameterTable(parameters)
 
     async def _download_list(self, idle_timeout_s: float, on_progress: OnProgress | None) -> None:
-        """Send PARAM_REQUEST_LIST, to which the vehicle answers with all parameters, and then request those missing."""
         from aerokit.protocols.parameter_list import ParameterList
 
         transfers = self._transfers
@@ -222,7 +213,7 @@ class ParameterAccess:
     async def read(
         self, names: Iterable[str], idle_timeout_s: float, *, probe: bool = False
     ) -> dict[str, ParameterAnswer]:
-        """Read parameters; ``probe`` is True for names that the vehicle may not have."""
+        """Read parameters. Set ``probe`` for names that the vehicle may not have."""
         names = tuple(names)
         if not names:
             return {}
@@ -253,12 +244,13 @@ class ParameterAccess:
             return await transfers.run(exchange)
 
     def _read_later(self, name: str, time: float) -> None:
-        """Read a parameter in the background at ``time`` (loop's clock), because its stored value may be wrong."""
+        """Read a parameter in the background at ``time`` (loop's clock)."""
 
         async def read() -> None:
             await anyio.sleep(time - self._transfers.connection.now())
             self._read_later_names.discard(name)
             with suppress(AerokitError):
+                # The answer corrects the stored value, which may be wrong.
                 await self.read([name], IDLE_TIMEOUT_S)
 
         if name not in self._read_later_names:
@@ -267,10 +259,9 @@ class ParameterAccess:
 
     @contextmanager
     def _boosted(self, *, after_s: float = 0.0) -> Iterator[None]:
-        """Raise the rate at which ArduPilot handles parameters, by SET_MESSAGE_INTERVAL of PARAM_VALUE.
+        """Raise the rate at which ArduPilot handles parameters during the block.
 
-        If the block lasts longer than ``after_s`` seconds, the rate is raised after this time, and restored at the end
-        of the block.
+        The rate is raised after ``after_s`` seconds, if the block lasts so long.
         """
         interval_s = self._transfers.autopilot.parameter_interval_s
         if interval_s is None or after_s == math.inf:
@@ -283,6 +274,7 @@ class ParameterAccess:
             is_boosted = True
             self._boosts += 1
             if self._boosts == 1:
+                # ArduPilot handles parameters at the rate of the message PARAM_VALUE.
                 self._set_interval(interval_s * 1e6)  # microseconds
 
         timer = asyncio.get_running_loop().call_later(after_s, boost)
@@ -301,7 +293,6 @@ class ParameterAccess:
     async def write(
         self, parameters: Iterable[Parameter], idle_timeout_s: float, on_progress: OnProgress | None = None
     ) -> dict[str, ParameterAnswer]:
-        """Set parameters and return the vehicle's values. Writes by other tasks wait until this one is done."""
         async with self._write_lock:
             return await self._write(tuple(parameters), idle_timeout_s, on_progress)
 
@@ -353,16 +344,13 @@ class ParameterAccess:
         return answers
 
     def _forget_written(self, names: Iterable[str]) -> None:
-        """Forget what earlier writes have set, because the vehicle may have another value from now on."""
+        # The vehicle may have other values from now on.
         for name in names:
             self.written.pop(name, None)
             self.store.unmark_replaced(name)
 
     def _recently_written(self) -> set[str]:
-        """Return the names of parameters whose last write may still be answered.
-
-        A late answer could be taken for the answer to the next write, so the next write is verified by a read.
-        """
+        # A late answer could be taken for the answer to the next write, so the next write is verified by a read.
         earliest = self._transfers.connection.now() - ECHO_WINDOW_S
         self._written_at = {name: written_at for name, written_at in self._written_at.items() if written_at > earliest}
         return set(self._written_at)
@@ -374,10 +362,9 @@ class ParameterAccess:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
-        """Write parameters in one file if possible. Then set, one by one, those that the vehicle did not apply.
+        """Write parameters in one file if possible.
 
-        Writes by other tasks wait until all is done. A value that another task wrote during the read-back would differ
-        from the file, count as not applied, and be overwritten.
+        Those that the vehicle did not apply are then set one by one.
         """
         parameters = tuple(parameters)
         if not parameters:
@@ -387,6 +374,8 @@ class ParameterAccess:
         if method == "set":
             return await self.write(parameters, idle_timeout_s, on_progress)
         answers: dict[str, ParameterAnswer] = {}
+        # A value that another task wrote during the read-back would differ from the file, count as not applied, and be
+        # overwritten.
         async with self._write_lock:
             self._forget_written(_names(parameters))
             try:
@@ -411,7 +400,6 @@ class ParameterAccess:
         )
 
     async def _read_back(self, written: tuple[Parameter, ...], idle_timeout_s: float) -> dict[str, ParameterAnswer]:
-        """Return the vehicle's values of these parameters, after they were set by uploading a parameter file."""
         if len(written) <= MAX_READ_BACK:
             return await self.read(_names(written), idle_timeout_s)
         await self.download("auto", refresh=True, cache=False, idle_timeout_s=idle_timeout_s, on_progress=None)
@@ -419,11 +407,11 @@ class ParameterAccess:
         return {name: table[name] for name in _names(written) if name in table}
 
     def _was_applied(self, written: Parameter, answer: ParameterAnswer | None) -> bool:
-        """Return True if the vehicle has the value. The last bits are ignored if it sends all values as floats."""
         if not isinstance(answer, Parameter):
             return False
         if self.store.bytewise:
             return same_value(answer.value, written.value)
+        # The vehicle sends all values as floats, so the last bits are ignored.
         return same_value(float(answer.value), float(written.value))
 
 
@@ -435,7 +423,6 @@ class _CachedList:
         self._hash: int | None = None
 
     async def load_if_current(self, refresh: bool) -> bool:
-        """Load the cached list into the store if its hash is the vehicle's; return True if it was loaded."""
         store = self._access.store
         key = await self._key()
         updates_before = store.updates
@@ -449,7 +436,7 @@ class _CachedList:
         return store.is_complete
 
     async def save(self) -> None:
-        """Save the downloaded list, unless the vehicle's parameter hash is unknown or changed during the download."""
+        # Another hash means that a parameter changed during the download.
         if self._hash is not None and self._hash == await self._read_hash():
             self._cache.save(await self._key(), self._hash, self._access.store.table)
 

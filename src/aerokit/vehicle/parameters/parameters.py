@@ -309,7 +309,6 @@ class Parameters(ReadOnly):
         return table.changed_from_default()
 
     def _with_documented_defaults(self, table: ParameterTable) -> ParameterTable:
-        """Return the table with the defaults in the metadata; raise NotSupported if there are none."""
         defaults = {name: entry.default for name, entry in (self._metadata or {}).items() if name in table}
         if not any(default is not None for default in defaults.values()):
             hint = "call load_metadata() first" if self._metadata is None else "the loaded metadata has none either"

@@ -17,13 +17,12 @@ MAX_RETURN_ALTITUDE_M = 3000
 
 
 async def read_return_altitude(parameters: Parameters, session: VehicleSession) -> float:
-    """Read the altitude; see :meth:`aerokit.Vehicle.return_altitude`."""
     _, value, units_per_metre = await _find_parameter("return_altitude", parameters, session)
     return round(value / units_per_metre, 3)
 
 
 def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vtol: bool) -> float | None:
-    """Return the altitude if its parameter is already known, otherwise None. Requests nothing."""
+    """Return the altitude, or None if its parameter is unknown. Requests nothing."""
     for name, units_per_metre in autopilot.return_altitude_parameters(is_vtol=is_vtol):
         if (known := parameters.known(name)) is not None:
             return round(known.value / units_per_metre, 3)
@@ -31,14 +30,13 @@ def known_return_altitude(parameters: Parameters, autopilot: Autopilot, *, is_vt
 
 
 async def write_return_altitude(parameters: Parameters, session: VehicleSession, altitude_m: float) -> None:
-    """Write the altitude; see :meth:`aerokit.Vehicle.set_return_altitude`."""
     check_range("altitude_m", altitude_m, 0, MAX_RETURN_ALTITUDE_M, above=True)
     name, _, units_per_metre = await _find_parameter("set_return_altitude", parameters, session)
     await parameters.set(name, altitude_m if units_per_metre == 1 else round(altitude_m * units_per_metre))
 
 
 async def _find_parameter(action: str, parameters: Parameters, session: VehicleSession) -> tuple[str, float, float]:
-    """Return the altitude parameter that the vehicle has: name, value and parameter units per metre."""
+    """Return name, value and units per metre of the vehicle's altitude parameter."""
     autopilot = session.autopilot
     names_and_units = autopilot.return_altitude_parameters(is_vtol=session.telemetry.is_vtol)
     if not names_and_units:

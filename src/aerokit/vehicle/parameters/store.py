@@ -69,20 +69,19 @@ class ParameterStore:
         return name in self._known
 
     def mark_replaced(self, name: str, value: float) -> None:
-        """Ignore messages with the old value of a parameter for ``IN_FLIGHT_S`` seconds after a write has replaced it.
-
-        ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
-        value. An answer with the old value may therefore arrive after the confirmation of the write. Such a message may
-        also mean that another station has restored the old value, so ``on_discarded`` is called after each of them.
-        """
+        """Ignore messages with the old value for ``IN_FLIGHT_S`` seconds after a write."""
+        # ArduPilot answers PARAM_SET at once, but sends the answer to PARAM_REQUEST_READ up to 0.1 s after it read the
+        # value. An answer with the old value may therefore arrive after the confirmation of the write. Another station
+        # may also have restored the old value, so ``on_discarded`` is called after each ignored message.
         self._replaced[name] = value, self._transfers.connection.now() + IN_FLIGHT_S
 
     def unmark_replaced(self, name: str) -> None:
-        """Undo `mark_replaced` before a new write, which may set the parameter to the replaced value again."""
+        """Undo `mark_replaced` before a new write."""
+        # The new write may set the parameter to the replaced value again.
         self._replaced.pop(name, None)
 
     def replaced_value(self, name: str) -> int | float | None:
-        """Return the value given to `mark_replaced`; None unless messages with this value are still ignored."""
+        """Return the value that is ignored in messages, or None."""
         if name not in self._replaced:
             return None
         value, ignored_until = self._replaced[name]
@@ -106,9 +105,9 @@ class ParameterStore:
         """Replace all parameters by a downloaded list.
 
         ``updates_before`` is the value of ``updates`` when the list was requested. Messages that have arrived after
-        that take precedence over the list. If the vehicle has rebooted since then, it may have other values, and the
-        list is ignored.
+        that take precedence over the list.
         """
+        # If the vehicle has rebooted since the request, it may have other values.
         if updates_before < self._forgotten_at:
             return
         newer_names = {name for name, last_update in self._last_updates.items() if last_update > updates_before}
@@ -125,7 +124,6 @@ class ParameterStore:
             self._publish(old.get(name), parameter)
 
     def _on_param_value(self, message: ParamValue) -> None:
-        """Update the known parameter from any PARAM_VALUE of the autopilot, whoever requested or set the value."""
         frame = message.received_frame
         if frame is None or frame.component_id != self._transfers.component_id:
             return
@@ -149,7 +147,6 @@ class ParameterStore:
         self._publish(old, new)
 
     def _publish(self, old: Parameter | None, new: Parameter) -> None:
-        """Publish ParameterChanged if the value of a known parameter has changed."""
         if old is None or same_value(old.value, new.value):
             return
         transfers = self._transfers
@@ -169,11 +166,9 @@ CACHE_FORMAT = 1
 
 
 def default_directory() -> Path:
-    """Return the user's cache directory: ``~/.cache/aerokit/parameters``, or its equivalent on other systems.
-
-    An absolute path in ``XDG_CACHE_HOME`` takes precedence (https://specifications.freedesktop.org/basedir-spec).
-    """
+    """Return ``~/.cache/aerokit/parameters``, or its equivalent on other systems."""
     xdg_cache_home = os.environ.get("XDG_CACHE_HOME", "")
+    # An absolute path in this variable takes precedence (https://specifications.freedesktop.org/basedir-spec).
     if os.path.isabs(xdg_cache_home):
         base = Path(xdg_cache_home)
     elif sys.platform == "win32":
@@ -192,7 +187,6 @@ class ParameterCache:
         self.directory: Path = default_directory() if directory is None else Path(directory)
 
     def load(self, vehicle: str, hash_: int) -> ParameterTable | None:
-        """Return the cached list of a vehicle if the list has this hash; otherwise None."""
         try:
             content = json.loads(self._path(vehicle).read_text(encoding="utf-8"))
             if (content["format"], content["vehicle"], content["hash"]) != (CACHE_FORMAT, vehicle, hash_):
@@ -220,7 +214,7 @@ class ParameterCache:
 
 
 def vehicle_key(autopilot: str, system_id: int, version: AutopilotVersion | None) -> str:
-    """Return the file name for a vehicle: its hardware id (or its system id if that is unknown) and its firmware."""
+    # Without a hardware id, the system id identifies the vehicle.
     unit = f"uid-{version.uid:016x}" if version is not None and version.uid else f"system-{system_id}"
     firmware = "unknown" if version is None else f"{version.firmware}-{version.git_hash}"
     key = f"{autopilot}-{unit}-{firmware}"

@@ -40,7 +40,7 @@ class RestoreRegistry:
         self._blocks.setdefault(name, []).append(block)
 
     def remove(self, name: str, block: _Block) -> _Block | None:
-        """Remove a block; return the next block that wrote the parameter, None if it was the last one."""
+        """Remove a block. Return the next block that wrote the parameter, or None after the last one."""
         blocks = self._blocks[name]
         position = blocks.index(block)
         del blocks[position]
@@ -66,15 +66,14 @@ class _Block:
     async def _resolve_and_save(
         self, names: Iterable[str], idle_timeout_s: float
     ) -> dict[str, ResolvedParameter | ParameterFailure]:
-        """Resolve names, and remember the parameters as they are before their first write, to restore them later.
-
-        Reads the parameters from the vehicle, because the store may be outdated. The writer calls this before each
-        round of writes, because some parameters appear only after the first round.
-        """
+        """Resolve names, and save the parameters as they are before their first write."""
+        # The writer calls this method before each round of writes, because some parameters appear only after the first
+        # round.
         results = await self._writer.names.resolve(names, idle_timeout_s)
         resolved = [result for result in results.values() if isinstance(result, ResolvedParameter)]
         fresh = {answer.name: answer.parameter for answer in resolved if answer.is_fresh}
         unread_names = {answer.name for answer in resolved} - fresh.keys() - self._saved.keys()
+        # The store may be outdated, so the vehicle's values are saved.
         answers = await self._access.read(unread_names, idle_timeout_s)
         if self._has_ended:  # A write by another task must not outlive the block, because nothing would restore it.
             raise InvalidArgument("the block of these parameters has ended; the rest was not set")
@@ -96,11 +95,7 @@ class _Block:
         return results
 
     def _take_saved(self) -> list[Parameter]:
-        """Return the parameters that this block must restore.
-
-        If an overlapping block has written a parameter later, the value that this block saved is handed to the other
-        block, which restores it at its own end.
-        """
+        """End the block, and return the parameters that it must restore."""
         self._has_ended = True
         to_restore = []
         for name, saved in self._saved.items():
@@ -108,6 +103,7 @@ class _Block:
             if later_block is None:
                 to_restore.append(saved)
             else:
+                # An overlapping block has written the parameter later, so it restores the value at its own end.
                 later_block._saved[name] = saved
         return to_restore
 
@@ -119,12 +115,11 @@ class _Block:
     async def _restore(self, cause: BaseException | None) -> None:
         """Restore the parameters within a limited time, shielded from cancellation.
 
-        RollbackFailed names the parameters that were not restored.
+        Raises RollbackFailed for parameters that were not restored.
         """
         await run_shielded(self._write_previous(self._take_saved(), cause))
 
     async def _write_previous(self, saved: list[Parameter], cause: BaseException | None) -> None:
-        """Write the saved parameters back; raise RollbackFailed for those that could not be restored."""
         answers: Mapping[str, object] = {}
         reason = ""
         with anyio.move_on_after(MAX_RESTORE_TIMEOUTS * self._idle_timeout_s):
@@ -141,16 +136,13 @@ class _Block:
         )
 
     def _abandon(self, error: AerokitError, cause: BaseException | None) -> None:
-        """End the block after the loop of its connection has ended: nothing can be restored."""
+        """End the block without restoring, because the loop of its connection has ended."""
         if self._has_ended:
             raise error
         _raise_not_restored(self._take_saved(), f" ({error})", cause)
 
     async def _unreadable_and_changed(self, saved: list[Parameter]) -> tuple[set[str], set[str]]:
-        """Return the names that cannot be read, and those that another station has changed since the write.
-
-        Changes by another station are logged.
-        """
+        """Return the names that cannot be read, and those that another station has changed."""
         written = self._access.written
         names = [param.name for param in saved if param.name in written]
         unreadable, changed = set[str](), set[str]()

@@ -55,7 +55,7 @@ class ResolvedParameter(Snapshot):
 
 
 def resolve_known(name: str, known: Mapping[str, Parameter]) -> ResolvedParameter | None:
-    """Return the known parameter with this name or, if it was renamed, with its other name; None if unknown."""
+    """Return the known parameter with this name or with another of its names, or None."""
     if name in known:
         return ResolvedParameter(name, known[name], is_fresh=False)
     from aerokit.parameters.renames import resolve_rename
@@ -97,7 +97,7 @@ class NameResolver:
         return translated
 
     def without_duplicates(self, values: Mapping[str, float], table: ParameterTable) -> dict[str, int | float]:
-        """If ``values`` has a parameter under two names, keep only the value under the name that the vehicle uses."""
+        """Drop each value that is also given under the vehicle's own name of the parameter."""
         from aerokit.parameters.renames import resolve_rename
 
         remaining = {}
@@ -112,7 +112,7 @@ class NameResolver:
         return name.upper() if self._access.has_upper_case_names else name
 
     def _unknown_names(self, names: Iterable[str]) -> dict[str, None]:
-        """Return the old and new names of all requested parameters whose values are not known yet."""
+        """Return the old and new names of those parameters that are not known yet."""
         from aerokit.parameters.renames import other_names, resolve_rename
 
         store = self._access.store
@@ -123,7 +123,6 @@ class NameResolver:
         return to_read
 
     def _resolve_one(self, name: str, answers: Mapping[str, ParameterAnswer]) -> ResolvedParameter | ParameterFailure:
-        """Find the parameter by this name or by another of its names, in the answers or else in the store."""
         direct = answers.get(name, self._access.store.get(name))
         if isinstance(direct, Parameter):
             return ResolvedParameter(name, direct, is_fresh=name in answers)
@@ -141,7 +140,6 @@ class NameResolver:
         return self._with_hint(failure or ParameterRejected(f"the vehicle has no parameter {name}", name=name))
 
     def _with_hint(self, answer: ParameterFailure) -> ParameterFailure:
-        """Add a hint to the error: similar names, or the name that replaced this one."""
         if not isinstance(answer, ParameterRejected):
             return answer
         from aerokit.parameters.renames import replacement_of
@@ -152,7 +150,7 @@ class NameResolver:
 
 
 def warn_of_rename(renamed: Renamed) -> None:
-    """Issue the warning, attributed to the line of the program that called aerokit."""
+    """Warn at the line of the program that called aerokit."""
     from aerokit.parameters.renames import ParameterRenamedWarning
 
     # Frame 1 and `stacklevel` 2 both stand for the caller of this function.
@@ -195,16 +193,11 @@ class ParameterWrite(Snapshot):
 
 
 def _failed_write(name: str, requested: float, known: Parameter | None, error: AerokitError) -> ParameterWrite:
-    """Return the result of a write that failed; ``known`` has the last known value, if there is one."""
     value, type_ = (math.nan, ParameterType.REAL32) if known is None else (known.value, known.type)
     return ParameterWrite(name, requested, value, type_, outcome="failed", error=error)
 
 
 def outcome_of(sent: Parameter, old: Parameter | None, answer: ParameterAnswer) -> Outcome | AerokitError:
-    """Return the outcome of a write, from the value that was sent, the old value, and the vehicle's answer.
-
-    If the write failed, the result is the error.
-    """
     if not isinstance(answer, Parameter):
         return answer
     is_old_value = old is not None and same_value(old.value, answer.value)
@@ -244,7 +237,6 @@ class _PlannedWrite(Snapshot):
 
     @property
     def is_unchanged(self) -> bool:
-        """True if the vehicle has this value already."""
         return same_value(self.old.value, self.to_send.value)
 
 
@@ -265,10 +257,10 @@ class ParameterWriter:
         idle_timeout_s: float,
         on_progress: OnProgress | None = None,
     ) -> dict[str, ParameterWrite]:
-        """Write the values; return a result for each, in order.
+        """Write the values, and return a result for each.
 
-        ``upload`` is the method of an upload, which sends only values that differ from the known ones; None sends all
-        values by PARAM_SET. ``resolve`` is called before each round of writes instead of :meth:`NameResolver.resolve`.
+        ``upload`` is the method of an upload, which sends only changed values. None sends all values by PARAM_SET.
+        ``resolve`` is called instead of :meth:`NameResolver.resolve`.
         """
         resolve = resolve or self.names.resolve
         results: dict[str, ParameterWrite] = {}
@@ -294,7 +286,7 @@ class ParameterWriter:
         idle_timeout_s: float,
         on_progress: OnProgress | None,
     ) -> dict[str, ParameterAnswer]:
-        """Send the planned values. Return the vehicle's answers; the keys are the parameters' names on the vehicle."""
+        """Send the planned values. The answers are keyed by the names on the vehicle."""
         if upload is None:  # `ParameterWrites` sends each name once, even if two plans have it.
             return await self._access.write((plan.to_send for plan in plans), idle_timeout_s, on_progress)
         # Two names may mean the same parameter, which must be in the file only once.
@@ -309,7 +301,10 @@ class ParameterWriter:
         *,
         is_first: bool,
     ) -> tuple[list[_PlannedWrite], dict[str, AerokitError]]:
-        """Return the planned writes and the errors. In the first round, an invalid value raises InvalidArgument."""
+        """Return the planned writes and the errors.
+
+        In the first round, an invalid value raises InvalidArgument.
+        """
         plans: list[_PlannedWrite] = []
         first_plans: dict[str, _PlannedWrite] = {}  # the first plan for each name on the vehicle
         errors: dict[str, AerokitError] = {}
@@ -330,7 +325,6 @@ class ParameterWriter:
         return plans, errors
 
     def _result(self, plan: _PlannedWrite, answers: Mapping[str, ParameterAnswer]) -> ParameterWrite:
-        """Return the result of one write, with the name and the unit of the request. The vehicle may use others."""
         name, requested = plan.resolved.requested, plan.requested
         answer = answers[plan.to_send.name]
         outcome = outcome_of(plan.to_send, plan.old, answer)
@@ -351,7 +345,6 @@ def _plan_write(resolved: ResolvedParameter, value: int | float) -> _PlannedWrit
 
 
 def _check_same_value(plan: _PlannedWrite, first: _PlannedWrite) -> None:
-    """Raise InvalidArgument if two requested writes of the same parameter have different values."""
     if not same_value(plan.to_send.value, first.to_send.value):
         raise InvalidArgument(
             f"{plan.resolved.requested} = {plan.requested:g} and {first.resolved.requested} = {first.requested:g}"
@@ -360,7 +353,7 @@ def _check_same_value(plan: _PlannedWrite, first: _PlannedWrite) -> None:
 
 
 def check_values(values: Mapping[str, float]) -> dict[str, int | float]:
-    """Return the values; raises :class:`InvalidArgument` for invalid names and values that are not finite."""
+    """Return the values. Raises InvalidArgument for an invalid name or a value that is not finite."""
     return {check_name(name): _number(name, value) for name, value in values.items()}
 
 

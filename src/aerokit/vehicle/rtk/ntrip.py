@@ -120,7 +120,6 @@ class _Response:
 
     @classmethod
     async def read(cls, reader: asyncio.StreamReader) -> _Response:
-        """Read the status line and the headers; `body` reads the rest."""
         status = (await reader.readline()).decode("latin-1").strip()
         headers: dict[str, str] = {}
         # In NTRIP 1, the data follow "ICY 200 OK" at once or after an empty line. RtcmReader skips that line.
@@ -235,7 +234,6 @@ class NtripClient:
         await run_shielded(self._wait_closed(writer))
 
     async def _wait_closed(self, writer: asyncio.StreamWriter | None) -> None:
-        """Wait, at most CLOSE_TIMEOUT_S, until the background task has ended and the connection is closed."""
         with anyio.move_on_after(CLOSE_TIMEOUT_S):
             if not self._session.is_closed:
                 await self._ended.wait()
@@ -244,7 +242,6 @@ class NtripClient:
                     await writer.wait_closed()
 
     async def _run(self, response: _Response) -> None:
-        """Forward corrections, and reconnect when necessary, until the block ends."""
         try:
             with self._cancellation:
                 await self._forward(response)
@@ -271,7 +268,7 @@ class NtripClient:
             self._ended.set()
 
     async def _forward(self, response: _Response) -> int:
-        """Send the corrections from one connection to the vehicle; return the number of messages received."""
+        """Send the corrections from one connection to the vehicle. Return the number of messages."""
         reader = RtcmReader()
         message_count = 0
         reason = "the caster closed the connection"
@@ -311,7 +308,6 @@ class NtripClient:
     # -------------------------------------------------------------------------------------- caster
 
     async def _open(self, mount: str) -> _Response:
-        """Request a mount point, and keep the connection open in ``_writer``; raise if the caster refuses."""
         response = await self._request(mount)
         if response.is_stream:
             return response
@@ -328,7 +324,7 @@ class NtripClient:
         raise OperationRejected(f"{self._name}: {reason}")
 
     async def _request(self, mount: str) -> _Response:
-        """Connect to the caster, and request a mount point, or the source table if ``mount`` is empty."""
+        """Request a mount point, or the source table if ``mount`` is empty."""
         caster = self._caster
         context = ssl.create_default_context() if caster.is_encrypted else None
 
@@ -355,7 +351,7 @@ class NtripClient:
             self._close()
 
     async def _read_source_table(self, response: _Response) -> dict[str, bool]:
-        """Read a source table: map each mount point to True if it needs the position (field ``nmea``)."""
+        """Map each mount point to True if it needs the position."""
         text = b""
         # If the table does not arrive completely in time, use the rows that have arrived.
         with anyio.move_on_after(self._timeout), suppress(OSError, ValueError, EOFError):
@@ -373,7 +369,6 @@ class NtripClient:
         return needs_position
 
     async def _report_position(self) -> None:
-        """Send the position to the caster every 10 s. While the position is unknown, check for it every second."""
         with self._session.streaming("position", "gps"):
             while self._writer is not None:
                 sentence = gga_sentence(self._session)
@@ -388,7 +383,7 @@ class NtripClient:
 
 
 def gga_sentence(session: VehicleSession) -> bytes | None:
-    """Return the vehicle's position as ``$GPGGA,…`` (NMEA); None while no recent position is known."""
+    """Return the vehicle's position as ``$GPGGA,…``, or None while no recent one is known."""
     position = session.telemetry.position
     place = position.latest
     if place is None or position.age > POSITION_MAX_AGE_S or place.altitude_amsl_m is None:
@@ -410,7 +405,7 @@ def gga_sentence(session: VehicleSession) -> bytes | None:
 
 
 def _format_angle(degrees: float, *, degree_digits: int) -> str:
-    """Format an angle as degrees and minutes without a separator between them: 4723.86456."""
+    """Format an angle as degrees and minutes: 4723.86456 is 47° 23.86456'."""
     whole_degrees, rest = divmod(round(abs(degrees) * 60 * 100_000), 60 * 100_000)
     minutes, fraction = divmod(rest, 100_000)
     return f"{whole_degrees:0{degree_digits}d}{minutes:02d}.{fraction:05d}"

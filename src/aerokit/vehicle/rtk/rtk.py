@@ -41,7 +41,7 @@ _SENT: WeakKeyDictionary[Connection, _SentMessages] = WeakKeyDictionary()
 
 
 def send_rtcm(connection: Connection, message: bytes, sender: object) -> int:
-    """Send one RTCM message as GPS_RTCM_DATA, which reaches every vehicle of the connection.
+    """Send one RTCM message as GPS_RTCM_DATA to every vehicle of the connection.
 
     Sends nothing if another sender has just sent the same message. Returns the number of MAVLink messages sent.
     """
@@ -136,13 +136,10 @@ class Rtk:
         return NtripClient(self._session, self._send, Caster.parse(url), send_position, timeout)
 
     def _send(self, message: bytes) -> None:
-        """Send one RTCM message and update the statistics.
-
-        One transmission reaches all vehicles of the connection. If the object of another vehicle has just sent the same
-        message, this method only counts it.
-        """
         if self._session.is_closed:
             raise ConnectionClosed("the async with block of this vehicle was left; nothing was sent")
+        # One transmission reaches all vehicles of the connection, so this sends nothing if the object of another
+        # vehicle has just sent the message.
         send_rtcm(self._session.connection, message, self)
         now = self._session.connection.now()
         self._messages += 1

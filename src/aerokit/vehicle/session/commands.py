@@ -74,7 +74,7 @@ class CommandSender:
         )
 
     def close(self) -> None:
-        """Stop receiving acks. Calls that wait for an ack, and later calls, raise ConnectionClosed."""
+        """Stop receiving acks. Waiting calls and later calls raise ConnectionClosed."""
         for detach in self._detach_callbacks:
             detach()
         self._is_closed = True
@@ -92,10 +92,10 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         was_just_sent: bool = False,
     ) -> CommandAck:
-        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack; see :meth:`Vehicle.command`.
+        """Send a COMMAND_LONG with param1 to param7 and return its ACCEPTED ack.
 
-        Pass ``was_just_sent=True`` if `send_unconfirmed` has just sent the command. This call then waits for the ack
-        first, and sends the command only to repeat it.
+        Pass ``was_just_sent=True`` if `send_unconfirmed` has just sent the command. It is then sent again only if no
+        ack arrives. See also :meth:`Vehicle.command`.
         """
         target = self._component_id if component_id is None else component_id
         message = command_long(self._system_id, target, command, params)
@@ -133,9 +133,9 @@ class CommandSender:
         order_status: OrderStatus | None = None,
         **options: Any,
     ) -> CommandAck:
-        """Send a command with a position: as COMMAND_INT, or as COMMAND_LONG if the vehicle answers "unsupported".
+        """Send a command with a position, as COMMAND_LONG if COMMAND_INT is unsupported.
 
-        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees; ``z`` is in metres above mean sea level.
+        ``x`` and ``y`` are latitude and longitude in 1e-7 degrees. ``z`` is in metres above mean sea level.
         COMMAND_LONG has no frame, so use this only if the command's altitude is always AMSL, as for DO_SET_HOME.
         """
         try:
@@ -159,37 +159,33 @@ class CommandSender:
         self._expect_acks((target, command), self._acks_of(command))
 
     def is_for_us(self, ack: CommandAck) -> bool:
-        """Return True if the ack is addressed to us, or has no target (0), as in MAVLink 1 and old firmware."""
+        # An ack without a target (0) counts too. MAVLink 1 and old firmware send no target.
         return is_addressed_to(ack, self._connection.source_system, self._connection.source_component)
 
     def last_result(self, command: int, component_id: int | None = None) -> int | None:
-        """Return the last MAV_RESULT received for this command, even if the call that sent it was cancelled."""
+        # The results of cancelled calls are recorded too.
         return self._results.get((self._component_id if component_id is None else component_id, command))
 
     def is_unsupported(self, command: int, component_id: int | None = None) -> bool:
-        """Return True if the vehicle's last answer to this command was one of `UNSUPPORTED_RESULTS`."""
         return self.last_result(command, component_id) in UNSUPPORTED_RESULTS
 
     def may_get_late_ack(self, command: int, component_id: int) -> bool:
-        """Return True if an earlier transmission of this command may still be answered.
-
-        Its late ack could then be taken for the ack of the same command that is sent now, without retries.
-        """
+        """Return True if an earlier transmission of this command may still be answered."""
+        # The late ack could be taken for the ack of the same command that is sent now, without retries.
         earliest = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return any(recorded_at >= earliest for recorded_at in self._pending_acks.get((component_id, command), ()))
 
     def accepted_at(self, command: int) -> float:
-        """Return the time of the autopilot's last ACCEPTED ack that was addressed to us; −inf if there was none."""
+        """Return the time of the autopilot's last ACCEPTED ack to us, or −inf if there was none."""
         return self._accepted_at.get((self._component_id, command), -math.inf)
 
     def forget_result(self, command: int, component_id: int | None = None) -> None:
-        """Discard the recorded result of this command."""
         key = (self._component_id if component_id is None else component_id, command)
         self._results.pop(key, None)
         self._accepted_at.pop(key, None)
 
     def forget_results(self) -> None:
-        """Discard all recorded results, because a rebooted vehicle may support other commands."""
+        # A rebooted vehicle may support other commands.
         self._results.clear()
 
     async def _run(
@@ -202,7 +198,7 @@ class CommandSender:
         order_status: OrderStatus | None,
         was_just_sent: bool = False,
     ) -> CommandAck:
-        """Send a command and return its ACCEPTED ack. Waits until earlier calls with the same key have ended."""
+        """Send a command and return its ACCEPTED ack. Waits for earlier calls of the same command."""
         # Several components may answer a command to all components (0). Only the autopilot's answer ends this call.
         key = (message.target_component or self._component_id, message.command)
         self._abort_run_of_ended_order(key)
@@ -252,36 +248,33 @@ class CommandSender:
                 self._expect_acks(key, exchange.pending_answers, still_pending)
 
     def _abort_run_of_ended_order(self, key: _Key) -> None:
-        """If the order of the running command with this key has ended, abort it, so that a newer one need not wait."""
         order_status = self._order_statuses.get(key)
         if order_status is not None and order_status.end:
             _, command = key
             text = f"no COMMAND_ACK for {command_name(command)} yet; not sent again: {order_status.end}"
+            # A newer order need not wait for the rest of this run.
             self._runs[key].abort(CommandTimeout(text))
 
     def _min_attempt_timeout_s(self) -> float:
-        """Return the minimum time to wait for an ack: a few round trips, but no more than ``MAX_ATTEMPT_TIMEOUT_S``.
-
-        A round trip that was measured while the link was stalled would make the wait too long.
-        """
+        # A round trip that was measured while the link was stalled would make the wait too long.
         return min(MIN_ROUND_TRIPS * (self._round_trip_s() or 0.0), MAX_ATTEMPT_TIMEOUT_S)
 
     def _acks_of(self, command: int) -> int:
-        """Return the number of acks that the vehicle sends for this command; PX4 sends two for some commands."""
+        # PX4 sends two acks for some commands.
         return self._acks_per_command.get(command, 1)
 
     def _expect_acks(self, key: _Key, count: int, earlier_records: Sequence[float] = ()) -> None:
-        """Record acks that may still arrive, so that the next command with this key ignores them.
+        """Record acks that may still arrive, so that the next command ignores them.
 
-        The last command may still get ``count`` acks, which are recorded with the current time. ``earlier_records``,
-        the result of :meth:`_pop_pending_acks`, are the times of acks of earlier commands; they are recorded again.
+        The last command may still get ``count`` acks. ``earlier_records`` are those of earlier commands, from
+        :meth:`_pop_pending_acks`.
         """
         new_records = [self._connection.now()] * count
         if earlier_records or new_records:
             self._pending_acks.setdefault(key, []).extend([*earlier_records, *new_records])
 
     def _pop_pending_acks(self, key: _Key) -> list[float]:
-        """Remove the pending acks with this key. Return the recorded times of those that may still arrive."""
+        """Remove the pending acks, and return the times of those that may still arrive."""
         lost_before = self._connection.now() - PENDING_ACK_TIMEOUT_S
         return [recorded_at for recorded_at in self._pending_acks.pop(key, ()) if recorded_at >= lost_before]
 
@@ -290,7 +283,6 @@ class CommandSender:
             run.abort(error)
 
     def _on_ack(self, ack: CommandAck) -> None:
-        """Deliver an ack to the call that waits for it; without such a call, count it as an ack of an earlier call."""
         frame = ack.received_frame
         key = (0 if frame is None else frame.component_id, ack.command)
         run = self._runs.get(key)
@@ -304,6 +296,7 @@ class CommandSender:
         if run is not None:
             run.receive(ack)
         elif is_answer and is_final:
+            # No call waits for this ack, so it is the ack of an earlier call.
             self._pending_acks[key].pop(0)
             if not self._pending_acks[key]:
                 del self._pending_acks[key]

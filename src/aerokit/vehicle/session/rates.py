@@ -50,7 +50,6 @@ START_STREAM = 1
 
 
 def check_rate(message_type: type[Message], hz: float) -> None:
-    """Raise InvalidArgument unless the rate is above 0 and at most 1000 Hz."""
     check_range(f"rate_hz of {message_type.NAME}", hz, 0, 1000, above=True)
 
 
@@ -81,26 +80,22 @@ class _Stream:
 
     @property
     def needed_hz(self) -> float:
-        """The highest rate needed that was not refused; 0 (the autopilot's own rate) if there is none."""
+        """The highest rate needed that was not refused, or 0 (the autopilot's own rate)."""
         return max((hz for hz in self.requests.values() if hz not in self.refused_hz), default=AUTOPILOT_DEFAULT)
 
     @property
     def is_optional(self) -> bool:
-        """True if no caller requires the stream: all its requests are optional."""
         return not self.required
 
     @property
     def is_due(self) -> bool:
-        """True if a request is due: the needed rate differs from the rate that was requested last."""
         return self.requested_hz != self.needed_hz
 
     def achieved_hz(self) -> float:
-        """Return the average rate in the window of the last checks."""
         received_in_window = self.counts_at_checks[-1] - self.counts_at_checks[0]
         return received_in_window / ((len(self.counts_at_checks) - 1) * WATCH_PERIOD_S)
 
     def mark_requested(self, now: float, hz: float) -> None:
-        """Record that this rate was requested, and restart the measurement of the received rate."""
         self.requested_hz = hz
         self.counts_at_checks = deque([self.received], maxlen=WATCH_WINDOW + 1)
         self.retry_at = now + self.retry_interval_s if hz > 0 else math.inf
@@ -142,10 +137,11 @@ class MessageRates:
         self._is_closed = False
 
     def request(self, message_type: type[Message], hz: float, *, is_optional: bool = False) -> Detach:
-        """Request ``message_type`` at ``hz`` (above 0, at most 1000) or faster until the returned function is called.
+        """Request a message at ``hz`` or faster until the returned function is called.
 
-        ``is_optional`` means that the vehicle may lack the message, for example because it lacks the sensor. If all
-        present requests for a message are optional, no event reports that it was refused or never arrives.
+        The rate is above 0 and at most 1000. ``is_optional`` means that the vehicle may lack the message, for example
+        because it lacks the sensor. If all requests for a message are optional, no event reports that it never
+        arrives.
         """
         check_rate(message_type, hz)
         stream = self._streams.get(message_type.ID)
@@ -167,7 +163,7 @@ class MessageRates:
         return release
 
     def request_again(self) -> None:
-        """Request all messages again, because the vehicle may have lost the requests, for example by a reboot."""
+        # The vehicle may have lost the requests, for example by a reboot.
         for stream in self._streams.values():
             stream.requested_hz = None
             stream.refused_hz.clear()
@@ -178,14 +174,14 @@ class MessageRates:
         self._has_due_streams.set()
 
     async def run(self) -> None:
-        """Send the requests that are due, until cancelled. :meth:`watch`, which repeats requests, must run as well."""
+        """Send the requests that are due, until cancelled. `watch` must run as well."""
         while True:
             await self._has_due_streams.wait()
             self._has_due_streams.clear()
             await self._request_all_due()
 
     async def watch(self) -> None:
-        """Check once a second, until cancelled, at which rates messages arrive and whether requests are due."""
+        """Check the received rates once a second, until cancelled."""
         while True:
             await anyio.sleep(WATCH_PERIOD_S)
             for stream in self._streams.values():
@@ -194,7 +190,6 @@ class MessageRates:
                 self._has_due_streams.set()
 
     def close(self) -> None:
-        """Stop counting messages."""
         self._is_closed = True
         for stream in self._streams.values():
             if stream.detach is not None:
@@ -211,10 +206,6 @@ class MessageRates:
         return stream
 
     async def _request_all_due(self) -> None:
-        """Request the due streams by MAV_CMD_SET_MESSAGE_INTERVAL, one at a time; after failures, a stream comes last.
-
-        If the vehicle does not support this command, request the groups of the streams instead, all at once.
-        """
         while not self._uses_groups and (stream := self._most_urgent()) is not None:
             await self._request_by_command(stream)
         if self._uses_groups:
@@ -226,7 +217,6 @@ class MessageRates:
         return min(due, key=lambda stream: (stream.failures, stream.is_optional), default=None)
 
     async def _request_by_command(self, stream: _Stream) -> None:
-        """Request the rate that a stream needs by MAV_CMD_SET_MESSAGE_INTERVAL."""
         hz = stream.needed_hz
         interval_us = 0.0 if hz == AUTOPILOT_DEFAULT else 1e6 / hz
         reset_count = self._reset_count
@@ -270,17 +260,13 @@ class MessageRates:
             stream.requested_hz = None
 
     def _mark_refused(self, stream: _Stream, hz: float, reason: str) -> None:
-        """Record that the vehicle does not send the stream at this rate. Lower rates are requested next, if needed."""
+        # Lower rates are requested next, if they are needed.
         stream.refused_hz.add(hz)
         if stream.requested_hz is None or not hz:
             stream.mark_requested(self._connection.now(), AUTOPILOT_DEFAULT)
         self._publish_unavailable(stream, reason)
 
     def _request_by_group(self) -> None:
-        """Request groups of messages by REQUEST_DATA_STREAM.
-
-        This message has no ack, so :meth:`watch` repeats it if nothing arrives.
-        """
         rates_by_group: dict[int, float] = {}
         for stream in self._streams.values():
             if not stream.is_due:
@@ -291,6 +277,7 @@ class MessageRates:
                 self._publish_unavailable(stream, "in no group of REQUEST_DATA_STREAM")
             else:
                 rates_by_group[group] = self._rate_of_group(group)
+            # REQUEST_DATA_STREAM has no ack, so `watch` repeats it if nothing arrives.
             stream.mark_requested(self._connection.now(), stream.needed_hz)
         for group, hz in rates_by_group.items():
             if hz > 0:  # A rate of 0 would stop a group that another ground station may use.
@@ -320,7 +307,6 @@ class MessageRates:
     # ------------------------------------------------------------------------------ watching
 
     def _watch(self, stream: _Stream) -> None:
-        """Record how many messages have arrived. If necessary, request the stream again, or report it as slow."""
         stream.counts_at_checks.append(stream.received)
         if stream.requested_hz is None or stream.requested_hz <= 0:
             return
@@ -329,7 +315,7 @@ class MessageRates:
         else:
             stream.retry_interval_s = RETRY_INTERVAL_S
             stream.retry_at = self._connection.now() + RETRY_INTERVAL_S
-        self._check_rate(stream)
+        self._publish_if_slow(stream)
 
     def _retry_if_due(self, stream: _Stream) -> None:
         if self._connection.now() >= stream.retry_at:
@@ -337,8 +323,7 @@ class MessageRates:
             stream.requested_hz = None
             self._has_due_streams.set()
 
-    def _check_rate(self, stream: _Stream) -> None:
-        """Publish StreamSlow when a stream becomes slow."""
+    def _publish_if_slow(self, stream: _Stream) -> None:
         if stream.requested_hz is None or len(stream.counts_at_checks) <= WATCH_WINDOW:
             return
         achieved_hz = stream.achieved_hz()

@@ -69,9 +69,9 @@ EAGER_REQUESTS, EAGER_INTERVAL_S = 4, 0.3
 
 
 async def learn_constants(connection: Connection, commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request version, home and origin until they are known, and again after each reboot. Request the modes.
+    """Request version, home, origin and modes while they are unknown.
 
-    Runs until the link closes.
+    Runs until the link closes, because a reboot makes them unknown. The modes are kept.
     """
     mode_requests_left = MAX_MODE_REQUESTS
     await _learn_version(commands, telemetry)
@@ -91,8 +91,8 @@ async def learn_constants(connection: Connection, commands: CommandSender, telem
 
 
 async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
-    """Request AUTOPILOT_VERSION at short intervals, because the first transfer waits for the capabilities in it."""
     version = telemetry.version
+    # The first transfer waits for the capabilities in AUTOPILOT_VERSION, so it is requested at short intervals.
     for _ in range(EAGER_REQUESTS):
         if version.is_known:
             return
@@ -102,7 +102,7 @@ async def _learn_version(commands: CommandSender, telemetry: Telemetry) -> None:
 
 
 async def _request(commands: CommandSender, message_id: int, *, attempt_timeout: float = 1.0) -> bool:
-    """Request one message, twice if necessary. Return True if the vehicle answered, even if it refused."""
+    """Request one message. Return True if the vehicle answered, even if it refused."""
     try:
         await commands.send_long(MavCmd.REQUEST_MESSAGE, message_id, attempts=2, attempt_timeout=attempt_timeout)
     except CommandTimeout:
@@ -191,7 +191,6 @@ class VehicleSession:
     # ------------------------------------------------------------------------- begin and end
 
     def start(self, heartbeat: Heartbeat, rates: Mapping[type[Message], float] | None) -> None:
-        """Process the first heartbeat, request streams and constants, and start the background tasks."""
         self.telemetry.receive(heartbeat)
         # A message with a default rate may be missing. If a message that the program has named is missing, it is
         # reported.
@@ -203,7 +202,7 @@ class VehicleSession:
             self.background.start(task, f"aerokit {task.__qualname__}")
 
     def close(self) -> None:
-        """Stop sending and receiving; waiting calls raise ConnectionClosed."""
+        """Stop sending and receiving. Waiting calls raise ConnectionClosed."""
         self.is_closed = True
         self._on_end(ConnectionClosed("the async with block of this vehicle was left"))
         for detach in self._detach_callbacks:
@@ -214,14 +213,17 @@ class VehicleSession:
         self.rates.close()
 
     def at_close(self, *functions: Detach) -> None:
-        """Register callbacks for the end of the vehicle's `async with` block; after its end, call them at once."""
+        """Register callbacks for the end of the vehicle's `async with` block.
+
+        After its end, they are called at once.
+        """
         self._detach_callbacks += functions
         if self.is_closed:
             for function in functions:
                 function()
 
     def register_cell(self, cell: StateCell[Any]) -> None:
-        """Add a state value: it is reset when the vehicle reboots, and closed with the session."""
+        """Reset this cell when the vehicle reboots, and close it with the session."""
         self._cells.append(cell)
         self.add_timeout_hint(cell)
         self.on_reboot.append(cell.forget)
@@ -230,11 +232,11 @@ class VehicleSession:
 
     @property
     def is_open(self) -> bool:
-        """True while messages can be sent: neither the connection nor the vehicle's `async with` block has ended."""
+        """True while messages can be sent."""
         return self.connection.is_open and not self.is_closed
 
     def add_timeout_hint(self, *cells: StateCell[Any]) -> None:
-        """Make time-out errors of these state cells mention rejected signatures, which are a likely cause."""
+        """Make time-out errors of these state cells mention rejected signatures."""
         for cell in cells:
             cell._explain_timeout = self._describe_signatures
 
@@ -248,7 +250,7 @@ class VehicleSession:
 
     @contextmanager
     def streaming(self, *names: str, hz: float = ACTION_HZ) -> Iterator[None]:
-        """Request the messages of these states during a `with` block, even if the program uses no default rates."""
+        """Request the messages of these states during a `with` block."""
         release_requests = [
             self.rates.request(message_type, hz, is_optional=True)
             for name in names
@@ -261,7 +263,7 @@ class VehicleSession:
                 release()
 
     def check_disarmed(self, action: str, *, is_current: bool = True) -> None:
-        """Raise OperationRejected unless the vehicle is known to be disarmed.
+        """Raise OperationRejected if the vehicle is not known to be disarmed.
 
         Pass ``is_current=False`` if the last HEARTBEAT is too old to show the present state.
         """
@@ -270,35 +272,30 @@ class VehicleSession:
             raise OperationRejected(f"{action}: the vehicle is {state}; nothing was sent")
 
     async def wait_for_heartbeat(self, since: float | None = None) -> None:
-        """Wait for a HEARTBEAT that is received after ``since``, or after this call if ``since`` is None.
-
-        A HEARTBEAT that waited long while the event loop was blocked does not count.
-        """
+        """Wait for a HEARTBEAT received after ``since``, by default after this call."""
         # Every HEARTBEAT updates `armed`.
         armed = self.telemetry.armed
         start = self.connection.now() if since is None else since
+        # A HEARTBEAT that waited long while the event loop was blocked does not count.
         await armed.wait_until(
             lambda _: armed.updated_at > start and armed.age <= MAX_HEARTBEAT_AGE_S, description="the next HEARTBEAT"
         )
 
     def is_answer(self, ack: CommandAck, command: int) -> bool:
-        """Return True if the autopilot sent this ack, and if it is for us and for this command."""
         frame = ack.received_frame
         is_from_autopilot = frame is not None and self.telemetry.accepts(frame)
         return is_from_autopilot and ack.command == command and self.commands.is_for_us(ack)
 
     @contextmanager
     def refusals_of(self, command: int) -> Iterator[list[CommandAck]]:
-        """Collect the acks that refuse a command during a `with` block.
-
-        PX4 acknowledges some commands twice, and may first accept and then refuse them. If it accepts the command
-        again, for example because the command was repeated, the refusals so far are removed.
-        """
+        """Collect the acks that refuse a command during a `with` block."""
         refusals: list[CommandAck] = []
 
         def collect(ack: CommandAck) -> None:
             if not self.is_answer(ack, command):
                 return
+            # PX4 acknowledges some commands twice, and may first accept and then refuse them. If it accepts the command
+            # again, for example because the command was repeated, the refusals so far do not count.
             if ack.result == MavResult.ACCEPTED:
                 refusals.clear()
             elif ack.result in RESULTS_OF_REFUSAL:
@@ -311,14 +308,12 @@ class VehicleSession:
             detach()
 
     async def wait_for_status_texts(self) -> None:
-        """Wait for a moment, because the status texts that explain a refusal may arrive after it."""
+        # The status texts that explain a refusal may arrive after it.
         await anyio.sleep(STATUS_TEXT_DELAY_S)
 
     def with_reasons(self, error: CommandRejected, since: float, reasons: tuple[str, ...] = ()) -> CommandRejected:
-        """Return the error with more reasons: the vehicle's status texts from ``since`` on, and ``reasons``.
-
-        Duplicates are removed. Informational texts ("ArduPilot Ready") are left out unless they are known refusals.
-        """
+        """Return the error with ``reasons`` and with the vehicle's status texts from ``since`` on."""
+        # An informational text such as "ArduPilot Ready" is no reason, unless it is a known refusal.
         texts = [
             text.text
             for text in self.telemetry.texts_since(since)
@@ -332,7 +327,7 @@ class VehicleSession:
         )
 
     def deduplicate_reasons(self, *texts: str) -> tuple[str, ...]:
-        """Remove duplicate texts: ArduPilot sends the same text once as "PreArm: …" and once as "Arm: …"."""
+        # ArduPilot sends the same text once as "PreArm: …" and once as "Arm: …".
         reasons: dict[str, str] = {}
         for text in texts:
             reasons.setdefault(self.autopilot.arming_reason(text) or text, text)
@@ -348,7 +343,6 @@ class VehicleSession:
         return self.connection.now() - self.watch.last_heartbeat_at
 
     def describe_link(self) -> str:
-        """Return one line about the link's quality, for error texts."""
         received, lost = self.connection.counts(self.system_id)
         sent = received + lost
         loss = f"{100 * lost / sent:.0f} % of the vehicle's frames lost" if sent else "nothing received"
@@ -364,11 +358,10 @@ class VehicleSession:
     # -------------------------------------------------------------------------------- events
 
     def publish(self, event_type: type[Event], *fields: Any) -> None:
-        """Publish an event of this vehicle on the bus."""
+        """Publish an event with the present time and this vehicle's system id."""
         self.connection.bus.publish(event_type(self.connection.now(), self.system_id, *fields))
 
     def _attach_telemetry(self) -> None:
-        """Let messages update the state cells, and publish some changes of the cells as events."""
         bus, streams = self.connection.bus, self.telemetry.streams
         for message_id, handler in self.telemetry.handles.items():
             message_type = bus.dialect.get(message_id)
@@ -398,7 +391,7 @@ class VehicleSession:
         ]
 
     def _attach_watched_streams(self) -> None:
-        """Make states with a ``watched_hz`` request their message at this rate while the program watches them."""
+        """Make states with a ``watched_hz`` request their message while the program watches them."""
         for name, state in STATES.items():
             cell = self.telemetry.cells[name]
             for source in state.sources:
@@ -410,12 +403,12 @@ class VehicleSession:
                     cell._feed_from(*cell._feeds, WatchedStream(cell, request))  # in addition to its present feeds
 
     def _on_link_selected(self, event: LinkSelected) -> None:
-        """Request all streams again, because an autopilot keeps separate rates for each of its ports."""
+        # An autopilot keeps separate rates for each of its ports.
         if event.system_id == self.system_id and event.before is not None:
             self.rates.request_again()
 
     def _on_computer_slept(self, event: ComputerSlept) -> None:
-        """Add the duration of the sleep to all ages, because the loop's clock stood still while the computer slept."""
+        # The loop's clock stood still while the computer slept.
         self.watch.last_heartbeat_at -= event.seconds
         for cell in (*self.telemetry.cells.values(), *self._cells):
             cell._add_age(event.seconds)
@@ -439,7 +432,6 @@ class VehicleSession:
             callback()
 
     def _on_end(self, error: Exception) -> None:
-        """End the background tasks and all waits for a state, because the connection or the session has ended."""
         self.background.cancel()
         self.watch.end(error)
         self.telemetry.close(error)

@@ -26,7 +26,7 @@ TIMESTAMP_TICKS_PER_S = 100_000
 
 
 async def set_up_signing(session: VehicleSession, signing: Signing | None, timeout: float) -> None:
-    """Send SETUP_SIGNING until the vehicle signs with the key, or no longer signs; see `Vehicle.setup_signing`."""
+    """Send SETUP_SIGNING until the vehicle signs with the key, or no longer signs."""
     _check_vehicle(session)
     connection, started = session.connection, session.connection.now()
     with connection._gate.key_handover(signing, session.system_id, session.component_id) as has_accepted:
@@ -49,7 +49,6 @@ async def set_up_signing(session: VehicleSession, signing: Signing | None, timeo
 
 
 def _check_vehicle(session: VehicleSession) -> None:
-    """Raise unless both sides use MAVLink 2 and the vehicle is disarmed."""
     heartbeat = session.connection.heartbeats.get((session.system_id, session.component_id))
     frame = None if heartbeat is None else heartbeat.received_frame
     sends_mavlink_1 = session.connection.mavlink_version == 1

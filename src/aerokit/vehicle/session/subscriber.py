@@ -28,7 +28,7 @@ SUBSCRIPTION_HZ = 4.0
 
 
 def subscription_rate_hz(message_type: type[Message]) -> float | None:
-    """Return the rate to request for a subscription that names no rate; None for a message that is not a stream."""
+    """Return the default rate of a subscription, or None if the message is not streamed."""
     name = message_type.__name__
     return DEFAULT_RATES_HZ.get(name, SUBSCRIPTION_HZ if name in STREAMED_MESSAGES else None)
 
@@ -76,7 +76,7 @@ class ComponentSubscriber:
         *,
         entire_system: bool = False,
     ) -> Subscription[ItemT]:
-        """Return a subscription to events and messages. During its `with` block, the messages are requested.
+        """Return a subscription that requests its messages during its `with` block.
 
         It receives the messages of this component, or of all components if ``entire_system`` is True.
         """
@@ -87,7 +87,6 @@ class ComponentSubscriber:
                 check_rate(message_type, rate_hz)
 
         def attach(sink: Sink) -> list[Detach]:
-            """Attach the sink and request the rates, when the `with` block of the subscription is entered."""
             filtered_sink = sink if entire_system else self._of_component(sink)
             detach_callbacks = self._connection.attach(types, filtered_sink, system_id=self._system_id)
             detach_callbacks.append(self._end.on_end(subscription.close))  # `subscription` is assigned below.
@@ -133,7 +132,6 @@ class ComponentSubscriber:
             self._at_close(bus.attach(message_type, self._of_component(callback), system_id=self._system_id))
 
     def _new_cell(self, message_type: type[Message]) -> StateCell[Any]:
-        """Return a cell that is updated by each message of this type, with the time of its arrival."""
         arrived_at = math.nan  # Time of the message in the cell. `store` sets this variable first, and then the cell.
         name = message_type.NAME
         cell: StateCell[Any] = StateCell(name, self._connection.now, waits_for=name, stamp=lambda: arrived_at)
@@ -150,7 +148,7 @@ class ComponentSubscriber:
         return cell
 
     def _of_component(self, sink: Callable[..., object]) -> Sink:
-        """Return a sink that drops messages of other components and events about them, and passes all else on."""
+        """Return a sink that drops messages and events of other components."""
 
         def filtered(item: Any) -> None:
             frame = getattr(item, "received_frame", None)
@@ -182,7 +180,6 @@ class WatchedStream:
         """Do nothing, because another feed of the cell decodes the message."""
 
     def watchers_changed(self) -> None:
-        """Request the message if the cell is now watched; release the request if it no longer is."""
         if not self._cell._is_watched and self._release is not None:
             self._release()
             self._release = None

@@ -47,7 +47,7 @@ class Messaging(Protocol):
 
 
 def _without_errors(on_progress: OnProgress) -> OnProgress:
-    """Return a callback that logs errors of ``on_progress``, so that the transfer continues."""
+    """Return a callback that logs the errors of ``on_progress`` instead of raising them."""
 
     def report(progress: TransferProgress) -> None:
         try:
@@ -101,8 +101,8 @@ class Transfers:
     async def run(self, exchange: Exchange[ResultT], *, timeout: float | None = None) -> ResultT:
         """Run one exchange to its end and return its result.
 
-        Cancellation ends the exchange at once. :class:`OperationTimeout` is raised after ``timeout`` seconds, or when
-        the exchange itself times out; the error text describes the link.
+        Cancellation ends the exchange at once. Raises :class:`OperationTimeout` after ``timeout`` seconds, or when the
+        exchange itself times out.
         """
         self._end.raise_if_ended()
         with self.limit(timeout), anyio.CancelScope() as scope:
@@ -129,25 +129,26 @@ class Transfers:
         error.args = (f"{error}; {self._describe()}",)
 
     def _init_round_trip(self) -> None:
-        """Unless a round trip is known already, use that of TIMESYNC as the first sample."""
         if self.round_trip.smoothed_s is not None:
             return
+        # The round trip of TIMESYNC is the first sample.
         seconds = self._round_trip_s()
         if seconds is not None:
             self.round_trip.add_sample(seconds)
 
     @contextmanager
     def limit(self, timeout: float | None) -> Iterator[None]:
-        """Raise :class:`OperationTimeout` if a `with` block takes more than ``timeout`` seconds. None: no limit."""
+        """Raise OperationTimeout if a `with` block takes more than ``timeout`` seconds."""
         with anyio.move_on_after(timeout) as scope:
             yield
         if scope.cancelled_caught:
             raise OperationTimeout(f"the operation was not done within {timeout:g} s; {self._describe()}")
 
     def command_in_background(self, command: int, *params: float, was_just_sent: bool = False) -> None:
-        """Send a command without waiting for its ack. The command is optional, so a failure is ignored.
+        """Send an optional command without waiting for its ack. Failures are ignored.
 
-        With ``was_just_sent``, the caller has already sent the command: it is sent again only if no ack arrives.
+        ``was_just_sent`` means that the caller has sent the command already. It is then sent again only if no ack
+        arrives.
         """
         send = self._send_command
 
@@ -161,7 +162,6 @@ class Transfers:
 
     @property
     def version(self) -> AutopilotVersion | None:
-        """The component's version, None while unknown."""
         return self._version.latest
 
     @property
@@ -171,10 +171,8 @@ class Transfers:
         return None if version is None else version.capabilities
 
     async def capabilities(self) -> int | None:
-        """Return the component's MAV_PROTOCOL_CAPABILITY bits; None if it does not send them within a few seconds.
-
-        Later calls do not wait again for a component that has not answered, unless it is an autopilot.
-        """
+        """Return the MAV_PROTOCOL_CAPABILITY bits, or None if they do not arrive in a few seconds."""
+        # Later calls do not wait again for a component that has not answered.
         if not self._version.is_known and not self._is_version_unavailable:
             with anyio.move_on_after(VERSION_TIMEOUT_S), suppress(CommandRejected, CommandTimeout):
                 if self._request_version is not None:
@@ -182,5 +180,4 @@ class Transfers:
                 await self._version.wait_until(lambda _: True)
             # There is no `request_version` for an autopilot, because its session requests the version until it arrives.
             self._is_version_unavailable = self._request_version is not None and not self._version.is_known
-        version = self._version.latest
-        return None if version is None else version.capabilities
+        return self.known_capabilities

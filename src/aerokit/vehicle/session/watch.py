@@ -111,9 +111,9 @@ class VehicleWatch:
     def silent_for_s(self) -> float:
         """Seconds since the last heartbeat was processed.
 
-        A heartbeat that waited while the event loop was blocked counts from its processing, so that the pause does not
-        count as silence. :attr:`last_heartbeat_at`, its time of arrival, may be earlier.
+        It may have arrived earlier, at :attr:`last_heartbeat_at`.
         """
+        # A pause in which the event loop was blocked must not count as silence.
         return self._connection.now() - self._heartbeat_read_at
 
     def end(self, error: Exception) -> None:
@@ -123,27 +123,24 @@ class VehicleWatch:
         self.link_state.close(error)
 
     def close(self) -> None:
-        """Stop monitoring."""
         self._connection.boot_clocks.pop((self._system_id, self._component_id), None)
         for detach in self._detach_callbacks:
             detach()
 
     def boot_time_ms(self, now: float) -> float | None:
-        """Return the vehicle's time since boot at ``now``, extrapolated from the last report; None if unknown.
-
-        The result takes into account that the clock of a simulation may be faster than real time.
-        """
+        """Return the vehicle's time since boot at ``now``, or None if it is unknown."""
         if "time_boot_ms" not in self._last_times or self._first_time is None:
             return None
         last_ms, last_at = self._last_times["time_boot_ms"]
         first_ms, first_at = self._first_time
         span_s = last_at - first_at
+        # The clock of a simulation may be faster than real time.
         ms_per_second = (last_ms - first_ms) / span_s if span_s > CLOCK_SPAN_S else 1000.0
         return last_ms + ms_per_second * (now - last_at)
 
     @contextmanager
     def expecting_reboot(self) -> Iterator[None]:
-        """During a `with` block, detect a reboot even if the previous boot was very recent."""
+        """Detect a reboot during a `with` block even if the previous boot was very recent."""
         self._expects_reboot = True
         try:
             yield
@@ -151,12 +148,9 @@ class VehicleWatch:
             self._expects_reboot = False
 
     def on_time_answer(self, requested_at: float, milliseconds: int) -> None:
-        """Detect a reboot by the time since boot in an answer to our TIMESYNC request.
-
-        An answer is ignored if its request was sent before the previous answer arrived, because the two may be in the
-        wrong order. In any other answer, a time lower than the previous one proves a reboot.
-        """
+        """Detect a reboot by the time since boot in an answer to our TIMESYNC request."""
         answered_at, milliseconds_before = self._last_answer
+        # If the request was sent before the previous answer arrived, the answers may be in the wrong order.
         if requested_at <= answered_at:
             return
         self._last_answer = (self._connection.now(), milliseconds)
@@ -164,7 +158,7 @@ class VehicleWatch:
             self._on_reboot_detected("TIMESYNC", milliseconds)
 
     def check(self) -> None:
-        """Publish VehicleSilent if heartbeats have stopped; called once a second."""
+        """Publish VehicleSilent if heartbeats have stopped. Called once a second."""
         now = self._connection.now()
         silent_for = self.silent_for_s
         self._state_tracker.check(now)
@@ -173,7 +167,6 @@ class VehicleWatch:
             self._connection.bus.publish(VehicleSilent(now, self._system_id, silent_for))
 
     def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
-        """Record a HEARTBEAT of the autopilot, and publish VehicleRecovered if it ends a reported silence."""
         frame = heartbeat.received_frame
         if frame is None or frame.component_id != self._component_id:
             return
@@ -190,23 +183,26 @@ class VehicleWatch:
         self._state_tracker.mark_lost(event.at)
 
     def _on_boot_time(self, frame: Frame) -> None:
-        """Read ``time_boot_ms`` at the start of the payload, which begins at byte 9 of ``body``."""
         if frame.component_id == self._component_id:
+            # ``time_boot_ms`` is at the start of the payload, which begins at byte 9 of ``body``.
             self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[9:13], "little"))
 
     def _on_system_time(self, frame: Frame) -> None:
-        """Read ``time_boot_ms``, which follows the 8 bytes of ``time_unix_usec`` in the payload."""
         if frame.component_id == self._component_id:
+            # ``time_boot_ms`` follows the 8 bytes of ``time_unix_usec`` in the payload.
             self._record_time(frame, "time_boot_ms", int.from_bytes(frame.body[17:21], "little"))
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Read the vehicle's time in its answers to TIMESYNC requests. It answers even if no streams are requested."""
         frame = message.received_frame
+        # The vehicle answers TIMESYNC requests even if no streams are requested.
         if message.tc1 != 0 and frame is not None and frame.component_id == self._component_id:
             self._record_time(frame, "TIMESYNC", message.tc1 // 1_000_000)
 
     def _record_time(self, frame: Frame, clock: str, milliseconds: int) -> None:
-        """Record a time since boot, and detect a reboot by it. ``clock`` names the message or field with the time."""
+        """Record a time since boot, and detect a reboot by it.
+
+        ``clock`` names the message or field with the time.
+        """
         now = self._now()
         milliseconds_before, read_at = self._last_times.get(clock, (milliseconds, now))
         # How far the vehicle's clock is behind its expected time. The result is too small if the earlier message was
@@ -224,7 +220,7 @@ class VehicleWatch:
             self._on_reboot_detected(clock, milliseconds)
 
     def _is_decrease_confirmed(self, clock: str, milliseconds: int) -> bool:
-        """Return True if the time first decreased at least ``REBOOT_CONFIRM_S`` seconds ago, and has advanced since."""
+        """Return True if the time decreased ``REBOOT_CONFIRM_S`` ago and has advanced since."""
         now = self._connection.now()
         decreased_ms, decreased_at = self._decreased_times.setdefault(clock, (milliseconds, now))
         if milliseconds < decreased_ms:  # The time has decreased further, so the confirmation starts again.
@@ -233,7 +229,6 @@ class VehicleWatch:
         return milliseconds > decreased_ms and now - decreased_at >= REBOOT_CONFIRM_S
 
     def _on_reboot_detected(self, clock: str, milliseconds: int) -> None:
-        """Report a reboot. The next one is detected relative to ``milliseconds``, the present time of ``clock``."""
         now = self._connection.now()
         # The times from before the reboot are discarded. Compared with them, later messages would show the same reboot
         # again.
@@ -285,16 +280,14 @@ class LinkWatch:
         self._detach = connection.bus.attach(Timesync, self._on_timesync, system_id=system_id)
 
     def close(self) -> None:
-        """Stop measuring."""
         self._detach()
 
     @property
     def round_trip_s(self) -> float | None:
-        """The round-trip time in seconds, as measured last; None before the first answer."""
         return self._round_trip_s
 
     async def run(self, on_tick: Callable[[], None]) -> None:
-        """Publish a report once a second, and call ``on_tick`` each time, until cancelled or the connection ends."""
+        """Publish a report and call ``on_tick`` once a second, until the connection ends."""
         self.request_time()
         self._next_request_at = self._connection.now()  # The next request follows after one second instead of two.
         while self._connection.is_open:
@@ -310,7 +303,6 @@ class LinkWatch:
                 on_tick()
 
     def request_time(self) -> None:
-        """Request the vehicle's time now; the next periodic request follows ``TIMESYNC_PERIOD_S`` later."""
         now = self._connection.now()
         self._next_request_at = now + TIMESYNC_PERIOD_S
         sent_at_ns = int(now * 1e9)
@@ -318,11 +310,8 @@ class LinkWatch:
         self._connection.send(Timesync(tc1=0, ts1=sent_at_ns), to=self._system_id)  # tc1 = 0 marks a request.
 
     def _on_timesync(self, message: Timesync) -> None:
-        """Measure the round trip by the autopilot's answer to our request, and pass the answer on.
-
-        All other TIMESYNC messages are ignored, for example the answer of a companion computer to the same request.
-        """
         frame = message.received_frame
+        # A companion computer may answer the same request.
         if frame is None or frame.component_id != self._component_id:
             return
         if message.tc1 != 0 and message.ts1 in self._open_requests:
@@ -334,7 +323,6 @@ class LinkWatch:
             self._on_answer(message.ts1 / 1e9, message.tc1 // 1_000_000)
 
     def _report(self) -> None:
-        """Publish the link's quality since the last report, with the round trip that was measured last."""
         counts, before = self._count(), self._counts_before
         self._counts_before = counts
         seconds = max(counts.at - before.at, 1e-9)

@@ -189,7 +189,6 @@ def second_gps(message: messages.Gps2Raw, context: Context) -> tuple[GpsReceiver
 
 
 def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) -> GpsReceiver:
-    """Return the receiver of this message, without a position if it has no fix."""
     has_fix = message.fix_type >= GpsFixType.TYPE_2D_FIX
     coordinates = valid_coordinates(message.lat, message.lon) if has_fix else None
     latitude, longitude = coordinates or (None, None)
@@ -215,7 +214,8 @@ def _gps_receiver(message: messages.GpsRawInt | messages.Gps2Raw, index: int) ->
 
 
 def cell_voltages_mv(message: messages.BatteryStatus) -> list[int]:
-    """Return the reported voltages in millivolts, of single cells or of all together; empty if none is measured."""
+    """Return the reported voltages, or an empty list if none is measured."""
+    # The voltages are those of single cells, or one of all cells together.
     cells_mv = [millivolts for millivolts in message.voltages if millivolts != U16]
     # Cells 11 to 14 are an extension of the message, in which an absent cell may be 0 instead of U16.
     cells_mv += [millivolts for millivolts in message.voltages_ext if millivolts not in (0, U16)]
@@ -293,7 +293,7 @@ def vibration(message: messages.Vibration) -> Vibration:
 
 
 def _replaced(items: tuple[Any, ...] | None, item: Any, key: Callable[[Any], int]) -> tuple[Any, ...]:
-    """Return ``items`` with ``item`` in place of the item that has the same key, or added; sorted by key."""
+    """Return ``items`` with ``item`` in place of the one with the same key, sorted by key."""
     other_items = (existing for existing in items or () if key(existing) != key(item))
     return tuple(sorted((item, *other_items), key=key))
 
@@ -371,26 +371,22 @@ def from_device(message: GimbalDeviceAttitudeStatus, heading: float | None) -> G
 
 
 def _is_from_nose(flags: int) -> bool:
-    """Return True if the yaw is relative to the vehicle's nose, False if it is relative to north.
-
-    Older gimbals set neither of the two flags YAW_IN_…_FRAME; their YAW_LOCK flag means "relative to north".
-    """
+    """Return True if the yaw is relative to the vehicle's nose, False if relative to north."""
     if flags & (YAW_IN_VEHICLE_FRAME | YAW_IN_EARTH_FRAME):
         return not flags & YAW_IN_EARTH_FRAME
+    # Older gimbals set neither of the two flags. Their YAW_LOCK flag means "relative to north".
     return not flags & YAW_LOCK
 
 
 def _euler(quaternion: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return pitch, roll and yaw in degrees; NaN for an invalid quaternion.
-
-    If the camera points straight up or down, roll and yaw have the same axis; roll is then 0.
-    """
+    """Return pitch, roll and yaw in degrees, or NaN for an invalid quaternion."""
     length = math.sqrt(sum(component * component for component in quaternion))
     if not length > 0:
         return math.nan, math.nan, math.nan
     w, x, y, z = (component / length for component in quaternion)
     sine_of_pitch = max(-1.0, min(1.0, 2 * (w * y - z * x)))  # Without the limits, rounding may exceed 1.
     pitch = math.degrees(math.asin(sine_of_pitch))
+    # If the camera points straight up or down, roll and yaw have the same axis.
     if abs(sine_of_pitch) > MIN_SINE_STRAIGHT:
         return pitch, 0.0, math.degrees(-2 * math.copysign(1, sine_of_pitch) * math.atan2(x, w))
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -399,16 +395,17 @@ def _euler(quaternion: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def _rounded(degrees: float) -> float | None:
-    """Round to hundredths of a degree, the resolution of MOUNT_STATUS; None for NaN."""
+    """Round to hundredths of a degree. Return None for NaN."""
+    # Hundredths of a degree are the resolution of MOUNT_STATUS.
     return round(degrees, 2) + 0.0 if math.isfinite(degrees) else None  # + 0.0 turns -0.0 into 0.0
 
 
 def _rounded_to_180(degrees: float) -> float | None:
-    """Like :func:`_rounded`, but first normalise the angle to -180 to 180."""
+    """Normalise an angle to -180 to 180, and round it."""
     return round(math.remainder(degrees, 360.0), 2) + 0.0 if math.isfinite(degrees) else None
 
 
 def _rounded_to_360(degrees: float) -> float | None:
-    """Like :func:`_rounded`, but first normalise the angle to at least 0 and below 360."""
+    """Normalise an angle to at least 0 and below 360, and round it."""
     # Rounding may turn 359.999 into 360, so the result is normalised again.
     return round(degrees % 360.0, 2) % 360.0 if math.isfinite(degrees) else None

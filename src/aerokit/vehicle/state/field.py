@@ -28,7 +28,6 @@ MESSAGE_IDS = {class_name: message_id for message_id, (class_name, *_) in messag
 
 
 def message_type(class_name: str) -> type[Message]:
-    """Return the message class of this name."""
     message_class: type[Message] = getattr(messages, class_name)
     return message_class
 
@@ -109,13 +108,12 @@ class StateField(Generic[T]):
         return cell
 
     def requested_from(self, autopilot: Autopilot) -> list[type[Message]]:
-        """Return the messages to request from this autopilot for this state."""
         best, *others = self.sources
         names = [best.message, *(source.message for source in others if source.alternative)]
         return [message_class for message_class in map(message_type, names) if autopilot.sends(message_class)]
 
     def waits_for(self, autopilot: Autopilot) -> str:
-        """Return the messages that report the state, as a part of error texts: "no … was received"."""
+        """Return the names of the messages that report the state, for error texts."""
         if self._waits_for:
             return self._waits_for
         names = " or ".join(message_class.NAME for message_class in self.requested_from(autopilot))
@@ -145,17 +143,15 @@ def enum_member(enum: type[int], value: int) -> int:
 
 
 def finite(value: float) -> float | None:
-    """Return the number; None for NaN and infinity."""
+    """Return the number, or None for NaN and infinity."""
     return value if math.isfinite(value) else None
 
 
 def known(value: int, *, unknown: int) -> int | None:
-    """Return the number; None if it equals ``unknown``."""
     return None if value == unknown else value
 
 
 def divided(value: int, divisor: int, *, unknown: int) -> float | None:
-    """Return the number divided by ``divisor``; None if the number equals ``unknown``."""
     return None if value == unknown else value / divisor
 
 
@@ -210,7 +206,7 @@ class StreamedMessage:
         """The latest frame of each instance, until it is decoded (or its message, until that is applied)."""
 
     def receive(self, frame: Frame, message: Message | None = None) -> None:
-        """Keep a frame until a cell is read. Apply it now if a cell has observers, or the last decoding was long ago.
+        """Keep a frame until a cell is read, or apply it now if that cannot wait.
 
         ``message`` is the decoded frame, if it was decoded already.
         """
@@ -247,11 +243,10 @@ class StreamedMessage:
                 self._apply(frame, message)
 
     def watchers_changed(self) -> None:
-        """Decode frames on arrival from now on if a cell has observers, otherwise on access."""
+        """Decode frames on arrival if a cell has observers, otherwise on access."""
         self._is_watched = any(cell._is_watched for cell in self._cells)
 
     def forget(self) -> None:
-        """Discard the pending frames."""
         with self._lock:
             self.pending.clear()
             self._decode_from = -math.inf

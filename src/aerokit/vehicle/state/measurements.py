@@ -146,7 +146,6 @@ def _scaled(factor: float, x: float, y: float, z: float) -> tuple[float, float, 
 
 
 def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
-    """Return the readings in HIGHRES_IMU, with the magnetic field converted from the autopilot's unit."""
     return Imu(
         acceleration_m_s2=(message.xacc, message.yacc, message.zacc),
         rate_deg_s=_scaled(RAD_DEG, message.xgyro, message.ygyro, message.zgyro),
@@ -159,7 +158,7 @@ def highres_imu(message: messages.HighresImu, context: Context) -> Imu:
 
 
 def scaled_imu(message: messages.ScaledImu) -> Imu:
-    """Return the readings in SCALED_IMU, whose units are thousandths of g, of rad/s and of gauss."""
+    # The units of SCALED_IMU are thousandths of g, of rad/s and of gauss.
     return Imu(
         acceleration_m_s2=_scaled(MG_M_S2, message.xacc, message.yacc, message.zacc),
         rate_deg_s=_scaled(RAD_DEG / 1000, message.xgyro, message.ygyro, message.zgyro),
@@ -169,7 +168,7 @@ def scaled_imu(message: messages.ScaledImu) -> Imu:
 
 
 def raw_imu(message: messages.RawImu) -> RawImu:
-    """Return the readings in RAW_IMU, of which only the temperature has a unit."""
+    # Only the temperature in RAW_IMU has a unit.
     return RawImu(
         acceleration=(message.xacc, message.yacc, message.zacc),
         rate=(message.xgyro, message.ygyro, message.zgyro),
@@ -179,7 +178,6 @@ def raw_imu(message: messages.RawImu) -> RawImu:
 
 
 def odometry(message: messages.Odometry) -> Odometry:
-    """Return the pose and velocity in ODOMETRY, with rates in degrees per second."""
     w, x, y, z = message.q
     return Odometry(
         frame=enum_member(MavFrame, message.frame_id),
@@ -195,7 +193,7 @@ def odometry(message: messages.Odometry) -> Odometry:
 
 
 def _covariance(values: tuple[float, ...]) -> tuple[float, ...] | None:
-    """Return the covariance; None if its first element is NaN, which means that the whole matrix is unknown."""
+    # NaN in the first element means that the whole matrix is unknown.
     return None if math.isnan(values[0]) else tuple(values)
 
 
@@ -209,13 +207,13 @@ def air_pressure(message: messages.ScaledPressure) -> AirPressure:
 
 
 def ground_truth(message: messages.HilStateQuaternion) -> Position | None:
-    """Return the true position in PX4's simulation (HIL_STATE_QUATERNION); None if the coordinates are invalid."""
+    """Return the true position in PX4's simulation (HIL_STATE_QUATERNION)."""
     coordinates = valid_coordinates(message.lat, message.lon)
     return None if coordinates is None else Position(*coordinates, message.alt / 1000)
 
 
 def simulation_state(message: messages.SimState) -> Position | None:
-    """Return the true position in ArduPilot's simulation (SIM_STATE); None if the position is invalid."""
+    """Return the true position in ArduPilot's simulation (SIM_STATE)."""
     latitude, longitude = message.lat_int, message.lon_int
     # Firmware that does not send the extension fields lat_int and lon_int sends only lat and lon, which are less exact.
     if not (latitude or longitude) and abs(message.lat) <= 90 and abs(message.lon) <= 180:
@@ -225,7 +223,6 @@ def simulation_state(message: messages.SimState) -> Position | None:
 
 
 def altitude(message: messages.Altitude) -> Altitude:
-    """Return the altitudes in ALTITUDE; None for those that the vehicle does not know."""
     terrain, clearance = finite(message.altitude_terrain), finite(message.bottom_clearance)
     return Altitude(
         monotonic_m=finite(message.altitude_monotonic),
@@ -243,7 +240,7 @@ def actuator_controls(message: messages.ActuatorControlTarget) -> ActuatorContro
 
 
 def aircraft(message: messages.AdsbVehicle, context: Context) -> tuple[Aircraft, ...]:
-    """Return the last 64 aircraft reported, each once, with the aircraft of this message last."""
+    """Return the last 64 aircraft reported, with the aircraft of this message last."""
 
     def if_valid(flag: AdsbFlags, value: float) -> float | None:
         return value if message.flags & flag else None

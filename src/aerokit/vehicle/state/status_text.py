@@ -45,7 +45,7 @@ class StatusTextAssembler:
         self._failsafes: deque[StatusText] = deque(maxlen=MAX_RECENT_TEXTS)
 
     def receive(self, message: Statustext, now: float, *, joins_id_0: bool = False) -> list[StatusText]:
-        """Add one message. Return the texts that it completes, and truncated texts whose next chunk is overdue.
+        """Add one message. Return the texts that are complete or truncated now.
 
         By the standard, a text with the id 0 is not chunked. With ``joins_id_0``, it is treated like other texts.
         """
@@ -59,7 +59,7 @@ class StatusTextAssembler:
         return truncated_texts + texts
 
     def expire(self, now: float) -> list[StatusText]:
-        """Remove the incomplete texts whose next chunk has not arrived for two seconds; return them as truncated."""
+        """Remove and return incomplete texts, if their next chunk is overdue."""
         overdue = [key for key, text in self._incomplete.items() if now - text.last_chunk_at > CHUNK_TIMEOUT_S]
         texts = [self._incomplete.pop(key).truncated(now) for key in overdue]
         self._store(texts)
@@ -74,11 +74,9 @@ class StatusTextAssembler:
         return tuple(self._failsafes)
 
     def clear_failsafes(self) -> None:
-        """Discard the texts about failsafes, because the failsafe has ended. They are still among the recent texts."""
         self._failsafes.clear()
 
     def clear(self) -> None:
-        """Discard all texts: incomplete, recent, and about failsafes."""
         self._incomplete.clear()
         self._recent.clear()
         self.clear_failsafes()
@@ -90,10 +88,7 @@ class StatusTextAssembler:
                 self._failsafes.append(text)
 
     def _add_chunk(self, message: Statustext, chunk: bytes, now: float) -> Iterator[StatusText]:
-        """Add a chunk to its text, and yield the text if this completes it.
-
-        If the chunk shows that the end of the previous text with this id was lost, yield that text first, truncated.
-        """
+        """Add a chunk, and yield the texts that are complete or truncated now."""
         key = (_sender(message), message.id)
         text = self._incomplete.get(key)
         if text is not None and message.chunk_seq < text.next_seq:
@@ -129,8 +124,8 @@ class _IncompleteText:
         self._parts: list[bytes] = []
 
     def add(self, seq: int, chunk: bytes, now: float) -> None:
-        """Append a chunk, after "…" if chunks before it are missing."""
         if seq > self.next_seq:
+            # Chunks before this one are missing.
             self._parts.append(ELLIPSIS.encode())
         self._parts.append(chunk)
         self.next_seq = seq + 1
@@ -150,7 +145,7 @@ def _sender(message: Statustext) -> _Sender:
 
 
 def _bytes_of(message: Statustext) -> bytes:
-    """Return the text of a chunk as bytes, because a multi-byte character may be split between two chunks."""
+    # A multi-byte character may be split between two chunks, so a chunk cannot be decoded alone.
     frame = message.received_frame
     # In the payload, the text follows one byte for the severity.
     data = message.text.encode() if frame is None else frame.payload[1 : 1 + CHUNK_LENGTH]

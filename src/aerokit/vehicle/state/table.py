@@ -28,7 +28,7 @@ watched": only while your program waits for the state or follows its changes; re
 
 
 def documentation() -> dict[str, tuple[str, str]]:
-    """Read states.py; return a mapping of each state's name to its type and its documentation."""
+    """Return the type and the documentation of each state, as they are in states.py."""
     module = ast.parse(Path(states.__file__).read_text(encoding="utf-8"))
     (states_class,) = (node for node in module.body if isinstance(node, ast.ClassDef))
     type_and_text: dict[str, tuple[str, str]] = {}

@@ -91,7 +91,7 @@ class Telemetry(States):
 
     @property
     def streams(self) -> Mapping[int, StreamedMessage]:
-        """Handlers of frames by message id. They decode a frame only when one of its values is read."""
+        """Handlers of frames by message id. They decode a frame only when it is needed."""
         return self._streams
 
     def accepts(self, frame: Frame) -> bool:
@@ -109,7 +109,7 @@ class Telemetry(States):
         self._publish_texts(self._texts.expire(now), self._source("Statustext"))
 
     def forget(self) -> None:
-        """Make all states unknown, because the vehicle has rebooted. The recent status texts are kept."""
+        """Make all states unknown after a reboot. The recent status texts are kept."""
         for stream in self._streams.values():
             stream.forget()
         for cell in self._cells.values():
@@ -124,12 +124,11 @@ class Telemetry(States):
 
     @property
     def cells(self) -> Mapping[str, StateCell[Any]]:
-        """All state cells by name."""
         return self._cells
 
     @property
     def mode_names(self) -> Mapping[int, str]:
-        """Names of modes by custom_mode, from AVAILABLE_MODES: the modes that no built-in table contains."""
+        """Mode names from AVAILABLE_MODES by custom_mode, without those in a built-in table."""
         return self._mode_names
 
     @property
@@ -139,32 +138,28 @@ class Telemetry(States):
         return {message_class: hz for message_class, hz in rates.items() if self.autopilot.sends(message_class)}
 
     def required_messages(self, name: str) -> tuple[type[Message], ...]:
-        """Return the messages to request for the cell of this name."""
         return tuple(STATES[name].requested_from(self.autopilot))
 
     @property
     def is_armed(self) -> bool:
-        """True if the last heartbeat reports armed; False while the state is unknown."""
+        """True if the last heartbeat reports armed. False while this is unknown."""
         return self.armed.latest is True
 
     @property
     def is_confirmed_disarmed(self) -> bool:
-        """True if the last heartbeat reports disarmed; False while the state is unknown."""
+        """True if the last heartbeat reports disarmed. False while this is unknown."""
         return self.armed.latest is False
 
     @property
     def is_vtol(self) -> bool:
-        """True for a VTOL vehicle, which can hover and cruise on wings (EXTENDED_SYS_STATE reports a VTOL state)."""
         return bool(self.vtol_state.latest)
 
     @property
     def mode_name(self) -> str:
-        """Name of the flight mode, ``"unknown"`` before the first heartbeat."""
         mode = self.mode.latest
         return "unknown" if mode is None else mode.name
 
     def is_in(self, mode: Mode) -> bool:
-        """Return True if the last heartbeat reported this mode."""
         latest = self.mode.latest
         return latest is not None and latest.custom_mode == mode.custom_mode
 
@@ -185,21 +180,18 @@ class Telemetry(States):
         return self._cells[name]
 
     def _time_of_arrival(self) -> float:
-        """Return the arrival time of the message that is being processed; the present time if it has no frame."""
         return self._clock() if self._arrived_at is None else self._arrived_at
 
     def _source(self, class_name: str) -> Source:
         return Source(self.system_id, self.component_id, message_type(class_name).NAME)
 
     def _receiver(self, class_name: str, handler: Handler) -> Callable[[Any], None]:
-        """Return a function that passes a message to ``handler``, unless a component other than the autopilot sent it.
-
-        A message without a frame is always passed: it was not received from a link, but given by a program or a log.
-        """
+        """Return a function that passes the autopilot's messages to ``handler``."""
         source = self._source(class_name)
 
         def on_message(message: Message) -> None:
             frame = message.received_frame
+            # A message without a frame was not received from a link, but given by a program or a log.
             if frame is None or self.accepts(frame):
                 with self._lock:
                     self._handle(handler, message, source, frame)
@@ -207,9 +199,9 @@ class Telemetry(States):
         return on_message
 
     def _handle(self, handler: Handler, message: Message, source: Source, frame: Frame | None) -> None:
-        """Update the state cells from a message. Their timestamp is the time at which its frame arrived."""
         # Calls may be nested, because a handler may read a cell, which then decodes another message.
         outer_arrived_at = self._arrived_at
+        # The cells get the time at which the frame arrived as their timestamp.
         self._arrived_at = None if frame is None else frame.received_at
         try:
             handler(message, source)
@@ -217,7 +209,6 @@ class Telemetry(States):
             self._arrived_at = outer_arrived_at
 
     def _handler(self, class_name: str) -> Handler:
-        """Return the handler for a message class: it updates the state cells of all values in the message."""
         special_handlers: Mapping[str, Handler] = {
             "AvailableModes": self._on_available_modes,
             "Statustext": self._on_status_text,
@@ -240,11 +231,7 @@ class Telemetry(States):
         return updates[0] if len(updates) == 1 else update_all
 
     def _cell_update(self, field: StateField[Any], message_source: MessageSource[Any]) -> Handler:
-        """Return the function that updates the cell of a state from one type of message.
-
-        A decoder returns None if the message does not have the value. The cell then keeps its previous value.
-        A fallback message updates the cell only if no better message has reported the value recently.
-        """
+        """Return the function that updates the cell of a state from one type of message."""
         cell, decode, context = self._cells[field.name], message_source.decode, self._context
         assert decode is not None
         # A frame that was kept undecoded may be older than a value from a message of another type.
@@ -252,7 +239,7 @@ class Telemetry(States):
 
         def update(message: Any, source: Source) -> None:
             value = decode(message)
-            if value is None:
+            if value is None:  # The message does not have the value, so the cell keeps its previous value.
                 return
             if may_be_older:
                 latest = cell.source
@@ -276,7 +263,6 @@ class Telemetry(States):
         return update_as_fallback if message_source.fallback else chosen_update
 
     def _streamed_message(self, class_name: str, handler: Handler) -> StreamedMessage:
-        """Create the object that keeps the latest frame of a message class, and decodes it when a value is read."""
         source, message_class = self._source(class_name), message_type(class_name)
         decode = decoder_of(message_class)
 
@@ -292,7 +278,7 @@ class Telemetry(States):
         return StreamedMessage(self.component_id, cells, instance_at, apply, self._lock)
 
     def _has_recent_better_value(self, cell: StateCell[Any], source: Source) -> bool:
-        """Return True if another message than the fallback ``source`` has recently reported the cell's value."""
+        """Return True if another message than the fallback ``source`` recently reported the value."""
         latest = cell.source
         is_other_message = latest is not None and latest.message != source.message
         return is_other_message and self._time_of_arrival() - cell.updated_at < FALLBACK_DELAY_S
@@ -300,7 +286,7 @@ class Telemetry(States):
     # --------------------------------------------------------- messages with special handling
 
     def _accept_heartbeat(self, heartbeat: messages.Heartbeat) -> bool:
-        """Record autopilot and base mode; return False if a ground station or companion sent the heartbeat instead."""
+        """Record autopilot and base mode. Return False if the heartbeat is not an autopilot's."""
         if not is_autopilot(heartbeat):
             return False
         if not self._knows_autopilot:
@@ -311,7 +297,6 @@ class Telemetry(States):
         return True
 
     def _learn_autopilot(self, heartbeat: messages.Heartbeat) -> None:
-        """Set the autopilot from the first HEARTBEAT, and in each cell the names of the messages that can fill it."""
         self.autopilot = autopilot_for(heartbeat)
         self._context.autopilot = self.autopilot
         self._knows_autopilot = True
@@ -319,7 +304,6 @@ class Telemetry(States):
             cell.waits_for = STATES[name].waits_for(self.autopilot)
 
     def _on_available_modes(self, message: messages.AvailableModes, source: Source) -> None:
-        """Store the name of an external mode or of a mode that aerokit does not know, unless too many are stored."""
         self.has_available_modes = True
         name = self.autopilot.learn_mode_name(message.custom_mode, message.mode_name)
         if name is not None and (message.custom_mode in self._mode_names or len(self._mode_names) < MAX_MODE_NAMES):
@@ -337,12 +321,12 @@ class Telemetry(States):
 
 
 def is_reported_on_ground(vehicle: States, *, max_age_s: float = LANDED_STATE_MAX_AGE_S) -> bool:
-    """Return True if the latest report says that the vehicle is on the ground, and is at most ``max_age_s`` old."""
+    """Return True if a report at most ``max_age_s`` old says that the vehicle is on the ground."""
     landed = vehicle.landed_state
     return landed.latest == MavLandedState.ON_GROUND and landed.age <= max_age_s
 
 
 def height_above_home(telemetry: Telemetry) -> float | None:
-    """Return the reported height above home in metres; None if it is unknown."""
+    """Return the reported height above home in metres, or None if it is unknown."""
     here = telemetry.position.latest
     return None if here is None else here.altitude_relative_m
