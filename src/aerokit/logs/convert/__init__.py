@@ -169,7 +169,7 @@ def _progress_callback(source: Path, on_progress: OnProgress | None) -> Callable
 
 
 def _move(complete: Path, target: Path) -> int:
-    """Flush the complete files to disk and move them to their final names. Return their total size."""
+    """Move complete files to their final names. Return their total size in bytes."""
     files = sorted(complete.iterdir()) if complete.is_dir() else [complete]
     for file in files:
         # Without fsync, a power failure could leave an empty file under the final name. Windows needs a writable file.

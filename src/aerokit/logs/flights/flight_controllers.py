@@ -76,7 +76,6 @@ class _RowReader(LogReader):
     _skipped = 0  # the number of damaged rows
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
-        """Return the columns of a table from its first record, with units if the log has them."""
         return [
             TableColumn(
                 name_with_unit(name, self._unit(entry.table, name)),
@@ -115,7 +114,7 @@ def _column_kind(value: object) -> str:
 
 
 def _position(latitude: float, longitude: float, amsl_m: float | None, relative_m: float | None) -> Position | None:
-    """Create a position; None for impossible values, which estimators report before they work or if they fail."""
+    # Estimators report impossible positions before they work, and when they fail.
     try:
         check_place(latitude, longitude)
         position = Position(latitude, longitude, amsl_m, relative_m)
@@ -134,7 +133,6 @@ class BinReader(_RowReader):
     _reader: Any = None
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all records except those that describe formats. Values are multiplied by the factors of the formats."""
         self._reader = opened_bin(self.path)
         try:
             yield from self._rows(self._reader, on_bytes)
@@ -142,10 +140,6 @@ class BinReader(_RowReader):
             close_bin(self._reader)
 
     def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield a record for each row, except descriptions of tables and rows with an implausible time.
-
-        Report the progress to ``on_bytes``.
-        """
         count = 0
         system_id = _bin_system_id(reader)
         while (message := self._next(reader)) is not None:
@@ -187,7 +181,7 @@ class BinReader(_RowReader):
 
 
 def _bin_system_id(reader: Any) -> int:
-    """Return the system id according to the first logged value of its parameter. Then the reader is at the start."""
+    """Return the system id among the logged parameters, and rewind the reader."""
     parameters: dict[str, float] = {}
     with suppress(Exception), redirect_stdout(sys.stderr):  # `_next` reports damage
         while (row := reader.recv_match(type=["PARM"])) is not None:
@@ -197,7 +191,6 @@ def _bin_system_id(reader: Any) -> int:
 
 
 def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
-    """Return the names and values of the states that a row changes."""
     decode = _ARDUPILOT.get(table)
     try:
         return () if decode is None else decode(fields, reader)
@@ -214,7 +207,7 @@ def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
 
 
 def _finite_or_none(value: float) -> float | None:
-    """Convert NaN, which batteries without a sensor have, to None."""
+    # Batteries without a sensor have NaN.
     return value if math.isfinite(value) else None
 
 
@@ -257,7 +250,6 @@ class UlogReader(_RowReader):
     """Reads a ``.ulg`` of PX4 with pyulog, which loads the whole log into memory."""
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield the rows of all topics and the logged texts, ordered by time, except those with an implausible time."""
         pyulog = import_module("pyulog")
         # pyulog prints to stdout, which may be for JSON.
         with self.path.open("rb") as file, redirect_stdout(sys.stderr):
@@ -324,7 +316,6 @@ class _Px4States:
         self._home_amsl_m: float | None = None
 
     def states(self, table: str, row: Mapping[str, Any]) -> States:
-        """Return the names and values of the states that a row changes."""
         try:
             return self._states(table, row)
         except KeyError:  # the field has another name in this version of PX4

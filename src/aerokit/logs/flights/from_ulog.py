@@ -132,8 +132,9 @@ class _Topic:
         return self._data["timestamp"] * NAN
 
     def valid_array(self, field: str, flag: str) -> Any:
-        """Return a column with NaN where its flag is 0. Old versions of PX4 do not have all flags."""
+        """Return a column with NaN where its flag is 0."""
         values = self.array(field)
+        # Old versions of PX4 do not have all flags.
         if flag in self:
             values[self.array(flag) == 0] = NAN
         return values
@@ -143,7 +144,6 @@ class _Topic:
         yield from zip(self.times, *(self.array(field).tolist() for field in fields), strict=True)
 
     def changes(self, field: str) -> Iterator[tuple[float, float]]:
-        """Yield the time and the value of the first row, and of each row in which the value of the field changed."""
         previous = None
         for time_s, value in self.rows(field):
             if value != previous:
@@ -162,7 +162,6 @@ class _Reader:
         self._began_us = min([int(log.start_timestamp), *first_times])
 
     def read(self) -> None:
-        """Fill the flight with the texts, the parameters and all topics of the log."""
         flight, log = self._flight, self._log
         flight.autopilot = "PX4"
         flight.vehicle = _version(log)
@@ -195,7 +194,7 @@ class _Reader:
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return the instances of one topic, the first of ``names`` that the log has, as (number, topic)."""
+        """Return number and data of each instance of the first of these topics that the log has."""
         for name in names:
             instances = [data for data in self._data if data.name == name]
             if instances:
@@ -232,7 +231,6 @@ class _Reader:
             self._flight.add_mode(time_s, name, reason, by_autopilot)
 
     def _read_failsafe_flags(self) -> None:
-        """Add evidence of failsafes for the flags that were set while the vehicle was armed."""
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
@@ -255,7 +253,6 @@ class _Reader:
                 )
 
     def _read_movement(self) -> None:
-        """Read home, track, velocity, attitude and airspeed."""
         flight = self._flight
         home = self._topic("home_position")
         if home is not None:
@@ -302,7 +299,6 @@ class _Reader:
         _extend(columns, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
 
     def _read_targets(self) -> None:
-        """Read the set-points. PX4 logs positions in metres from the local origin."""
         flight = self._flight
         self._add_angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
         setpoint = self._topic("vehicle_local_position_setpoint")
@@ -315,6 +311,7 @@ class _Reader:
             east_m_s=setpoint.array("vy"),
             down_m_s=setpoint.array("vz"),
         )
+        # PX4 logs positions in metres from the local origin.
         origin = self._origin(self._topic("vehicle_local_position"))
         if origin is None:
             return
@@ -329,7 +326,7 @@ class _Reader:
         )
 
     def _origin(self, local: _Topic | None) -> tuple[float, float, float] | None:
-        """Return the last origin of the local frame. PX4 may move the origin on the ground, before the flight."""
+        # PX4 may move the origin on the ground, before the flight, so the last one is returned.
         origin = None
         if local is not None:
             for _, latitude, longitude, altitude in local.rows("ref_lat", "ref_lon", "ref_alt"):
@@ -338,7 +335,6 @@ class _Reader:
         return origin
 
     def _read_equipment(self) -> None:
-        """Read batteries, GPS receivers, the estimator, vibration and links."""
         flight = self._flight
         for number, battery in self._topics("battery_status"):
             remaining = battery.array("remaining") * 100
@@ -383,7 +379,6 @@ class _Reader:
         self._read_links()
 
     def _read_links(self) -> None:
-        """Read the loss of messages and the values of the telemetry radio."""
         # PX4 may have several links. The data of the link that received the most messages is used.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
@@ -403,17 +398,15 @@ class _Reader:
 
 
 def _drop_damaged_rows(topics: list[Any]) -> int:
-    """Drop the rows whose time is impossible, and the topics that are then empty. Return the number of these rows.
-
-    Rows have no checksum. The time of a row is impossible if it is far from those of both neighbours, or later than the
-    whole log.
-    """
+    """Drop rows with an impossible time, and topics that are then empty. Return the number of these rows."""
     numpy = import_module("numpy")
     all_times = [topic.data["timestamp"].astype("int64") for topic in topics]
     last_us = max((int(times[-2]) for times in all_times if len(times) > 1), default=_MAX_TIME_US)
     damaged = 0
     for topic, times in zip(topics, all_times, strict=True):
         before, after = numpy.append(times[:1], times[:-1]), numpy.append(times[1:], times[-1:])
+        # Rows have no checksum. A time is impossible if it is far from those of both neighbours, or later than the
+        # whole log.
         is_spike = (times > after + _MAX_DISORDER_US) | (times < before - _MAX_DISORDER_US)
         is_damaged = is_spike & (before <= after + _MAX_DISORDER_US) | (times > last_us + _MAX_LATE_US)
         if is_damaged.any():
@@ -435,7 +428,7 @@ def _version(log: Any) -> str:
 
 
 def utc_at_boot(log: Any) -> float:
-    """Return the Unix time at which PX4 booted and its clock was 0; 0 if the log has no GNSS time."""
+    """Return the Unix time at which PX4 booted; 0 if the log has no GNSS time."""
     for data in log.data_list:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():
