@@ -78,9 +78,9 @@ class Readiness:
         return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
-        """Wait until any attribute gets a value or fails, for 0.2 s or ``max_wait_s``, whichever is shorter.
+        """Wait a short time until any attribute gets a value or fails.
 
-        Returns at once if all attributes in ``names`` have values, or if one without a value has failed.
+        Returns at once if all attributes in ``names`` have values, or if a missing one has failed.
         """
         with self._lock:
             missing, changed = names - self.names, self._changed
@@ -124,7 +124,6 @@ class LatestMessage(Generic[MessageT]):
         return tuple([None if message is None else getattr(message, field) for field in fields])
 
     def add(self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None) -> None:
-        """Add a handler; see :meth:`Core.on`."""
         self._handlers.append(handler)
         self._announced_names.update(names)
         if listeners is not None:
@@ -180,7 +179,6 @@ class Core:
 
     @property
     def target_system(self) -> int:
-        """System id of the vehicle, 0 until it is found."""
         return self.handler.target_system
 
     @property

@@ -163,7 +163,6 @@ class ParameterValues:
         return len(self._parameters)
 
     def copy(self) -> dict[str, float]:
-        """Return the values by name, in the vehicle's spelling and units."""
         return {name: float(parameter.value) for name, parameter in self._parameters.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:

@@ -250,7 +250,6 @@ def _module_error(module: str) -> str | None:
 
 
 def _missing_main_error(path: str) -> str | None:
-    """Return Python's error text for a folder without a ``__main__.py``, otherwise None."""
     return f"can't find '__main__' module in {path!r}" if _lacks_main(path) else None
 
 

@@ -60,7 +60,6 @@ class FieldDefinition:
 
     @property
     def length(self) -> int:
-        """Number of bytes in the payload."""
         return SIZES[self.type] * (self.array_length or 1)
 
     @property

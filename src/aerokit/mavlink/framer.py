@@ -300,7 +300,7 @@ class PythonFramer:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
-        """Return (verdict, end, frame if valid) for the magic byte at ``begin``."""
+        """Return the verdict, the end, and the frame if it is valid, for the magic byte at ``begin``."""
         size = len(data)
         if data[begin] == MAGIC_V2:
             if size - begin < 3:  # The flags have not arrived yet.

@@ -74,7 +74,7 @@ def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[Dialec
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that `STANDARD_FILES` lists first, and the remarks of ``added``, if any."""
+    """Return ``existing`` with the origin that `STANDARD_FILES` lists first."""
     origin = min(
         existing.origin,
         added.origin,
@@ -267,7 +267,6 @@ def xml_folder() -> Path:
 
 
 def fingerprint(folder: Path | None = None) -> str:
-    """Return a hash of the XML files."""
     folder = folder or xml_folder()
     digest = hashlib.sha256()
     for stem in _stems():

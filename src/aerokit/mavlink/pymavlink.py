@@ -222,7 +222,7 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
 @cache
 def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
-    """Return the decoder of the first pymavlink dialect that has the message and does not contradict the standard."""
+    """Return the decoder of the first pymavlink dialect that has the message."""
     row = STANDARD.rows.get(message_id)
     for module in _dialects(preferred):
         message_class = module.mavlink_map.get(message_id)
@@ -231,6 +231,7 @@ def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
         if row is None:
             return _with_checksum_check(message_class, _decoder_for(message_class))
         crc_extra, *_ = row
+        # A dialect with another CRC_EXTRA contradicts the standard.
         if message_class.crc_extra == crc_extra:
             return _decoder_for(message_class)
     return _unknown
@@ -310,10 +311,10 @@ class _Received:
         return value
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle and copy the message as an object of pymavlink's class."""
         names = (*LAZY_ATTRIBUTES, "_type", "_fieldnames", "_instance_field", "_instance_offset")
         state = {name: getattr(self, name) for name in (*names, "_signed", "_link_id", "_instances")}
         state.update((name, value) for name, value in self.__dict__.items() if name != "_frame")
+        # Messages are pickled and copied as objects of pymavlink's own class.
         return _restored, (self._decoded_class, state)
 
     def create_header(self) -> Any:
@@ -339,7 +340,6 @@ def _length_after_payload(frame: Frame) -> int:
 
 
 def _received_class(message_class: Any) -> Any:
-    """Create a subclass of a pymavlink class for received messages."""
     return type(
         message_class.__name__,
         (_Received, message_class),

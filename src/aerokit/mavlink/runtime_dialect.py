@@ -41,7 +41,6 @@ class Standard(Protocol):
 
 
 def read_xml_dialect(path: str | Path, standard: Standard) -> LoadedDialect:
-    """Load an XML file with its includes; see `Dialect.from_xml`."""
     path = Path(path)
     dialects = read_dialect(path, [xml_folder()])
     definitions = [message for dialect in dialects for message in dialect.messages]
@@ -49,7 +48,6 @@ def read_xml_dialect(path: str | Path, standard: Standard) -> LoadedDialect:
 
 
 def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> LoadedDialect:
-    """Load a pymavlink dialect; see `Dialect.from_pymavlink`."""
     if isinstance(module, str):
         module = _import(module)
     classes: dict[int, Any] | None = getattr(module, "mavlink_map", None)

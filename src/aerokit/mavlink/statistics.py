@@ -184,7 +184,8 @@ class SourceStatistics(SourceFields):
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
-        """Make this sequence number the newest, without counting the numbers before it as lost."""
+        """Make this sequence number the newest."""
+        # The numbers before it do not count as lost.
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
         self._missing_base = self.expected
@@ -257,11 +258,9 @@ class SourceLimit:
         self._swept_at = -math.inf
 
     def join(self, statistics: FramerStatistics) -> None:
-        """Include the senders of these statistics in the limit."""
         self._statistics.add(statistics)
 
     def leave(self, statistics: FramerStatistics) -> None:
-        """Exclude the senders of these statistics from the limit, which frees their places."""
         self._statistics.discard(statistics)
         self.free += len(statistics.sources)
 

@@ -144,7 +144,7 @@ def _writer_for(target: Path, table_format: str) -> Callable[[Path, LogReader], 
 
 
 def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
-    """Write all records of a log. Return their number, the first and the latest time, and the writer's ``written``."""
+    """Write all records. Return their number, the first and the latest time, and ``writer.written``."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):

@@ -302,7 +302,6 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """Yield the logged status texts as rows of a table, like `_rows`."""
     for text in log.logged_messages:
         # `log_level` is the ASCII code of a digit: 54 ("6") is info. MAV_SEVERITY has the numbers of the Linux kernel.
         severity = max(0, min(7, int(text.log_level) - ord("0")))

@@ -217,7 +217,6 @@ class _Reader:
         self._flight, self._tables = flight, tables
 
     def read(self, on_share: Callable[[float], object]) -> None:
-        """Read all tables. ``on_share`` is called with the share of the work that is done, from 0 to 1."""
         flight, tables = self._flight, self._tables
         flight.autopilot = "ArduPilot"
         flight.begins_at = tables.unix_at_0 + tables.began_us / 1e6

@@ -167,7 +167,6 @@ class TlogReader(LogReader):
         return vehicle.update(unix_s, message) if vehicle.component_id == component_id else ()
 
     def _check_and_note(self, records: int) -> None:
-        """Raise FileFormatError if nothing could be read, and add notes about skipped messages."""
         if not records:
             raise FileFormatError(f"{self.path} contains no MAVLink messages: it is not a .tlog, or it is empty")
         statistics = self._framer.statistics

@@ -156,7 +156,6 @@ def time_range(begin_s: float, end_s: float) -> list[float]:
 
 
 def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
-    """Return Plotly's shapes for the background of all timelines."""
     spans: dict[str, list[str]] = {}
     for change, end in flight.mode_spans():
         band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
@@ -181,7 +180,6 @@ def _path_shape(paths: Sequence[str], **style: Any) -> dict[str, Any]:
 
 
 def track_parts(flight: FlightLog) -> list[Part]:
-    """Return the parts of the report that show the track from above."""
     places = metres_from_home(flight)
     if not places or flight.home is None:
         return []

@@ -141,7 +141,6 @@ def _overlay_section(
     get_series: Callable[[FlightLog], TimeSeries | None],
     column: str,
 ) -> Section:
-    """Return a section that shows a column of both flights over the time since arming."""
     traces, names_without_data = [], []
     for number, flight in enumerate(flights):
         columns = get_series(flight)
