@@ -13,7 +13,7 @@ from aerokit._internal.geo import check_place
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import ardupilot_system_id, clean_text, skipped_rows_note
-from aerokit.logs.flights.from_ulog import utc_at_boot
+from aerokit.logs.flights.from_ulog import load_ulog, severity_of, utc_at_boot
 from aerokit.logs.flights.records import LogReader, LogRecord, TableColumn, name_with_unit
 from aerokit.position import Position
 from aerokit.vehicle.state.condition import StatusText
@@ -250,13 +250,8 @@ class UlogReader(_RowReader):
     """Reads a ``.ulg`` of PX4 with pyulog, which loads the whole log into memory."""
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        pyulog = import_module("pyulog")
-        # pyulog prints to stdout, which may be for JSON.
-        with self.path.open("rb") as file, redirect_stdout(sys.stderr):
-            try:
-                log = pyulog.ULog(file)
-            except Exception as error:  # pyulog raises arbitrary errors for other files
-                raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
+        with self.path.open("rb") as file:
+            log = load_ulog(file, self.path)
         if log.file_corruption:
             self.notes.append("the log is damaged: the readable part was converted")
         if not log.data_list:
@@ -303,9 +298,7 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
     for text in log.logged_messages:
-        # `log_level` is the ASCII code of a digit: 54 ("6") is info. MAV_SEVERITY has the numbers of the Linux kernel.
-        severity = max(0, min(7, int(text.log_level) - ord("0")))
-        yield text.timestamp, "logged_messages", {"severity": severity, "message": text.message}
+        yield text.timestamp, "logged_messages", {"severity": severity_of(text), "message": text.message}
 
 
 class _Px4States:

@@ -8,7 +8,7 @@ import sys
 from array import array
 from contextlib import redirect_stdout
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from aerokit.autopilots.px4 import Px4
 from aerokit.errors import FileFormatError
@@ -84,13 +84,8 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
         FileFormatError: the file is not a PX4 log.
         ModuleNotFoundError: pyulog is not installed.
     """
-    pyulog = import_module("pyulog")
-    # pyulog prints messages about damaged files to stdout, where the JSON of a command may go.
-    with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file, redirect_stdout(sys.stderr):
-        try:
-            log = pyulog.ULog(file, list(_TOPICS))
-        except Exception as error:  # pyulog raises arbitrary errors for other files
-            raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
+    with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file:
+        log = load_ulog(file, flight.path, list(_TOPICS))
     if not log.data_list and not log.logged_messages:
         raise FileFormatError(f"{flight.path} contains no data of a flight")
     if log.file_corruption:
@@ -99,6 +94,22 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
         lost_s = sum(dropout.duration for dropout in log.dropouts) / 1e3
         flight.notes.append(f"{len(log.dropouts)} logging dropouts, {lost_s:.1f} s in total")
     _Reader(flight, log).read()
+
+
+def load_ulog(file: BinaryIO, path: Path, topics: list[str] | None = None) -> Any:
+    """Load these topics of a log with pyulog, or all topics."""
+    pyulog = import_module("pyulog")
+    try:
+        with redirect_stdout(sys.stderr):  # pyulog prints about damage, but stdout may be for JSON
+            return pyulog.ULog(file, topics)
+    except Exception as error:  # pyulog raises arbitrary errors for other files
+        raise FileFormatError(f"{path} is not a PX4 log: {error}") from error
+
+
+def severity_of(text: Any) -> int:
+    # `log_level` is the character code of a digit: 54, the code of "6", is info. The Linux kernel's levels and
+    # MAV_SEVERITY have the same numbers.
+    return max(0, min(7, int(text.log_level) - ord("0")))
 
 
 class _ProgressFile(io.FileIO):
@@ -176,10 +187,8 @@ class _Reader:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         for text in log.logged_messages:
-            # `log_level` is the character code of a digit: 54, the code of "6", is info. The Linux kernel's levels and
-            # MAV_SEVERITY have the same numbers.
-            severity = max(0, min(7, int(text.log_level) - ord("0")))
-            flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
+            time_s, logged = self._time(text.timestamp), clean_text(str(text.message))
+            flight.texts.append(LoggedText(time_s, severity_of(text), logged))
         initial = [(log.start_timestamp, name, value) for name, value in log.initial_parameters.items()]
         for time_us, name, value in (*initial, *log.changed_parameters):
             if isinstance(value, (int, float)):
