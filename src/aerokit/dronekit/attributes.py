@@ -99,7 +99,6 @@ class Locations(HasObservers, LocationPrivates):
         self._core.listeners.announce("location")
 
     def _announce(self, frame: str) -> None:
-        """Notify this object's listeners of e.g. ``local_frame``, then the vehicle's of ``location.local_frame``."""
         self._dk_listeners.announce(frame)
         self._core.listeners.announce(f"location.{frame}")
 
@@ -300,6 +299,6 @@ class VehicleAttributes(VehicleCore):
         self._dk_reported_home = home
 
     def _dk_forget_home(self) -> None:
-        """Forget home, because the vehicle has rebooted, perhaps at another place, and altitudes depend on it."""
+        # The vehicle has rebooted, perhaps at another place, and altitudes depend on home.
         self._home_location = None
         self._dk_reported_home = None

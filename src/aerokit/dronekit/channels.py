@@ -60,8 +60,6 @@ class _ChannelDict(dict[Any, Any], Python2Mapping[Any]):
 
 
 def _unsupported(name: str) -> Any:
-    """Return a method that raises TypeError; ``name`` appears in the text."""
-
     def refuse(*_: object, **__: object) -> NoReturn:
         raise TypeError(f"{name} is not supported on Channels object")
 
@@ -129,7 +127,7 @@ class Channels(_ChannelDict):
         self._store(first_index, FIRST_VALUES(message))
 
     def _store(self, first_index: int, received: tuple[int, ...]) -> None:
-        """Store values of consecutive channels, the first of which has the number ``first_index + 1``."""
+        """Store consecutive values. The first is that of channel ``first_index + 1``."""
         with self._changing:
             numbers = NUMBERS[first_index : self._count]
             values = (None if value == UNUSED else value for value in received)
@@ -221,7 +219,7 @@ class ChannelsOverride(_ChannelDict):
             self._apply({**self.copy(), **self._checked(overrides)})
 
     def _apply(self, overrides: dict[str, int]) -> None:
-        """Replace all overrides by these; a value of 0 releases its channel."""
+        """Replace all overrides. A value of 0 releases its channel."""
         active = {channel: value for channel, value in overrides.items() if value}
         # Earlier releases are repeated, in case their message was lost.
         released = (self._released | self.keys()) - active.keys()
@@ -232,7 +230,7 @@ class ChannelsOverride(_ChannelDict):
         self._released = released
 
     def _checked(self, overrides: Mapping[Any, float | None]) -> dict[str, int]:
-        """Check overrides; return microseconds by channel number as a string (0: release the channel)."""
+        """Return microseconds by channel number. A value of 0 releases the channel."""
         checked: dict[str, int] = {}
         for channel, value in overrides.items():
             number = int(channel)
@@ -242,10 +240,6 @@ class ChannelsOverride(_ChannelDict):
         return checked
 
     def _send(self, active: dict[str, int], released: set[str]) -> None:
-        """Send RC_CHANNELS_OVERRIDE with the overridden channels, and with the channels to release.
-
-        Channels 1 to 8 that are not overridden are always released, higher ones only if they are in ``released``.
-        """
         aio = self._core.check_link()
         if aio.connection.mavlink_version == 1 and any(int(channel) > MAVLINK_1_CHANNELS for channel in active):
             raise APIException("channels above 8 need MAVLink 2, and this vehicle uses MAVLink 1")
@@ -258,10 +252,7 @@ class ChannelsOverride(_ChannelDict):
 
 
 def _checked_value(number: int, value: Any) -> int:
-    """Check a channel's value and return it in microseconds (0: release the channel).
-
-    Raises InvalidArgument, whose text names the channel.
-    """
+    """Return a channel's value in microseconds. A value of 0 releases the channel."""
     if value is None:
         return 0
     with contextlib.suppress(TypeError, ValueError, OverflowError):

@@ -75,10 +75,10 @@ class ClassicConnection:
         )
 
     def send(self, message: Message, *, to: int | None = None) -> None:
-        """Send a message without blocking, from any thread. Messages are sent in the order of the calls.
+        """Send a message without blocking, from any thread.
 
-        With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``.
-        Raises InvalidArgument if a field is out of range, and APIException if the connection is closed.
+        Messages are sent in the order of the calls. ``to`` is that of :meth:`Connection.send`. Raises InvalidArgument
+        if a field is out of range, and APIException if the connection is closed.
         """
         message.encode()  # Raises for an invalid field here. On the loop, the error would only be logged.
         with classic_errors():
@@ -119,7 +119,7 @@ class ClassicConnection:
         self._close_callbacks.append(function)
 
     def wait_closed(self, timeout: float) -> bool:
-        """Wait at most ``timeout`` seconds until :meth:`close` is called; return True if it was."""
+        """Wait for :meth:`close`, at most ``timeout`` seconds. Return True if it was called."""
         return self._closed.wait(timeout)
 
     @property
@@ -127,14 +127,13 @@ class ClassicConnection:
         return self._closed.is_done
 
     def is_of_another_vehicle(self, system_id: int) -> bool:
-        """Return True if the system with this id has an autopilot but is not the connected vehicle."""
         return system_id != self.target_system and any(
             sender_system == system_id and is_autopilot(heartbeat)
             for (sender_system, _), heartbeat in self.connection.heartbeats.items()
         )
 
     def match_mavlink_version(self, heartbeat: Message) -> None:
-        """Send in MAVLink 2 if the vehicle is known to support it, otherwise in the version of its HEARTBEAT."""
+        """Send in MAVLink 2 if the vehicle supports it, otherwise in the version of its HEARTBEAT."""
         frame = heartbeat.received_frame
         if frame is not None:
             version = 2 if self.supports_mavlink_2 else frame.version
@@ -148,7 +147,7 @@ def _on_dropped(
     listener_thread: ListenerThread,
     close_callbacks: list[Callable[[], object]],
 ) -> None:
-    """Clean up after the program dropped a connection without closing it. Runs on the loop, which ends afterwards."""
+    """Clean up on the loop after the program dropped the connection without closing it."""
     vehicle_logger.warning("the connection to %s was closed: the program dropped it without close()", address)
     atexit.unregister(exit_callback)
     listener_thread.stop()
@@ -199,14 +198,14 @@ class BackgroundCalls:
         return call
 
     def cancel(self, call: BackgroundCall) -> None:
-        """Cancel a call without blocking, from any thread. The call then sends nothing more."""
+        """Cancel a call without blocking, from any thread."""
         with contextlib.suppress(ConnectionClosed):
             self._loop.call_soon(self._cancel, call)
 
     def post(self, function: Callable[..., object], *args: Any) -> None:
-        """Call a function on the loop: at once on the loop's thread, otherwise as soon as all earlier calls have begun.
+        """Call a function on the loop, as soon as all earlier calls have begun.
 
-        The function must neither block nor raise.
+        On the loop's thread, it is called at once. The function must neither block nor raise.
         """
         if self._loop.is_current:
             function(*args)
@@ -220,7 +219,6 @@ class BackgroundCalls:
             concurrent.futures.wait(pending, timeout)
 
     def _begin(self, call: BackgroundCall, function: CoroutineFunction) -> None:
-        """Start the task of a call, which replaces the running call of its kind. Runs on the loop."""
         kind = SHARED_KINDS.get(call.kind, call.kind)  # Disarming and arming replace each other.
         if kind in self._newest:
             self._cancel(self._newest[kind])  # The new call replaces it.
@@ -235,7 +233,6 @@ class BackgroundCalls:
             call.task.cancel()
 
     def _end(self, kind: str, call: BackgroundCall) -> None:
-        """Forget a call whose task has ended. If the task was cancelled, the call fails with ConnectionClosed."""
         if self._newest.get(kind) is call:
             del self._newest[kind]
         if not call.done():  # The task was cancelled before it had a result.
@@ -243,7 +240,6 @@ class BackgroundCalls:
             call.set_exception(ConnectionClosed(f"{call.kind}: {reason}"))
 
     async def _run(self, call: BackgroundCall, function: CoroutineFunction) -> None:
-        """Await the function, log its failure, and set the result of the call."""
         try:
             await function()
         except Exception as error:
@@ -299,7 +295,7 @@ class OverrideRelease:
         self._overridden: dict[tuple[int, int], set[int]] = {}  # (system id, component id) → channels
 
     def note_sent(self, message: Message) -> None:
-        """Record which channels a sent RC_CHANNELS_OVERRIDE overrides or releases; ignore other messages."""
+        """Record which channels a sent RC_CHANNELS_OVERRIDE overrides or releases."""
         if not isinstance(message, RcChannelsOverride):
             return
         target = message.target_system, message.target_component
@@ -313,7 +309,6 @@ class OverrideRelease:
                 overridden.add(channel)
 
     def send(self, connection: Connection) -> None:
-        """Release all overridden channels, unless ``is_enabled`` is False (loop thread). A closed link is ignored."""
         for (system, component), channels in self._overridden.items():
             if self.is_enabled and channels:
                 values = [_release_value(channel, channel in channels) for channel in range(1, CHANNELS + 1)]

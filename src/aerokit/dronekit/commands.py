@@ -269,7 +269,7 @@ class CommandSequence:
         return (*unknown_home, *state.items)
 
     def _append(self, cmd: Command) -> int:
-        """Append a command, or store it if it is home; return its ``seq`` (0: home)."""
+        """Append a command, or store it as home. Return its ``seq``, which is 0 for home."""
         with self._lock:
             state = self._state
             if not state.items and _is_home_row(cmd, self._vehicle._home_location):
@@ -281,7 +281,6 @@ class CommandSequence:
             return cmd.seq
 
     async def _run_download(self, number: int) -> None:
-        """Read the vehicle's mission and store it. Runs on the loop thread."""
         try:
             mission = await self._core.aio.mission.download()
         except AerokitError as error:
@@ -290,7 +289,6 @@ class CommandSequence:
         self._store_download(number, mission)
 
     def _store_download(self, number: int, mission: Mission) -> None:
-        """Store a downloaded mission. Runs on the loop thread."""
         home, connection = mission.home, self._core.aio.connection
         own_ids = connection.source_system, connection.source_component
         home_command, *items = _commands_of(mission, own_ids)
@@ -304,7 +302,6 @@ class CommandSequence:
         self._core.listeners.notify("commands", self)
 
     def _on_download_failed(self, number: int, error: AerokitError) -> None:
-        """Record why the latest download has failed, for programs that wait for it or change the sequence."""
         error_class = TimeoutError if isinstance(error, OperationTimeout) else APIException
         failure = error_class(f"the mission could not be downloaded: {error}")
         failure.__cause__ = error
@@ -313,7 +310,7 @@ class CommandSequence:
                 self._core.ready.fail("commands", failure)
 
     def _require_downloaded(self) -> None:
-        """Wait for a running download; raise APIException if the last download has failed."""
+        """Wait for a running download. Raise APIException if the last download has failed."""
         self._wait_for_download()
         if (failure := self._core.ready.failure_of({"commands"})) is not None:
             raise type(failure)(f"{failure}; call download() again, or clear()") from failure.__cause__
@@ -339,7 +336,6 @@ class WaypointLoader:
 
 
 def _checked_index(index: Any, count: int) -> int:
-    """Return the position for an index, which may be negative. IndexError if it is out of range."""
     try:
         position = operator.index(index)
     except TypeError:
@@ -350,7 +346,7 @@ def _checked_index(index: Any, count: int) -> int:
 
 
 def _command_from(cmd: Any) -> Command:
-    """Copy a command, or convert a MISSION_ITEM or MISSION_ITEM_INT of pymavlink; TypeError for anything else."""
+    """Copy a command, or convert pymavlink's MISSION_ITEM or MISSION_ITEM_INT."""
     if isinstance(cmd, Command):
         return copy.copy(cmd)
     try:
@@ -363,7 +359,7 @@ def _command_from(cmd: Any) -> Command:
 
 
 def _content_of(commands: Iterable[Command]) -> tuple[tuple[Any, ...], ...]:
-    """Return the values of commands as tuples for comparison, in which NaN equals NaN."""
+    """Return the values of commands for comparison, in which NaN equals NaN."""
     return tuple(tuple(_comparable(getattr(command, name)) for name in CONTENT_FIELDS) for command in commands)
 
 
@@ -373,11 +369,7 @@ def _comparable(value: Any) -> Any:
 
 
 def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
-    """Return True if a command is the home row of a waypoint file rather than a waypoint.
-
-    The home row is a waypoint without parameters whose frame has altitudes above sea level. It also has one of three
-    marks: its ``current`` is 1, its position is all zeros, or its position is that of home.
-    """
+    """Return True if a command is the home row of a waypoint file."""
     if cmd.command != MavCmd.NAV_WAYPOINT or cmd.frame not in AMSL_FRAMES:
         return False
     if any((cmd.param1, cmd.param2, cmd.param3, cmd.param4)):
@@ -386,7 +378,6 @@ def _is_home_row(cmd: Command, home: LocationGlobal | None) -> bool:
 
 
 def _is_at_home(cmd: Command, home: LocationGlobal | None) -> bool:
-    """Return True if a command is at home. False if home is unknown, or if a field is not a number."""
     if home is None or home.lat is None or home.lon is None or home.alt is None:
         return False
     try:
@@ -397,7 +388,6 @@ def _is_at_home(cmd: Command, home: LocationGlobal | None) -> bool:
 
 
 def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
-    """Convert commands to a mission for this vehicle; InvalidArgument names a field that is not a number."""
     items: Iterable[MissionItem] = [_item_of(command, index) for index, command in enumerate(commands)]
     if not vehicle.autopilot.home_is_item_0:
         # For ArduPilot, coordinates 0, 0 mean the current position. Other autopilots need the actual coordinates.
@@ -407,13 +397,12 @@ def _mission_of(commands: Sequence[Command], vehicle: AsyncVehicle) -> Mission:
 
 
 def _commands_of(mission: Mission, own_ids: tuple[int, int]) -> tuple[Command, ...]:
-    """Convert a mission to commands for the system and component ``own_ids``. The first is home (zeros if unknown)."""
+    """Convert a mission to commands. The first is home, with zeros if home is unknown."""
     items = mission.to_items(home_is_item_0=True)
     return tuple(_command_of(item, seq, own_ids) for seq, item in enumerate(items))
 
 
 def _item_of(cmd: Command, index: int) -> MissionItem:
-    """Convert a command, which is ``commands[index]``. InvalidArgument if a field is not a number."""
     try:
         command, frame = int(cmd.command), int(cmd.frame)
         param1, param2, param3, param4 = (float(getattr(cmd, name)) for name in PARAM_FIELDS)
@@ -425,8 +414,9 @@ def _item_of(cmd: Command, index: int) -> MissionItem:
 
 
 def _wire_number(value: Any, command: int, frame: int) -> int | float:
-    """Convert x or y for MISSION_ITEM_INT. Like ArduPilot, drop the fraction of parameters 5 and 6."""
+    """Convert x or y for MISSION_ITEM_INT."""
     number = from_degrees(float(value), command, frame)
+    # Like ArduPilot, drop the fraction of parameters 5 and 6.
     # Infinity and numbers that are much too large stay floats, which the check of the plan refuses.
     return int(number) if isinstance(number, float) and abs(number) < 1e9 else number
 

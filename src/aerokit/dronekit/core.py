@@ -49,7 +49,6 @@ class Readiness:
         self._changed: ThreadFuture[None] = ThreadFuture()  # finished and replaced at the next value or failure
 
     def mark(self, name: str) -> None:
-        """Record that the attribute has a value."""
         if name in self.names and name not in self._failures:
             return
         with self._lock:
@@ -58,13 +57,12 @@ class Readiness:
             self._notify()
 
     def unmark(self, name: str) -> None:
-        """Record that the attribute is being read again, so that programs wait for the new value."""
         with self._lock:
             self._failures.pop(name, None)
             self.names.discard(name)
 
     def fail(self, name: str, error: APIException) -> None:
-        """Record that reading the attribute has failed. Programs that wait for the attribute raise this error."""
+        """Let programs that wait for the attribute raise this error."""
         with self._lock:
             self._failures[name] = error
             self._notify()
@@ -74,16 +72,15 @@ class Readiness:
         changed.finish()
 
     def failure_of(self, names: set[str]) -> APIException | None:
-        """Return the error with which reading one of these attributes has failed, or None."""
         for name in names:
             if name in self._failures:
                 return self._failures[name]
         return None
 
     def wait_for_change(self, names: set[str], max_wait_s: float) -> None:
-        """Wait until any attribute gets a value or fails, for 0.2 s or ``max_wait_s``, whichever is shorter.
+        """Wait a short time until any attribute gets a value or fails.
 
-        Returns at once if all attributes in ``names`` have values, or if one without a value has failed.
+        Returns at once if all attributes in ``names`` have values, or if a missing one has failed.
         """
         with self._lock:
             missing, changed = names - self.names, self._changed
@@ -123,19 +120,17 @@ class LatestMessage(Generic[MessageT]):
         return decoded
 
     def values(self, *fields: str) -> tuple[Any, ...]:
-        """Return the values of these fields of the latest message; None for each before the first message."""
         message = self.message
         return tuple([None if message is None else getattr(message, field) for field in fields])
 
     def add(self, handler: Callable[[MessageT], object], names: tuple[str, ...], listeners: Listeners | None) -> None:
-        """Add a handler; see :meth:`Core.on`."""
         self._handlers.append(handler)
         self._announced_names.update(names)
         if listeners is not None:
             self._listeners.append(listeners)
 
     def on_frame(self, frame: Frame, message: MessageT | None = None) -> None:
-        """Receive a frame of the vehicle's system, and its message if it is already decoded (loop thread)."""
+        """Receive a frame on the loop thread, and its message if it is already decoded."""
         if frame.component_id != self.component_id:
             return
         if self._must_decode():
@@ -144,14 +139,14 @@ class LatestMessage(Generic[MessageT]):
             self._latest = frame
 
     def receive(self, message: MessageT) -> None:
-        """Store a message and call the handlers."""
         self._latest = message
         for handler in self._handlers:
             handler(message)
 
     def _must_decode(self) -> bool:
-        """Return True if a handler needs each message, or an announced attribute has listeners or no value yet."""
+        """Return True if a handler needs the message now."""
         names = self._announced_names
+        # A handler without names needs each message. Attributes without a value need the first one.
         if not names or not names <= self._ready_names:
             return True
         for listeners in self._listeners:
@@ -184,7 +179,6 @@ class Core:
 
     @property
     def target_system(self) -> int:
-        """System id of the vehicle, 0 until it is found."""
         return self.handler.target_system
 
     @property
@@ -195,7 +189,7 @@ class Core:
         return self.aio_or_none
 
     def check_link(self) -> AsyncVehicle:
-        """Return the asynchronous vehicle; raise APIException unless commands can be sent to it."""
+        """Return the asynchronous vehicle. Raise APIException if commands cannot be sent to it."""
         aio = self.aio
         if self.handler.is_closed:
             raise APIException("the vehicle was closed")
@@ -207,9 +201,10 @@ class Core:
         return aio
 
     def check_may_wait(self) -> None:
-        """Raise APIException if the link is down, or on the loop's thread, where a wait would be a deadlock."""
+        """Raise APIException if the link is down, or on the loop's thread."""
         self.check_link()
         with classic_errors():
+            # On the loop's thread, a wait would be a deadlock.
             self.handler.loop.check_may_wait()
 
     # ----------------------------------------------------------------------------- receiving
@@ -245,22 +240,17 @@ class Core:
         return self.on(message_type, announce, *names)
 
     def start_receiving(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving once the vehicle is connected (loop thread).
-
-        The loop gets weak references only, so that a vehicle that the program drops can be garbage collected.
-        """
+        """Start receiving on the loop thread, once the vehicle is connected."""
         self.aio_or_none, self._tasks = aio, tasks
         self.handler.target_system = aio.system_id
         _ = aio.parameters  # This creates the object, so that it gets each PARAM_VALUE before our handlers.
+        # The loop gets weak references only, so that a vehicle that the program drops can be garbage collected.
         for message_type, latest in self._latest.items():
             latest.component_id = aio.component_id
             aio.connection.bus.attach_lazily(message_type, weak_callback(latest.on_frame), system_id=aio.system_id)
 
     def watch_link(self) -> None:
-        """Log when silence begins and ends, and report the heartbeat's age up to 20 times a second.
-
-        The age is reported to the listeners of ``last_heartbeat``.
-        """
+        """Log when silence begins and ends, and report the heartbeat's age to the listeners of ``last_heartbeat``."""
         aio = self.aio
         if not aio.connection.is_open:
             return
@@ -293,7 +283,7 @@ class Core:
             return self.handler.loop.run(function, *args, **kwargs)
 
     def order(self, kind: str, function: CoroutineFunction, *args: Any, **kwargs: Any) -> BackgroundCall:
-        """Start an order without waiting; a newer order of the same kind replaces it."""
+        """Start an order without waiting. It replaces an older order of the same kind."""
         self.check_link()
         with classic_errors():
             return self.handler.calls.start(kind, function, *args, **kwargs)
@@ -309,12 +299,13 @@ class Core:
 
 
 def _recording_activity(original: property) -> property:
-    """Wrap a property, so that reading it also shows that the program is running and our heartbeat must continue."""
+    """Wrap a property, so that reading it lets our heartbeat continue."""
     getter = original.fget
     assert getter is not None
 
     @functools.wraps(getter)
     def recording_getter(vehicle: VehicleCore) -> Any:
+        # Reading an attribute shows that the program is running.
         vehicle._dk.handler.loop.feed()
         return getter(vehicle)
 
@@ -399,5 +390,5 @@ class VehicleCore(HasObservers):
 
 
 def core_of(vehicle: VehicleCore) -> Core:
-    """Return the core of a vehicle. Used by classes whose constructors, as in DroneKit, take the vehicle."""
+    # Classes whose constructors take the vehicle, as in DroneKit, get the core from here.
     return vehicle._dk

@@ -19,10 +19,10 @@ class TimeoutError(APIException, builtins.TimeoutError):  # noqa: A001 - the nam
 
 @contextmanager
 def classic_errors() -> Iterator[None]:
-    """Convert errors of aerokit to those of DroneKit, but not errors about arguments and files (ValueErrors)."""
+    """Convert errors of aerokit to those of DroneKit."""
     try:
         yield
-    except (InvalidArgument, FileFormatError):
+    except (InvalidArgument, FileFormatError):  # Errors about arguments and files stay ValueErrors.
         raise
     except OperationTimeout as error:
         raise TimeoutError(str(error)) from error

@@ -28,7 +28,6 @@ ORDER_POLL_INTERVAL_S = 0.02
 
 
 def _armed_order_kind(value: bool) -> str:
-    """Return the kind of the order that changes `armed` to this value."""
     return "arm" if value else "disarm"
 
 
@@ -77,7 +76,7 @@ class FlightMethods(VehicleAttributes):
 
     @property
     def _dk_is_heartbeat_old(self) -> bool:
-        """True if the last HEARTBEAT is so old that its mode and armed flag may be outdated."""
+        """True if the mode and the armed flag of the last HEARTBEAT may be outdated."""
         aio = self._dk.aio_or_none
         return aio is not None and aio.heartbeat_age > MODE_MAX_AGE_S
 
@@ -102,10 +101,7 @@ class FlightMethods(VehicleAttributes):
             self._dk.check_link()
 
     def _dk_reports_armed(self, value: bool) -> bool:
-        """Return True if HEARTBEAT reports this value of ``armed``.
-
-        An old report of a disarmed vehicle does not count, because a pilot may have armed it since.
-        """
+        # An old report of a disarmed vehicle does not count, because a pilot may have armed it since.
         return self._armed == value and (value or not self._dk_is_heartbeat_old)
 
     def _dk_set_armed(self, value: bool) -> BackgroundCall:
@@ -115,7 +111,6 @@ class FlightMethods(VehicleAttributes):
         return order
 
     def _dk_is_changing_armed_to(self, value: bool) -> bool:
-        """Return True while an order to change ``armed`` to ``value`` is pending."""
         order = self._dk_arming
         return order is not None and order.kind == _armed_order_kind(value) and not order.done()
 
@@ -131,7 +126,6 @@ class FlightMethods(VehicleAttributes):
         self._dk_change_armed(False, wait, timeout, "failed to disarm vehicle")
 
     def _dk_change_armed(self, value: bool, wait: bool, timeout: float | None, failure_text: str) -> None:
-        """Arm or disarm, unless the vehicle already reports the value and no opposite order is pending."""
         is_overruling = self._dk_is_changing_armed_to(not value)
         if self._dk_reports_armed(value) and not is_overruling:
             self._dk.check_link()
@@ -292,7 +286,7 @@ class FlightMethods(VehicleAttributes):
             self._home_location = self._dk_reported_home
 
     def _dk_home_altitude(self) -> float:
-        """Return home's altitude above sea level. If home is unknown, request it; APIException if there is none."""
+        """Return home's altitude above sea level. Request home if it is unknown."""
         if self._home_location is None:
             self._dk.run(self._dk_fetch_home)
         home = self.home_location
@@ -363,10 +357,7 @@ class FlightMethods(VehicleAttributes):
         timeout: float | None,
         failure_text: str,
     ) -> None:
-        """Wait for the effect of an order, or raise TimeoutError as soon as the order fails.
-
-        If waiting ends with an error, the order is cancelled and not sent again.
-        """
+        """Wait for the effect of an order. Raise TimeoutError as soon as the order fails."""
 
         def is_over() -> bool:
             if is_done():
@@ -379,6 +370,6 @@ class FlightMethods(VehicleAttributes):
 
         try:
             self.wait_for(is_over, timeout, ORDER_POLL_INTERVAL_S, failure_text)
-        except BaseException:
+        except BaseException:  # If waiting ends with an error, the order must not be sent again.
             self._handler.calls.cancel(order)
             raise

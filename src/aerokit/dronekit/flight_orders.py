@@ -56,11 +56,12 @@ def mode_name(vehicle: AsyncVehicle, custom_mode: int) -> str:
 
 
 def find_mode(vehicle: AsyncVehicle, mode: str | int) -> Mode:
-    """Return a mode by its name or, on ArduPilot, its number; KeyError if the vehicle has no mode of this name.
+    """Return a mode by its name or, on ArduPilot, its number. Raise KeyError for an unknown name.
 
-    The name must be in capitals, or spelled as the vehicle reports it. Numbers are not checked, as in DroneKit.
+    The name must be in capitals, or spelled as the vehicle reports it.
     """
     autopilot = _autopilot_with_mode_numbers(vehicle)
+    # Numbers are not checked, as in DroneKit.
     if isinstance(mode, int) and autopilot.modes_are_numbered:
         return Mode(mode_name(vehicle, mode), mode)
     try:
@@ -84,12 +85,10 @@ def _px4_base_mode(name: str) -> int:
 
 
 def _autopilot_with_mode_numbers(vehicle: AsyncVehicle) -> Autopilot:
-    """Return the vehicle's autopilot, or ArduPilot in place of one whose mode numbers are unknown, such as iNav.
-
-    pymavlink, too, uses ArduPilot's mode numbers for such autopilots.
-    """
+    """Return the vehicle's autopilot, or ArduPilot if its mode numbers are unknown."""
     if vehicle.autopilot.modes.numbers:
         return vehicle.autopilot
+    # pymavlink, too, uses ArduPilot's mode numbers for autopilots such as iNav.
     heartbeat = m.Heartbeat(
         vehicle.vehicle_type,
         MavAutopilot.ARDUPILOTMEGA,
@@ -107,7 +106,8 @@ async def change_mode(vehicle: AsyncVehicle, mode: Mode) -> None:
 
 
 async def change_armed(vehicle: AsyncVehicle, value: bool) -> None:
-    """Arm or disarm, and wait until HEARTBEAT reports the change. Disarming ends orders that move the vehicle."""
+    """Arm or disarm, and wait until HEARTBEAT reports the change."""
+    # Disarming ends orders that move the vehicle.
     topics: tuple[Subject, ...] = ("arm",) if value else ("arm", "motion")
     try:
         with vehicle.posted(*topics, armed=value) as order:
@@ -127,9 +127,10 @@ async def take_off(vehicle: AsyncVehicle, modes: tuple[Mode, ...], command: int,
 
 
 async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: float) -> None:
-    """Send DO_REPOSITION; if it is unsupported, send SET_POSITION_TARGET_GLOBAL_INT.
+    """Send DO_REPOSITION or, if it is unsupported, SET_POSITION_TARGET_GLOBAL_INT.
 
-    Latitude and longitude are in 1e-7 degrees. The altitude is in metres, above sea level on PX4, otherwise above home.
+    Latitude and longitude are in 1e-7 degrees. The altitude is in metres, above sea level on PX4, otherwise above
+    home.
     """
     is_amsl = vehicle.autopilot.repositions_amsl
     flags = MavDoRepositionFlags.CHANGE_MODE if is_amsl else 0
@@ -164,12 +165,11 @@ async def go_to(vehicle: AsyncVehicle, latitude: int, longitude: int, altitude: 
 
 
 def reposition_modes(aio: AsyncVehicle) -> tuple[Mode, ...]:
-    """Return the modes in which a reposition command is sent to PX4, which then changes to the first of them.
-
-    Empty for other autopilots: they do not change the mode, and refuse the command in unsuitable modes.
-    """
+    """Return the modes in which a reposition command is sent to PX4; empty for other autopilots."""
+    # Other autopilots do not change the mode, and refuse the command in unsuitable modes.
     if not aio.autopilot.repositions_amsl:  # not PX4
         return ()
+    # PX4 changes to the first of these modes.
     purposes: tuple[Purpose, ...] = (aio.autopilot.reposition_purpose, "take_off")
     modes = map(aio.autopilot.mode_for, purposes)
     return tuple(mode for mode in modes if mode is not None)
@@ -181,10 +181,7 @@ async def reject(reason: str) -> None:
 
 
 def checked_location(location: LocationGlobal | LocationGlobalRelative) -> tuple[int, int, float]:
-    """Check a location; return latitude and longitude in 1e-7 degrees, and the altitude in metres.
-
-    Raises InvalidArgument, whose text names the wrong attribute.
-    """
+    """Return latitude and longitude in 1e-7 degrees, and the altitude in metres."""
     for name, limit in (("lat", 90.0), ("lon", 180.0), ("alt", MAX_FLOAT)):
         value = getattr(location, name)
         try:
@@ -217,7 +214,7 @@ class CurrentCommand:
 
     @property
     def seq(self) -> int:
-        """``seq`` of the current command; 0 before the first MISSION_CURRENT, and on PX4 while no mission is active."""
+        """``seq`` of the current command; 0 if it is unknown or, on PX4, if no mission is active."""
         message = self._latest.message
         if message is None:
             return 0
@@ -230,7 +227,7 @@ class CurrentCommand:
         return int(message.seq) + 1
 
     def set_next(self, seq: int) -> None:
-        """Set the next command without waiting. Raises InvalidArgument if ``seq`` is not from 0 to 65,535."""
+        """Set the next command without waiting."""
         if not 0 <= operator.index(seq) <= MAX_SEQ:
             raise InvalidArgument(f"next = {seq!r} is not allowed: it must be 0 to {MAX_SEQ}")
         self._core.order("commands.next", self._set_current, operator.index(seq))
@@ -244,15 +241,12 @@ class CurrentCommand:
         return is_at_start_or_end and not self._core.aio.is_armed
 
     async def _set_current(self, seq: int) -> None:
-        """Set the current command on the vehicle.
-
-        Like DroneKit, send ArduPilot one MISSION_SET_CURRENT. If it is not confirmed, send a command with retries.
-        """
         aio = self._core.aio
         if not aio.autopilot.home_is_item_0:
             await aio.mission.set_current(max(seq - 1, 0))
             self._requested_index = seq - 1  # -1 is not the index of an item.
             return
+        # DroneKit, too, sends this message only once.
         aio.send(m.MissionSetCurrent(aio.system_id, aio.component_id, seq))
         current, sent_at = aio.telemetry.mission_current, aio.connection.now()
         with anyio.move_on_after(MISSION_CURRENT_TIMEOUT_S):
@@ -348,7 +342,6 @@ class Maintenance(VehicleCore):
 
 
 def _tune_text(tune: str | bytes) -> str:
-    """Check a tune, and return it as text."""
     try:
         data = tune.encode() if isinstance(tune, str) else tune
         text = data.rstrip(b"\0").decode("ascii")

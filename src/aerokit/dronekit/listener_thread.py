@@ -47,7 +47,7 @@ class ListenerThread:
             self._calls.put((function, args))
 
     def post_or_drop(self, function: Callable[..., object], *args: Any) -> None:
-        """Queue a call like :meth:`post`, but drop it while 10,000 calls are queued. For values that repeat."""
+        """Like :meth:`post`, but drop the call while the queue is full. For values that repeat."""
         if self._calls.qsize() < MAX_QUEUED_CALLS:
             self.post(function, *args)
             return
@@ -56,15 +56,15 @@ class ListenerThread:
         self.dropped += 1
 
     def call(self, function: Callable[..., object], *args: Any) -> None:
-        """Queue a call and wait until it has run, but at most two seconds.
+        """Queue a call and wait until it has run, at most two seconds.
 
-        The wait is limited because the caller may hold a lock for which a callback waits. The function is called
-        directly if the caller is this listener thread, or after :meth:`stop`. The call is queued without waiting if the
-        caller is the thread of an event loop or another listener thread, because the wait could cause a deadlock.
+        On this listener thread, and after :meth:`stop`, the function is called directly. On the thread of an event
+        loop or of another listener, this method does not wait.
         """
         if self.is_current or self.is_stopped:
             function(*args)
             return
+        # On these threads, a wait could cause a deadlock.
         if _must_not_wait():
             self.post(function, *args)
             return
@@ -77,13 +77,14 @@ class ListenerThread:
                 called.finish()
 
         self.post(call_and_finish)
+        # The wait is limited, because the caller may hold a lock for which a callback waits.
         deadline = time.monotonic() + CALL_TIMEOUT_S
         # Wait in short steps, because on some systems Ctrl-C does not interrupt a long wait.
         while not called.wait(0.2) and not self.is_stopped and time.monotonic() <= deadline:
             pass
 
     def keep_alive(self, owner: object, *, has_listeners: bool) -> None:
-        """Keep an object alive while it has listeners, even if the program drops the vehicle; else release it."""
+        """Keep an object alive while it has listeners, even if the program drops the vehicle."""
         if has_listeners and not self.is_stopped:
             self._kept_alive[id(owner)] = owner
         else:
@@ -94,19 +95,19 @@ class ListenerThread:
         return threading.current_thread() is self._thread
 
     def stop(self) -> None:
-        """End the thread after its current call; queued calls are dropped. Idempotent; does not block."""
+        """End the thread after its current call, and drop queued calls. Does not block."""
         with self._lock:
             self.is_stopped = True
         self._kept_alive.clear()
         self._calls.put((_nothing, ()))  # This wakes the thread, which then notices `is_stopped`.
 
     def join(self) -> None:
-        """Wait until the thread has ended, but not for more than two seconds: a callback may block it forever."""
+        """Wait until the thread has ended, at most two seconds."""
         if self._thread is not None and not self.is_current:
+            # A callback may block the thread forever.
             self._thread.join(JOIN_TIMEOUT_S)
 
     def _start(self) -> None:
-        """Start the thread, unless it runs or was stopped."""
         with self._lock:
             if self._thread is None and not self.is_stopped:
                 thread = _Thread(target=self._run, name=self._name, daemon=True)
@@ -118,7 +119,6 @@ class ListenerThread:
                     self._thread = thread
 
     def _run(self) -> None:
-        """Call the queued functions until :meth:`stop` is called."""
         while True:
             function, args = self._calls.get()
             if self.is_stopped:

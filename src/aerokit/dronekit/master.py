@@ -281,7 +281,7 @@ class Inbox(Mapping[str, Any]):
         return None
 
     def age_s(self, name: str) -> float:
-        """Return the seconds since the last message of this type; before the first, since this inbox was first used."""
+        """Return the seconds since the last message of this type or, before the first, since the first use."""
         self._start()
         frame = self._latest.get(_id_of(name))
         if frame is None:
@@ -306,7 +306,6 @@ class Inbox(Mapping[str, Any]):
         return len(self._latest)
 
     def _start(self) -> None:
-        """Start receiving at the first access."""
         with self._lock:
             if self._started_at is not None:
                 return
@@ -333,7 +332,7 @@ class Inbox(Mapping[str, Any]):
             arrived.finish()
 
     def _pop(self, deadline: float | None) -> Frame | None:
-        """Remove and return the oldest frame that is not too old; wait for one until the deadline, then return None."""
+        """Remove the oldest frame that is not too old. Wait for one until the deadline, then return None."""
         now = self._connection.connection.now
         while True:
             with self._lock:

@@ -138,7 +138,7 @@ class MAVConnection(ClassicConnection):
 
     @_accept_input.setter
     def _accept_input(self, value: bool) -> None:
-        """Discard received bytes if False: tests of programs use this to simulate a silent link."""
+        # Tests of programs set this to False, which discards received bytes, to simulate a silent link.
         # The link calls `bytes_received` with received bytes. An instance attribute of this name hides the method.
         if value:
             vars(self.connection).pop("bytes_received", None)
@@ -193,7 +193,7 @@ _created_connections: ContextVar[weakref.WeakSet[MAVConnection] | None] = Contex
 
 @contextlib.contextmanager
 def created_connections() -> Iterator[weakref.WeakSet[MAVConnection]]:
-    """Collect the connections that this thread creates in the block, by weak reference."""
+    """Collect the connections that this thread creates in the block."""
     connections: weakref.WeakSet[MAVConnection] = weakref.WeakSet()
     token = _created_connections.set(connections)
     try:
@@ -211,10 +211,10 @@ def _open(
     overrides: OverrideRelease,
     heartbeat: OwnHeartbeat | None,
 ) -> OpenContext[Connection]:
-    """Open the link. Retries if the connection is refused: the program may have just started a simulator."""
     own_ids: dict[str, Any] = {"source_system": source_system, "source_component": source_component}
     try:
         _check_address(ip)
+        # A refused connection is retried, because the program may have just started a simulator.
         for attempt in range(MAX_OPEN_ATTEMPTS):
             try:
                 opened = open_connection(ip, baud=baud, reconnect=True, heartbeat=heartbeat, **own_ids)
@@ -237,11 +237,11 @@ def _open(
 async def _with_override_release(
     opened: contextlib.AbstractAsyncContextManager[Connection], overrides: OverrideRelease
 ) -> AsyncIterator[Connection]:
-    """Yield a connection. However the block ends, overridden RC channels are released before it closes."""
     async with opened as connection:
         try:
             yield connection
         finally:
+            # However the block ends, overridden RC channels are released before the link closes.
             overrides.send(connection)
 
 
@@ -257,10 +257,7 @@ def _check_address(ip: object) -> None:
 
 
 def _classic_error(error: LinkOpenError) -> Exception:
-    """Convert a failure to open a link to the type of its cause, OSError or ValueError, which programs catch.
-
-    Without such a cause, return the error itself.
-    """
+    """Convert the error to the type of its cause, OSError or ValueError, which programs catch."""
     original = error.__context__
     classic: Exception
     if isinstance(original, OSError):

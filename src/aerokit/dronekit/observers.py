@@ -52,7 +52,6 @@ class Listeners:
         """The last values of attributes whose listeners are called only on changes."""
 
     def add(self, name: str, listener: AttributeListener) -> None:
-        """Add a listener, unless it is already registered."""
         with _registration_lock:
             present = self.by_name.get(name, ())
             if listener in present:
@@ -61,7 +60,6 @@ class Listeners:
             self._update_kept_owner()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Remove a listener. Ignored if the name has no listeners; ValueError if it has only others."""
         with _registration_lock:
             present = self.by_name.get(name)
             if present is None:
@@ -79,13 +77,10 @@ class Listeners:
         return name in self.by_name or EVERY_NAME in self.by_name
 
     def notify(self, name: str, value: Any, cache: bool = False, *, waits: bool = False) -> None:
-        """Call the listeners of a name with a value.
+        """Call the listeners of a name with a value, on the listener thread.
 
-        The listeners run on the listener thread. This method returns at once; with ``waits``, it waits for them as
-        :meth:`ListenerThread.call` does. Without a listener thread, they run in this call.
-
-        With ``cache``, listeners are called only if the value has changed. While too many calls are queued, the value
-        is skipped, unless ``cache`` or ``waits`` is set.
+        With ``waits``, wait for them as :meth:`ListenerThread.call` does. With ``cache``, call them only if the value
+        has changed.
         """
         if cache:
             if name in self.last_values and self.last_values[name] == value:
@@ -105,14 +100,13 @@ class Listeners:
             self._thread.post_or_drop(self.deliver, name, value)
 
     def announce(self, name: str) -> None:
-        """Like :meth:`notify`, with the value of the owner's attribute, which is read only if it has listeners."""
+        """Like :meth:`notify` with the owner's attribute, which is read only if it has listeners."""
         if self.has_listener(name):
             self.notify(name, attrgetter(name)(self._owner))
         elif self._on_value is not None:
             self._on_value(name)
 
     def deliver(self, attr_name: str, value: Any) -> None:
-        """Call the listeners of this name, then the listeners of ``'*'``."""
         for name in (attr_name, EVERY_NAME):
             for listener in self.by_name.get(name, ()):
                 try:
@@ -129,8 +123,6 @@ class Listeners:
 def listener_decorator(
     add: Callable[[str, AttributeListener], object], name: str | list[str] | tuple[str, ...]
 ) -> Callable[[ListenerT], ListenerT]:
-    """Return a decorator that adds a listener for one or several names."""
-
     def decorate(listener: ListenerT) -> ListenerT:
         for attribute in (name,) if isinstance(name, str) else name:
             add(attribute, listener)
@@ -197,13 +189,11 @@ class MessageListeners(Listeners):
         self._is_started = False
 
     def add(self, name: str, listener: AttributeListener) -> None:
-        """Add a listener for every message of this name, or for every message (``'*'``)."""
         _pymavlink()  # The import takes 60 ms, which would delay the first message.
         super().add(str(name), listener)
         self._attach_now()
 
     def remove(self, name: str, listener: AttributeListener) -> None:
-        """Remove a listener; ignored if the listener is not registered."""
         with contextlib.suppress(ValueError):
             super().remove(name, listener)
         self._attach_now()
@@ -224,7 +214,6 @@ class MessageListeners(Listeners):
                 self._handler.loop.call(self._attach)
 
     def _attach(self) -> None:
-        """Subscribe to the messages that have listeners, or to all messages if there is a listener for ``'*'``."""
         names = list(self.by_name.copy())
         if EVERY_NAME in names:
             names = [EVERY_NAME]
@@ -236,7 +225,6 @@ class MessageListeners(Listeners):
                 self._detach_by_name[name] = self._listen(name)
 
     def _listen(self, name: str) -> Detach:
-        """Subscribe to the messages of one name, or to all frames."""
         connection = self._handler.connection
         if name == EVERY_NAME:
             return connection.observe_frames(self._on_frame)
@@ -257,18 +245,14 @@ class MessageListeners(Listeners):
 
 
 def message_of(frame: Frame) -> Any:
-    """Convert a frame to a pymavlink message. Never raises.
-
-    Uses the program's dialect, ``mavutil.mavlink``, if that is a MAVLink 2 dialect. ``_timestamp`` is the time of this
-    call.
-    """
+    """Convert a frame to a pymavlink message. Never raises."""
     mavutil, to_pymavlink = _pymavlink()
+    # The program's dialect is used if it is a MAVLink 2 dialect.
     return to_pymavlink(frame, dialect=mavutil.mavlink, timestamp=time.time())
 
 
 @cache
 def _pymavlink() -> tuple[Any, Callable[..., Any]]:
-    """Import pymavlink's ``mavutil`` and our conversion to its messages when they are first needed."""
     from pymavlink import mavutil
 
     from aerokit.mavlink.pymavlink import to_pymavlink

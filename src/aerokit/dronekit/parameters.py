@@ -61,7 +61,7 @@ class ParameterDownload:
         self._has_warned = False  # True once a failure was logged
 
     def begin(self) -> None:
-        """Begin the download, unless it runs or is complete. Called on the loop."""
+        """Begin the download, on the loop."""
         if self._ended is None and not self.is_complete:
             self._ended = asyncio.Event()
             aio, on_success = self._core.aio, weak_callback(self._store_all)
@@ -74,11 +74,11 @@ class ParameterDownload:
             self._core.handler.calls.post(self.begin)
 
     async def wait_for(self, name: str) -> None:
-        """Wait until the parameter is received, alone or with the list, or reported as missing by the vehicle.
+        """Wait until the parameter is received, or reported as missing by the vehicle.
 
-        A vehicle may leave a parameter out of the list. If the list is already complete, the parameter is therefore
-        requested once, and the call returns even without an answer. The call also returns if the connection ends.
+        Also returns if a vehicle that has sent the list does not answer, or if the connection ends.
         """
+        # A vehicle may leave a parameter out of the list, so it is requested once.
         if self.is_complete:
             await self._request(name)
             return
@@ -110,16 +110,14 @@ class ParameterDownload:
             self._core.logger.warning("the parameters could not be downloaded: %s", error)
 
     async def _request(self, name: str) -> bool:
-        """Request a parameter under all its names; return True if it was received or the vehicle reported it missing.
-
-        While the vehicle sends the list, it may ignore requests. No answer does not mean that the parameter is missing.
-        """
+        """Request a parameter under all its names. Return True if it was received or reported as missing."""
         from aerokit.parameters.renames import other_names
 
         names = (name, *other_names(name))
         try:
             answers = (await self._core.aio.parameters.probe(*names, idle_timeout_s=READ_TIMEOUT_S)).values()
         except AerokitError:
+            # While the vehicle sends the list, it may ignore requests, so the parameter may exist.
             return False
         if any(isinstance(answer, Parameter) for answer in answers):
             return True
@@ -133,8 +131,8 @@ async def _download(
     on_failure: Callable[[AerokitError], None],
     on_ended: Callable[[], None],
 ) -> None:
-    """Download all parameters on the loop. The callbacks must be weak, so that the program's vehicle can be freed."""
     try:
+        # The callbacks are weak, so that the program's vehicle can be freed.
         on_success(await vehicle.parameters.download(method=await _download_method(vehicle)))
     except ConnectionClosed:
         return
@@ -147,10 +145,10 @@ async def _download(
 
 
 async def _download_method(vehicle: AsyncVehicle) -> DownloadMethod:
-    """Return "auto", or "list" if AUTOPILOT_VERSION does not arrive soon: "auto" needs it to know if MAVFTP exists."""
     version = vehicle.telemetry.version
     with anyio.move_on_after(VERSION_TIMEOUT_S):
         await version.wait_until(lambda _: True)
+    # "auto" needs AUTOPILOT_VERSION to know if MAVFTP exists.
     return "auto" if version.is_known else "list"
 
 
@@ -165,7 +163,6 @@ class ParameterValues:
         return len(self._parameters)
 
     def copy(self) -> dict[str, float]:
-        """Return a new dict of values by name, in the vehicle's spelling and units."""
         return {name: float(parameter.value) for name, parameter in self._parameters.copy().items()}
 
     def find(self, name: str) -> ResolvedParameter | None:
@@ -180,7 +177,7 @@ class ParameterValues:
         return None if parameter is None else float(parameter.value)
 
     def store(self, parameter: Parameter) -> bool:
-        """Store a parameter, unless it is new and the store is full; return True if a value was added or changed."""
+        """Store a parameter. Return True if a value was added or changed."""
         name, previous = parameter.name, self._parameters.get(parameter.name)
         if previous is None and len(self._parameters) >= MAX_PARAMETERS:
             return False  # A sender can make up names, so their number is limited.
@@ -191,16 +188,14 @@ class ParameterValues:
 
 
 async def set_parameter(aio: AsyncVehicle, name: str, value: float, retries: int) -> AerokitError | None:
-    """Set a parameter. Return None if the vehicle confirms the value, otherwise the error.
-
-    Values of integer parameters are truncated, as in ArduPilot. If PARAM_SET is not answered, the value is requested.
-    PARAM_SET is sent again only if the vehicle still reports the old value. ParameterTimeout is returned if the vehicle
-    does not answer for the time of ``retries + LAST_WAIT_SHARE`` attempts.
-    """
+    """Set a parameter. Return None if the vehicle confirms the value, otherwise the error."""
     idle_timeout_s = (retries + LAST_WAIT_SHARE) * _attempt_s(aio)
     try:
         parameter = aio.parameters.known(name) or await aio.parameters.read(name, idle_timeout_s=idle_timeout_s)
+        # Values of integer parameters are truncated, as in ArduPilot.
         converted = convert_to_type(name, value, parameter.type)
+        # If PARAM_SET is not answered, the value is requested. PARAM_SET is sent again only if the vehicle still
+        # reports the old value.
         result = await aio.parameters.set(name, converted, idle_timeout_s=idle_timeout_s)
     except (InvalidArgument, ParameterRejected, ParameterTimeout) as error:
         return error
@@ -217,7 +212,6 @@ async def set_once(aio: AsyncVehicle, name: str, value: float) -> None:
 
 
 def convert_to_type(name: str, value: float, type: ParameterType) -> int | float:  # noqa: A002
-    """Convert a value to a parameter type; InvalidArgument if that is impossible."""
     if type.is_integer and isinstance(value, float) and abs(value) < float("inf"):
         rounding = -ROUNDING if value < 0 else ROUNDING
         value = int(value + rounding)
@@ -225,10 +219,11 @@ def convert_to_type(name: str, value: float, type: ParameterType) -> int | float
 
 
 def _attempt_s(aio: AsyncVehicle) -> float:
-    """Return the time to allow for one attempt to set a parameter, in seconds; slow links need more."""
+    """Return the seconds to allow for one attempt to set a parameter."""
     report = aio.link_quality.latest
     if report is None or report.round_trip_s is None:
         return MIN_ATTEMPT_S
+    # Slow links need more time.
     return max(MIN_ATTEMPT_S, ROUND_TRIPS * report.round_trip_s)
 
 
@@ -370,7 +365,6 @@ class Parameters(MutableMapping[str, float], Python2Mapping[float], HasObservers
 
     @property
     def _is_settled(self) -> bool:
-        """True if the download is complete, and has at least as many parameters as the vehicle reports."""
         return self._download.is_complete and self._count <= len(self._values)
 
     async def _wait_for(self, name: str) -> None:
@@ -417,7 +411,6 @@ def _upper_name(name: str) -> str:
 
 
 def _key_error_text(name: str) -> str:
-    """Return the name of an unknown parameter, and what has replaced the parameter, if known."""
     from aerokit.parameters.renames import replacement_of
 
     replacement = replacement_of(name)

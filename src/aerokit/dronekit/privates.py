@@ -51,7 +51,7 @@ def _velocity(index: int) -> OverridableProperty[Any]:
 
 
 def _message_fields(latest_message: str, *fields: str) -> tuple[OverridableProperty[Any], ...]:
-    """Return a property for each of these fields of a message. ``latest_message`` names the vehicle's LatestMessage."""
+    """Return properties for fields of the vehicle's LatestMessage with this name."""
     return tuple(attribute_path(f"{latest_message}.message.{field}") for field in fields)
 
 

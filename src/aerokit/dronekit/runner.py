@@ -61,7 +61,7 @@ def install() -> None:
 
 
 def uninstall() -> None:
-    """Undo :func:`install`, if it was called. Modules that were imported under the alias stay usable."""
+    """Undo :func:`install`. Modules that were imported under the alias stay usable."""
     if sys.modules.get(ALIAS) is not sys.modules.get(PACKAGE):
         return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _SubmoduleFinder)]
@@ -73,7 +73,7 @@ def uninstall() -> None:
 
 
 def _aerokit_name(name: str) -> str | None:
-    """Return the aerokit module that an alias such as ``dronekit.lib`` stands for; None if the name is no alias."""
+    """Return the module that an alias such as ``dronekit.lib`` stands for; None if it is no alias."""
     if name == SITL_ALIAS:
         return SITL_MODULE
     return PACKAGE + name.removeprefix(ALIAS) if name.startswith(f"{ALIAS}.") else None
@@ -179,7 +179,7 @@ def main(arguments: Sequence[str], prog: str = "python -m aerokit.dronekit") -> 
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Return the parser for the command line up to and including the program; the program parses the rest."""
+    """Return the parser for the command line up to and including the program."""
     parser = _Parser(
         prog=prog,
         usage=f"{prog} [-h] [--sim [OPTION ...]] (PROGRAM.py | -m MODULE) [ARGUMENT ...]",
@@ -212,7 +212,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _split_at_program(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-    """Split a command line after the program: return the arguments up to it, and the program's own arguments."""
+    """Return the arguments up to the program, and the program's own arguments."""
     is_option_value = False
     for count, argument in enumerate(arguments, 1):
         if not is_option_value and not argument.startswith("-"):
@@ -222,7 +222,6 @@ def _split_at_program(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence
 
 
 def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
-    """Serve a simulated vehicle for the program, and print its addresses."""
     from aerokit.dronekit.sitl import parse_home, serve_for_program
     from aerokit.sim.motion import HOME
 
@@ -236,11 +235,9 @@ def _serve(options: argparse.Namespace, prog: str) -> ServedVehicle:
 
 
 def _module_error(module: str) -> str | None:
-    """Return the error text that ``python -m`` prints if it cannot run the module; None if it can.
-
-    Imports the module's parent packages, as ``python -m`` does.
-    """
+    """Return the error text of ``python -m`` if it cannot run the module; None if it can."""
     try:
+        # This imports the module's parent packages, as ``python -m`` does.
         spec = importlib.util.find_spec(module)
         if spec is None:
             return f"No module named {module}"
@@ -253,7 +250,6 @@ def _module_error(module: str) -> str | None:
 
 
 def _missing_main_error(path: str) -> str | None:
-    """Return the error text that Python prints for a folder without a ``__main__.py``, otherwise None."""
     return f"can't find '__main__' module in {path!r}" if _lacks_main(path) else None
 
 
@@ -279,7 +275,7 @@ def _run_module(name: str, arguments: Sequence[str]) -> None:
 
 
 def _run_file(path: str, arguments: Sequence[str]) -> None:
-    """Run a program as ``python PATH ARGUMENTS`` does, and return when its main program has ended."""
+    """Run a program as ``python PATH ARGUMENTS`` does."""
     sys.argv[:] = [path, *arguments]
     if os.path.isdir(path) or path.endswith(".pyc") or zipfile.is_zipfile(path):
         runpy.run_path(path, run_name="__main__")
@@ -303,7 +299,6 @@ def _prepend_path(folder: str) -> None:
 
 @contextlib.contextmanager
 def _restored_sys() -> Iterator[None]:
-    """Restore the arguments, the search path and the main module at the end of the block."""
     argv = sys.argv[:]
     path = sys.path[:]
     main = sys.modules["__main__"]
@@ -316,13 +311,11 @@ def _restored_sys() -> Iterator[None]:
 
 
 def _print_program_traceback(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-    """Print a traceback without the frames of this module, as if ``python program.py`` had printed it."""
     error.__traceback__ = _without_our_frames(traceback)
     sys.__excepthook__(kind, error, error.__traceback__)
 
 
 def _without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
-    """Return the part of a traceback that belongs to the program."""
     entry = traceback
     # Skip our frames up to the one that runs the program, then those of runpy.
     while entry is not None and entry.tb_frame.f_code not in (_run_file.__code__, _run_module.__code__):

@@ -215,7 +215,7 @@ def version_list() -> dict[str, dict[str, str]]:
 
 
 def parse_home(text: str) -> tuple[float, float, float]:
-    """Parse ``LAT,LON,ALT``; InvalidArgument unless these are numbers. Ignore further parts, such as SITL's heading."""
+    """Parse ``LAT,LON,ALT``. Further parts, such as SITL's heading, are ignored."""
     try:
         latitude, longitude, altitude = (float(part) for part in text.split(",")[:3])
     except ValueError:

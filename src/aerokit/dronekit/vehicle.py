@@ -260,16 +260,15 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return not mode_name(self._dk.aio, mode_code).endswith(f" {mode_code}")
 
     def _dk_begin(self, aio: AsyncVehicle, tasks: BackgroundTasks) -> None:
-        """Start receiving, in the same loop iteration in which the vehicle was found.
-
-        Callbacks that the event loop keeps have only weak references to this vehicle, so that it can be garbage
-        collected when the program drops it. `_handler` may have strong ones, because it belongs to this vehicle.
-        """
+        """Start receiving, in the loop iteration in which the vehicle was found."""
         core = self._dk
         core.start_receiving(aio, tasks)
         self._handler.vehicle = self
         self._handler.note_sent = aio.note_sent
         self._handler.calls.describe = self._dk_describe
+        # The event loop keeps these callbacks, so they have only weak references to this vehicle. It can then be
+        # garbage collected when the program drops it. `_handler` may have strong ones, because it belongs to this
+        # vehicle.
         aio.telemetry.status_text.observe(weak_callback(self._dk_on_status_text), every_arrival=True)
         aio._session.on_reboot.append(weak_callback(self._dk_forget_home))
         # The heartbeat that revealed the vehicle arrived before the handlers were attached, so it is handled here.
@@ -291,10 +290,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
         return f"the vehicle is {'armed' if self._armed else 'disarmed'}, in {self._flightmode}"
 
     def _dk_wait_for_first_values(self) -> None:
-        """Wait until all attributes in FIRST_VALUES have values.
-
-        Give up after FIRST_VALUES_TIMEOUT_S, or if no further value arrives for NEXT_VALUE_TIMEOUT_S.
-        """
+        """Wait until all attributes in FIRST_VALUES have values, or until values stop arriving."""
         names, ready = set[str](FIRST_VALUES), self._dk.ready
         now = time.monotonic()
         deadline = now + FIRST_VALUES_TIMEOUT_S
@@ -320,10 +316,7 @@ class Vehicle(FlightMethods, Maintenance, VehiclePrivates):
 async def _connected(
     connection: Connection, timeout: float, begin: Callable[..., None], rate: float | None
 ) -> AsyncIterator[AsyncVehicle]:
-    """Connect on the loop, call ``begin``, and request streams.
-
-    ``begin`` must be a weak callback, because the loop keeps it until the connection ends.
-    """
+    """Connect on the loop, call ``begin``, and request streams."""
     async with connect_async(connection, timeout=timeout, rates={}) as aio:
         tasks = BackgroundTasks(connection.fail)
         rate_hz: float | None = None
@@ -331,6 +324,7 @@ async def _connected(
             # DroneKit accepts a rate of 0 or less, but aio.streams() does not; 1 Hz is requested instead.
             rate_hz = min(rate, MAX_STREAM_RATE_HZ) if rate > 0 else 1.0
         try:
+            # `begin` is a weak callback, because the loop keeps it until the connection ends.
             begin(aio, tasks)
             with nullcontext() if rate_hz is None else aio.streams(rate_hz):
                 yield aio

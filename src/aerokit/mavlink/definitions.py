@@ -54,23 +54,20 @@ class FieldDefinition:
 
     @property
     def attribute(self) -> str:
-        """Name in Python: the standard's name. A keyword or a name that `Message` uses gets a trailing underscore."""
+        """Name in Python, with a trailing underscore if the standard's name is reserved."""
         reserved = keyword.iskeyword(self.name) or self.name in _RESERVED
         return self.name + "_" if reserved else self.name
 
     @property
     def length(self) -> int:
-        """Number of bytes in the payload."""
         return SIZES[self.type] * (self.array_length or 1)
 
     @property
     def is_text(self) -> bool:
-        """True if the value is a ``str``."""
         return self.type == "char" and not self.carries_bytes
 
     @property
     def is_bytes(self) -> bool:
-        """True if the value is ``bytes``."""
         return self.carries_bytes or (self.type == "uint8_t" and bool(self.array_length))
 
 
@@ -87,7 +84,6 @@ class MessageDefinition:
 
     @property
     def class_name(self) -> str:
-        """Name of the class: ``Gps2Raw`` for ``GPS2_RAW``."""
         return cap_words(self.name)
 
     @property
@@ -108,7 +104,6 @@ class MessageDefinition:
 
     @property
     def crc_extra(self) -> int:
-        """Byte derived from the definition. If the sender has another definition, the checksums of its frames fail."""
         # https://mavlink.io/en/guide/serialization.html#crc_extra
         text = self.name + " "
         for field in self.wire_fields:
@@ -143,7 +138,6 @@ class EnumDefinition:
 
     @property
     def class_name(self) -> str:
-        """Name of the class: ``MavCmd`` for ``MAV_CMD``."""
         return cap_words(self.name)
 
     @property
@@ -200,7 +194,7 @@ def read_dialect(path: Path, search: Sequence[Path] = ()) -> list[DialectDefinit
 
 
 def read_xml(path: Path) -> DialectDefinition:
-    """Read one file without its includes; errors as for :func:`read_dialect`."""
+    """Read one file without its includes. Raises the errors of :func:`read_dialect`."""
     # The XML parsers are imported here, because definitions from pymavlink do not need them.
     from xml.etree.ElementTree import ParseError
 
@@ -223,7 +217,7 @@ def read_xml(path: Path) -> DialectDefinition:
 
 
 def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
-    """Return all enums. Entries in later files are added to the enum of the first file that defines it."""
+    """Return all enums. An enum that several files define has the entries of all of them."""
     merged: dict[str, EnumDefinition] = {}
     for dialect in dialects:
         for enum in dialect.enums:
@@ -231,6 +225,7 @@ def merged_enums(dialects: Iterable[DialectDefinition]) -> list[EnumDefinition]:
             if first is None:
                 merged[enum.name] = enum
                 continue
+            # The enum itself is that of the first file.
             # An entry in a later file replaces an entry with the same name.
             entries = {entry.name: entry for entry in (*first.entries, *enum.entries)}
             ordered = sorted(entries.values(), key=lambda entry: entry.value)
@@ -251,7 +246,6 @@ def _find_include(include: str, file: Path, search: Sequence[Path]) -> Path:
 
 
 def _parse_message(node: Element, origin: str) -> MessageDefinition:
-    """Parse a ``<message>``. Fields after ``<extensions/>`` are extension fields."""
     fields: list[FieldDefinition] = []
     extension = False
     for child in node:
@@ -279,7 +273,6 @@ def _parse_message(node: Element, origin: str) -> MessageDefinition:
 
 
 def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinition:
-    """Read one ``<field>`` element of a message. ``extension`` is True below ``<extensions/>``."""
     # The field mavlink_version of HEARTBEAT has its own type "uint8_t_mavlink_version", and its value is always 3.
     match = _FIELD_TYPE.match(node.attrib["type"])
     if match is None or match[1] not in SIZES or match[2] == "0":
@@ -300,12 +293,10 @@ def _parse_field(node: Element, extension: bool, message: str) -> FieldDefinitio
 
 
 def carries_bytes(message: str, field_name: str, kind: str) -> bool:
-    """Return True if this field is in BYTES_IN_CHARS, and is an array of ``char`` in its dialect."""
     return kind == "char" and (message, field_name) in BYTES_IN_CHARS
 
 
 def _parse_enum(node: Element, origin: str) -> EnumDefinition:
-    """Read one ``<enum>`` element. ``origin`` is the file that contains it."""
     entries: list[EntryDefinition] = []
     highest = 0
     for child in node.findall("entry"):
@@ -363,7 +354,6 @@ def _text(node: Element | None) -> str:
 
 
 def _remarks(node: Element) -> tuple[str, ...]:
-    """Return one sentence for each ``<deprecated>``, ``<superseded>`` and ``<wip>`` of a message or entry."""
     remarks: list[str] = []
     for child in node:
         if child.tag in ("deprecated", "superseded"):
@@ -383,7 +373,7 @@ def _remarks(node: Element) -> tuple[str, ...]:
 
 
 def _common_prefix(enum: str, names: list[str]) -> str:
-    """Return the prefix of the entries: the enum's name if most begin with it, else the words with which all begin."""
+    """Return the enum's name if most entries begin with it, else the words with which all begin."""
     if not names:
         return ""
     enum_prefix = enum + "_"
@@ -403,7 +393,6 @@ def _common_prefix(enum: str, names: list[str]) -> str:
 
 
 def _member_name(enum: str, prefix: str, name: str) -> str:
-    """Return the Python name of an enum entry: its name without the prefix of the entries."""
     if not name.startswith(prefix):  # Some entries begin only with the last words of the enum's name.
         words = enum.split("_")
         shorter_prefixes = ("_".join(words[i:]) + "_" for i in range(1, len(words)))

@@ -41,13 +41,13 @@ class Dialect:
         self._set_rows({cls.ID: (cls.CRC_EXTRA, cls.BASE_LENGTH, cls.LENGTH) for cls in self._classes.values()})
 
     def _set_rows(self, rows: dict[int, Row]) -> None:
-        """Store the table of messages, and prepare a decoder for each. It loads the message class at its first use."""
         self.rows = rows
         """Maps message ids to (CRC_EXTRA, payload length without extensions, payload length with extensions)."""
         self.extras: dict[int, bytes] = {
             message_id: bytes((crc_extra,)) for message_id, (crc_extra, *_) in rows.items()
         }
         """Maps message ids to CRC_EXTRA as a byte, which is appended to the payload for the checksum."""
+        # Each decoder loads its message class at the first use.
         self._decoders: dict[int, Callable[[bytes, Frame | None], Message]] = {
             message_id: partial(self._decode_first, message_id) for message_id in rows
         }
@@ -169,7 +169,6 @@ class _Extended(Dialect):
         return first[message_id] if message_id in first else second[message_id]
 
     def enum(self, name: str) -> type[Any]:
-        """Return the first part's enum if it has all members of the other enums, otherwise a merged enum."""
         enum_types: list[type[Any]] = []
         for part in self._parts:
             try:

@@ -109,7 +109,7 @@ if wire is not None:
 
 
 def is_whole_frame(data: bytes) -> bool:
-    """Return True if the bytes are one frame by their header and length. The checksum is not verified."""
+    """Return True if the bytes are one frame. The checksum is not verified."""
     if len(data) < 8 or data[0] not in (MAGIC_V1, MAGIC_V2):
         return False
     magic, payload_length, flags = data[:3]
@@ -120,7 +120,7 @@ def is_whole_frame(data: bytes) -> bool:
 
 
 def x25_in_python() -> Callable[[bytes], int]:
-    """Create a checksum function in Python, for platforms where pymavlink does not install ``fastcrc``."""
+    """Create a checksum function in Python."""
     table: list[int] = []
     for byte in range(256):
         for _ in range(8):
@@ -137,13 +137,13 @@ def x25_in_python() -> Callable[[bytes], int]:
 
 
 def _fastest_x25() -> Callable[[bytes], int]:
-    """Return the checksum function of the compiled module, else that of ``fastcrc``, else the one in Python."""
     if wire is not None:
         compiled: Callable[[bytes], int] = wire.x25
         return compiled
     try:
         from fastcrc.crc16 import mcrf4xx
     except ImportError:
+        # pymavlink does not install fastcrc on this platform.
         return x25_in_python()
     return mcrf4xx
 

@@ -207,13 +207,13 @@ class PythonFramer:
     def _fill_late_and_foreign(self, frames: list[Frame], out_of_order: list[tuple[int, int, int]]) -> None:
         """Sort the frames that were out of order into :attr:`late` and :attr:`foreign`.
 
-        ``out_of_order`` has (position in ``frames``, result of `SourceStatistics.out_of_order`, sequence and sender) of
-        each. An unwanted message is not in ``frames``, so a later frame may be at its position. That frame is not
-        sorted, because its sequence or sender differs.
+        ``out_of_order`` has the position in ``frames``, the result of `SourceStatistics.out_of_order`, and the
+        sequence and sender.
         """
         for position, ordering, identity in out_of_order:
             if position < len(frames):
                 frame = frames[position]
+                # An unwanted message is not in `frames`, so a later frame may be at its position.
                 if frame.sequence << 16 | frame.component_id << 8 | frame.system_id != identity:
                     continue
                 if ordering == OTHERS:
@@ -282,7 +282,6 @@ class PythonFramer:
         return frames
 
     def _skip_unknown(self, data: bytes, begin: int, end: int) -> None:
-        """Count a frame of an unknown message, and keep it if :attr:`keep_unknown` is set."""
         if self.keep_unknown:
             self._unknown.append(data[begin:end])
         if data[begin] == MAGIC_V2:
@@ -301,7 +300,7 @@ class PythonFramer:
             self.statistics.bad_crcs += sum(position < end for position in bad_crcs)
 
     def _examine(self, data: bytes, begin: int) -> tuple[int, int, _ValidFrame | None]:
-        """Return (verdict, end, frame if valid) for the magic byte at ``begin``."""
+        """Return the verdict, the end, and the frame if it is valid, for the magic byte at ``begin``."""
         size = len(data)
         if data[begin] == MAGIC_V2:
             if size - begin < 3:  # The flags have not arrived yet.

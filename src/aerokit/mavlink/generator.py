@@ -46,14 +46,12 @@ DefinedT = TypeVar("DefinedT", EnumDefinition, MessageDefinition)
 
 
 def read_additions() -> list[DialectDefinition]:
-    """Read the three XML files in the folder ``additions``."""
     return [read_xml(UNION_FOLDER / f"{stem}.xml") for stem in ("minimal", "common", "development")]
 
 
 def with_added_messages(
     messages: Sequence[MessageDefinition], additions: Sequence[DialectDefinition]
 ) -> list[MessageDefinition]:
-    """Merge pymavlink's messages with those of the additions. Messages that pymavlink lacks are appended."""
     merged = {message.id: message for message in messages}
     for added in (message for dialect in additions for message in dialect.messages):
         existing = merged.get(added.id)
@@ -64,23 +62,19 @@ def with_added_messages(
 
 
 def with_added_enums(enums: Sequence[EnumDefinition], additions: Sequence[DialectDefinition]) -> list[EnumDefinition]:
-    """Merge pymavlink's enums with those of the additions. Enums that pymavlink lacks are appended.
-
-    If a value has several names, that of the additions comes first. New entries do not change the Python names of
-    existing entries.
-    """
     merged = {enum.name: enum for enum in enums}
     for added in (enum for dialect in additions for enum in dialect.enums):
         existing = merged.get(added.name)
         if existing is not None:
             entries = _merged_entries(existing, added)
+            # New entries do not change the Python names of existing ones, which depend on the prefix.
             added = _with_first_origin(replace(existing, entries=entries, own_prefix=existing.prefix), added)
         merged[added.name] = added
     return list(merged.values())
 
 
 def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
-    """Return ``existing`` with the origin that `STANDARD_FILES` lists first, and the remarks of ``added``, if any."""
+    """Return ``existing`` with the origin that `STANDARD_FILES` lists first."""
     origin = min(
         existing.origin,
         added.origin,
@@ -90,21 +84,17 @@ def _with_first_origin(existing: DefinedT, added: DefinedT) -> DefinedT:
 
 
 def _merged_fields(existing: MessageDefinition, added: MessageDefinition) -> tuple[FieldDefinition, ...]:
-    """Return the fields of both definitions.
-
-    A field in both gets its units, enum and invalid value from ``added``, even if empty; the rest from ``existing``.
-    """
     fields = {field.name: field for field in existing.fields}
     for field in added.fields:
         existing_field = fields.get(field.name)
         if existing_field is not None:
+            # Units, enum and invalid value are those of the addition, even if empty.
             field = replace(existing_field, units=field.units, enum=field.enum, invalid=field.invalid)
         fields[field.name] = field
     return tuple(fields.values())
 
 
 def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[EntryDefinition, ...]:
-    """Return the entries of both enums, sorted by value. Entries with the same name are merged."""
     by_name = {entry.name: entry for entry in existing.entries}
     merged = {entry.name: _merged_entry(by_name.get(entry.name, entry), entry) for entry in added.entries}
     for name, entry in by_name.items():
@@ -114,10 +104,6 @@ def _merged_entries(existing: EnumDefinition, added: EnumDefinition) -> tuple[En
 
 
 def _merged_entry(existing: EntryDefinition, added: EntryDefinition) -> EntryDefinition:
-    """Return an entry with the params of both definitions. An added param replaces one with the same number.
-
-    The value and any remarks are those of the addition, the description is the existing one.
-    """
     params = {number: (number, label, units, text) for number, label, units, text in (*existing.params, *added.params)}
     return replace(
         existing,
@@ -281,7 +267,6 @@ def xml_folder() -> Path:
 
 
 def fingerprint(folder: Path | None = None) -> str:
-    """Return a hash of the XML files."""
     folder = folder or xml_folder()
     digest = hashlib.sha256()
     for stem in _stems():
@@ -296,7 +281,6 @@ def generated_fingerprint() -> str:
 
 
 def definitions(folder: Path | None = None) -> tuple[list[MessageDefinition], list[EnumDefinition]]:
-    """Return all messages and enums to generate."""
     folder = folder or xml_folder()
     dialects = [read_xml(folder / f"{stem}.xml") for stem in _stems()]
     additions = read_additions()
@@ -337,7 +321,6 @@ def differences(folder: Path | None = None) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m aerokit.mavlink.generator", description=(__doc__ or "").partition("\n")[0]
     )
@@ -378,7 +361,6 @@ def _other_files(stems: Sequence[str]) -> str:
 
 
 def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
-    """Render one module of message classes."""
     text = "\n\n".join(render_message(message) for message in messages)
     helpers = "".join(f", {name}" for name in ("pack_bytes", "pack_items", "pack_text") if f"{name}(" in text)
     stems = MODULES.get(module, MODULES["common"])  # COMMON_MORE has messages of the same files as common.
@@ -389,7 +371,6 @@ def _messages_module(module: str, messages: Sequence[MessageDefinition]) -> str:
 
 
 def _messages_init(messages: Sequence[MessageDefinition]) -> tuple[str, str]:
-    """Render ``messages/__init__.py`` and its stub."""
     rows = ""
     for message in sorted(messages, key=lambda message: message.id):
         numbers = f"{message.crc_extra}, {message.base_length}, {message.length}"

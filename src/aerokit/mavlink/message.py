@@ -152,10 +152,7 @@ class _Fields:
 
 
 def offset_of(message_type: type[Message], field: str) -> int:
-    """Return the offset of a field in the payload.
-
-    https://mavlink.io/en/guide/serialization.html#field_reordering
-    """
+    # https://mavlink.io/en/guide/serialization.html#field_reordering
     offset = 0
     for wire_field in _wire_fields(message_type):
         if wire_field.name == field:
@@ -165,14 +162,14 @@ def offset_of(message_type: type[Message], field: str) -> int:
 
 
 def _wire_fields(message_type: type[Message]) -> list[Field]:
-    """Return the fields in the order in which they are sent: largest types first, then extensions."""
+    """Return the fields in the order in which they are sent."""
     fields = [Field(*row) for row in message_type._FIELDS]
     base = sorted((field for field in fields if not field.extension), key=lambda field: -SIZES[field.type])
     return [*base, *(field for field in fields if field.extension)]
 
 
 def layout_of(message_type: type[Message]) -> Any:
-    """Return the layout that compiled code uses for a generated class, created on first use; None for other classes."""
+    """Return the layout for compiled code, or None if the class has none. It is created on first use."""
     own_attributes = message_type.__dict__  # without the attributes of base classes, whose layout would be wrong
     if "_LAYOUT" not in own_attributes:
         is_generated = {"_FIELDS", "decode_body", "encode"} <= own_attributes.keys()
@@ -187,7 +184,7 @@ def _new_layout(message_type: type[Message]) -> Any:
 
 
 def _wire_code(field: Field) -> str:
-    """Return the code of a field in ``_wire.c``: "s" for a text, "p" for bytes, else the code in ``struct``."""
+    """Return the code of a field in ``_wire.c``."""
     if field.is_text:
         return "s"
     is_bytes = field.type == "char" or (field.type == "uint8_t" and field.array_length > 0)
@@ -195,7 +192,7 @@ def _wire_code(field: Field) -> str:
 
 
 def decoder_of(message_type: type[MessageT]) -> Callable[[bytes, Frame | None], MessageT]:
-    """Return the compiled function that decodes this class; without one, the class's `Message.decode_body`."""
+    """Return the compiled decoder of this class or, without one, its `Message.decode_body`."""
     layout = layout_of(message_type)
     decode: Callable[[bytes, Frame | None], MessageT] = message_type.decode_body if layout is None else layout.decode
     return decode
@@ -269,7 +266,6 @@ class Message:
         return f"{type(self).__name__}({fields})"
 
     def _encode_error(self) -> InvalidArgument:
-        """Return the error for the first field with an invalid value."""
         for field in self.FIELDS:
             value = getattr(self, field.name, None)
             problem = field.problem(value)
@@ -288,22 +284,25 @@ def _format_field(name: str, value: object) -> str:
 
 
 def pack_text(value: str, size: int) -> bytes:
-    """Encode a text as UTF-8. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
+    """Encode a text as UTF-8. Raise ValueError if it has more than ``size`` bytes."""
     data = value.encode()
     if len(data) > size:
         raise ValueError(value)
+    # The struct format appends missing zeros.
     return data
 
 
 def pack_bytes(value: bytes, size: int) -> bytes:
-    """Return the value unchanged. Raises ValueError above ``size`` bytes. The struct format appends missing zeros."""
+    """Return the value. Raise ValueError if it has more than ``size`` bytes."""
     if len(value) > size:
         raise ValueError(value)
+    # The struct format appends missing zeros.
     return value
 
 
 def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
-    """Return the numbers, with zeros appended up to ``size``. If there are more numbers, packing them raises."""
+    """Return the numbers, with zeros appended up to ``size``."""
+    # If there are too many numbers, packing them raises.
     missing = size - len(value)
     return (*value, *(0,) * missing) if missing else value
 
@@ -312,7 +311,7 @@ def pack_items(value: Sequence[float], size: int) -> Sequence[float]:
 
 
 def _same(left: Any, right: Any) -> bool:
-    """Return True if two values are equal, where NaN equals NaN, also inside tuples."""
+    """Return True if two values are equal. NaN equals NaN, also inside tuples."""
     are_both_nan = left != left and right != right
     if left == right or are_both_nan:
         return True
@@ -322,7 +321,7 @@ def _same(left: Any, right: Any) -> bool:
 
 
 def _number_problem(value: Any, kind: str) -> str | None:
-    """Explain why a value does not fit into this type, or return None. A number is what ``struct`` accepts."""
+    """Explain why a value does not fit into this type, or return None."""
     if kind in INTEGER_RANGES:
         low, high = INTEGER_RANGES[kind]
         try:  # 64 bits are enough for each kind, whose range is checked below. Other values are no integers, or huge.
@@ -332,6 +331,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
                 return f"must be an integer in {low}..{high} ({kind})"
         return None if low <= value.__index__() <= high else f"must be in {low}..{high} ({kind})"
     try:
+        # A number is what ``struct`` accepts.
         struct.pack("<f" if kind == "float" else "<d", value)
     except OverflowError:
         return f"does not fit into a {kind}"
@@ -341,7 +341,7 @@ def _number_problem(value: Any, kind: str) -> str | None:
 
 
 def _text_problem(value: Any, size: int) -> str | None:
-    """Explain why a value does not fit into a text field of this size in bytes, or return None."""
+    """Explain why a value does not fit into a text of ``size`` bytes, or return None."""
     if not isinstance(value, str):
         return f"must be a str of at most {size} bytes"
     try:

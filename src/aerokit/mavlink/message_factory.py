@@ -38,7 +38,7 @@ class MessageFactory(_MAVLink):
     """Number of messages sent, modulo 256. The link has its own sequence numbers."""
 
     def __init__(self, connection_send: Callable[[Any], object], source_system: int, source_component: int) -> None:
-        """Create a factory that passes messages to ``connection_send(message)``. The ids are kept as attributes."""
+        """Create a factory that passes messages to ``connection_send(message)``."""
         super().__init__(None, source_system, source_component)
         self._connection_send = connection_send
 
@@ -63,8 +63,9 @@ class MessageFactory(_MAVLink):
 
 
 def _accept_text(encode: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap an ``…_encode`` method of pymavlink, which accepts only bytes for text fields, so that it accepts `str`."""
+    """Wrap an ``…_encode`` method of pymavlink, so that it accepts `str` for text fields."""
 
+    # pymavlink accepts only bytes.
     @wraps(encode)
     def encode_text(self: MessageFactory, *args: Any, **kwargs: Any) -> Any:
         converted_args = [_as_bytes(value) for value in args]

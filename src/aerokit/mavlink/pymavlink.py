@@ -58,7 +58,6 @@ def from_pymavlink(message: Any, target_system: int | None = None) -> Message:
 
 
 def _class_of(message: Any) -> type[Message]:
-    """Return aerokit's class for a message of pymavlink, or of a similar library."""
     message_type: Any = type(message)
     # Classes of pymavlink have these attributes. For any other object, the message's name must be in the standard.
     if hasattr(message_type, "ordered_fieldnames") and hasattr(message_type, "crc_extra"):
@@ -84,7 +83,6 @@ def _counterpart(message_id: int, crc_extra: int, pymavlink_class: Any) -> type[
 
 # ----------------------------------------------------------------------------------------- values
 def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
-    """Return the arguments for ``message_class``. Extension fields that ``message`` does not have are omitted."""
     values = {}
     for field in message_class.FIELDS:
         name = field.name.rstrip("_")
@@ -99,7 +97,6 @@ def _values(message_class: type[Message], message: Any) -> dict[str, Any]:
 
 
 def _has(message: Any, name: str) -> bool:
-    """Return True if the message has a value for an extension field."""
     # hasattr() is not enough for pymavlink's messages. All their classes have an attribute ``id`` (the message id), but
     # ``id`` may also be the name of an extension field.
     if name in getattr(message, "__dict__", ()):
@@ -108,7 +105,6 @@ def _has(message: Any, name: str) -> bool:
 
 
 def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
-    """Convert a value of pymavlink to the type of aerokit's field."""
     if field.is_text:
         return _text(value)
     if field.type == "char" and isinstance(value, str):  # an array of `char` that carries bytes
@@ -125,7 +121,6 @@ def _converted(message_class: type[Message], field: Field, value: Any) -> Any:
 
 
 def _packed(message_class: type[Message], field: Field, items: list[Any]) -> bytes:
-    """Return the items of an array of uint8_t as bytes. InvalidArgument if an item is not a byte."""
     try:
         return bytes(items)
     except (TypeError, ValueError):
@@ -163,10 +158,8 @@ def _error(message_class: type[Message], field: Field, value: Any, problem: str)
 
 # ------------------------------------------------------------------------------------------ texts
 def _original_text(message: Any, name: str) -> Any:
-    """Return the value of a text field, as bytes if possible.
-
-    In the text of a received message, pymavlink replaces non-ASCII characters. It also stores the original bytes.
-    """
+    """Return the value of a text field, as bytes if possible."""
+    # In the text of a received message, pymavlink replaces non-ASCII characters. It also stores the original bytes.
     text = getattr(message, name)
     raw = getattr(message, f"_{name}_raw", None)
     if isinstance(raw, bytes) and text == raw.partition(b"\0")[0].decode("ascii", "replace"):
@@ -175,7 +168,7 @@ def _original_text(message: Any, name: str) -> Any:
 
 
 def _text(value: Any) -> Any:
-    """Convert a text to str without trailing NULs. Other values are returned for `Message.encode` to reject."""
+    """Convert a text to str without trailing NULs."""
     if isinstance(value, str):
         return value.rstrip("\0")
     if not isinstance(value, (bytes, bytearray, memoryview)):
@@ -229,7 +222,7 @@ def to_pymavlink(frame: Frame, *, dialect: ModuleType | None = None, timestamp: 
 
 @cache
 def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
-    """Return the decoder of the first pymavlink dialect that has the message and does not contradict the standard."""
+    """Return the decoder of the first pymavlink dialect that has the message."""
     row = STANDARD.rows.get(message_id)
     for module in _dialects(preferred):
         message_class = module.mavlink_map.get(message_id)
@@ -238,6 +231,7 @@ def _decoder(message_id: int, preferred: ModuleType | None) -> Decoder:
         if row is None:
             return _with_checksum_check(message_class, _decoder_for(message_class))
         crc_extra, *_ = row
+        # A dialect with another CRC_EXTRA contradicts the standard.
         if message_class.crc_extra == crc_extra:
             return _decoder_for(message_class)
     return _unknown
@@ -251,7 +245,6 @@ def _dialects(preferred: ModuleType | None) -> Any:
 
 
 def _decoder_for(message_class: Any) -> Decoder:
-    """Return the function that decodes frames of one message to objects of pymavlink. Made once for each message."""
     received_class = _received_class(message_class)
     unpack = message_class.unpacker.unpack_from
     length = HEADER_LENGTH + message_class.unpacker.size
@@ -318,10 +311,10 @@ class _Received:
         return value
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle and copy the message as an object of pymavlink's class."""
         names = (*LAZY_ATTRIBUTES, "_type", "_fieldnames", "_instance_field", "_instance_offset")
         state = {name: getattr(self, name) for name in (*names, "_signed", "_link_id", "_instances")}
         state.update((name, value) for name, value in self.__dict__.items() if name != "_frame")
+        # Messages are pickled and copied as objects of pymavlink's own class.
         return _restored, (self._decoded_class, state)
 
     def create_header(self) -> Any:
@@ -347,7 +340,6 @@ def _length_after_payload(frame: Frame) -> int:
 
 
 def _received_class(message_class: Any) -> Any:
-    """Create a subclass of a pymavlink class with the same name and attributes, for received messages."""
     return type(
         message_class.__name__,
         (_Received, message_class),

@@ -57,7 +57,7 @@ def render_enum_row(enum: EnumDefinition) -> str:
 
 
 def render_enum_stub(enum: EnumDefinition) -> str:
-    """Render the class of one enum for type checkers and editors, with a docstring for each member."""
+    """Render the class of one enum for type checkers and editors."""
     lines = [f"class {enum.class_name}({'IntFlag' if enum.bitmask else 'IntEnum'}):"]
     lines += _docstring(_enum_doc(enum), "    ")
     for name, entry in enum.members():
@@ -86,7 +86,6 @@ def _enum_doc(enum: EnumDefinition) -> list[str]:
 
 
 def _field_doc(field: FieldDefinition) -> str:
-    """Return the docstring of a field: its description, followed by type, unit and values."""
     parts = [_sentence(field.description)] if field.description else []
     if field.array_length:
         parts.append(f"Type: {field.type}[{field.array_length}].")
@@ -104,7 +103,6 @@ def _field_doc(field: FieldDefinition) -> str:
 
 
 def _entry_doc(entry: EntryDefinition) -> list[str]:
-    """Return the paragraphs of an enum entry's docstring."""
     paragraphs = [_sentence(entry.description)] if entry.description else []
     paragraphs += entry.remarks
     for index, label, units, text in entry.params:
@@ -119,7 +117,6 @@ def _sentence(text: str) -> str:
 
 
 def _docstring(paragraphs: Iterable[str], indent: str) -> list[str]:
-    """Return the lines of a docstring with these paragraphs."""
     texts = [text.replace("\\", "\\\\").replace('"""', "'''") for text in paragraphs if text]
     wrapped: list[str] = []
     for number, text in enumerate(texts):
@@ -146,7 +143,7 @@ def _render_tuple(name: str, items: list[str]) -> list[str]:
 
 
 def _filled(head: str, items: list[str], tail: str, indent: str) -> list[str]:
-    """Format items in brackets on one line. If they do not fit, break them into lines that are as full as possible."""
+    """Format items in brackets on one line, or on several if they do not fit."""
     single = f"{head}{', '.join(items)}{',' if len(items) == 1 else ''}{tail}"
     if len(single) <= _WIDTH:
         return [single]
@@ -167,7 +164,6 @@ def _field_row(field: FieldDefinition) -> str:
 
 
 def _struct_code(field: FieldDefinition) -> str:
-    """Return the part of a struct format for one field."""
     if field.type == "char" or (field.type == "uint8_t" and field.array_length):
         return f"{field.array_length or 1}s"
     return f"{field.array_length or ''}{STRUCT_CODES[field.type]}"
@@ -182,7 +178,7 @@ def _is_tuple(field: FieldDefinition) -> bool:
 
 
 def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
-    """Return the type of a field's attribute; with ``argument``, that of the constructor's argument."""
+    """Return the type of a field's attribute or, with ``argument``, of the constructor's argument."""
     if field.is_text:
         return "str"
     if field.is_bytes:
@@ -194,7 +190,7 @@ def _annotation(field: FieldDefinition, *, argument: bool = False) -> str:
 
 
 def _default(field: FieldDefinition) -> str:
-    """Return the default, as `` = value``, for a field that a program may omit; an empty text for other fields."""
+    """Return `` = value`` for a field that a program may omit, otherwise an empty text."""
     if field.default is not None:
         return f" = {field.default}"
     if not field.extension:
@@ -207,7 +203,6 @@ def _default(field: FieldDefinition) -> str:
 
 
 def _render_init(message: MessageDefinition) -> list[str]:
-    """Return the lines of a message's ``__init__`` method."""
     # In Python, a parameter without a default cannot follow one with a default, unless a "*" makes it keyword-only.
     arguments: list[str] = []
     optional = False
@@ -225,7 +220,6 @@ def _render_init(message: MessageDefinition) -> list[str]:
 
 
 def _render_decode(message: MessageDefinition) -> list[str]:
-    """Render ``decode_body``, which unpacks all fields in one statement, and then converts arrays and texts."""
     unpacked = f"_S{message.id}.unpack_from(body, {HEADER_LENGTH})"
     lines = [
         "    @classmethod",
@@ -256,7 +250,7 @@ def _render_decode(message: MessageDefinition) -> list[str]:
 
 
 def _render_decode_by_index(fields: Iterable[FieldDefinition], unpacked: str) -> list[str]:
-    """Render the statements that decode a message with long arrays: each array is a slice of the unpacked values."""
+    """Render the statements that decode a message with long arrays."""
     lines = [f"        values = {unpacked}"]
     index = 0
     for field in fields:
@@ -274,7 +268,6 @@ def _text_expression(value: str) -> str:
 
 
 def _render_encode(message: MessageDefinition) -> list[str]:
-    """Return the lines of a message's ``encode`` method."""
     arguments: list[str] = []
     for field in message.wire_fields:
         value = f"self.{field.attribute}"

@@ -41,7 +41,6 @@ class Standard(Protocol):
 
 
 def read_xml_dialect(path: str | Path, standard: Standard) -> LoadedDialect:
-    """Load an XML file with its includes; see `Dialect.from_xml`."""
     path = Path(path)
     dialects = read_dialect(path, [xml_folder()])
     definitions = [message for dialect in dialects for message in dialect.messages]
@@ -49,7 +48,6 @@ def read_xml_dialect(path: str | Path, standard: Standard) -> LoadedDialect:
 
 
 def read_pymavlink_dialect(module: str | ModuleType, standard: Standard) -> LoadedDialect:
-    """Load a pymavlink dialect; see `Dialect.from_pymavlink`."""
     if isinstance(module, str):
         module = _import(module)
     classes: dict[int, Any] | None = getattr(module, "mavlink_map", None)
@@ -73,8 +71,9 @@ def class_from_pymavlink(message_class: Any, standard: Standard) -> type[Message
 
 
 def compile_message(definition: MessageDefinition) -> type[Message]:
-    """Create a class like the generated classes. Its messages cannot be pickled, because no module has the class."""
+    """Create a class like the generated ones. Its messages cannot be pickled."""
     source = "from __future__ import annotations\n" + render_message(definition, docs=False)
+    # No module has the class, so pickle cannot find it.
     namespace: dict[str, Any] = {
         "__name__": f"{__name__}.{definition.origin}",
         "Struct": Struct,
@@ -94,12 +93,9 @@ def compile_message(definition: MessageDefinition) -> type[Message]:
 def _load(
     name: str, definitions: Iterable[MessageDefinition], enums: Iterable[EnumDefinition], standard: Standard
 ) -> LoadedDialect:
-    """Compile the messages and enums of a dialect. Messages equal to those of the standard use its classes.
-
-    Several files of a dialect may contain the same definition, but not different ones with the same id.
-    """
     by_id: dict[int, MessageDefinition] = {}
     for definition in definitions:
+        # Several files of a dialect may contain the same definition, but not different ones with the same id.
         earlier = by_id.setdefault(definition.id, definition)
         if earlier != definition and (earlier.name, earlier.crc_extra) != (definition.name, definition.crc_extra):
             raise InvalidArgument(
@@ -111,7 +107,6 @@ def _load(
 
 
 def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
-    """Create the enum class for a definition of this dialect."""
     members = [(member, entry.value) for member, entry in enum.members()]
     try:
         return make_enum(
@@ -127,12 +122,13 @@ def _enum_type(dialect: str, enum: EnumDefinition) -> type[Any]:
 
 
 def _standard_class(definition: MessageDefinition, standard: Standard) -> type[Message] | None:
-    """Return the generated class if the wire formats are the same; it may have more extensions than the definition."""
+    """Return the generated class if the wire formats are the same, otherwise None."""
     row = standard.rows.get(definition.id)
     if row is None or row[:2] != (definition.crc_extra, definition.base_length):
         return None
     generated = standard[definition.id]
     fields = [(field.attribute, field.type, field.array_length) for field in definition.fields]
+    # The generated class may have more extensions than the definition.
     generated_fields = [(field.name, field.type, field.array_length) for field in generated.FIELDS[: len(fields)]]
     return generated if definition.name == generated.NAME and generated_fields == fields else None
 
@@ -172,11 +168,10 @@ def _message_definition(cls: Any) -> MessageDefinition:
 
 
 def _with_extensions(definition: MessageDefinition, order: list[str], crc_extra: int) -> MessageDefinition:
-    """Return the definition with its extension fields marked. pymavlink's classes do not mark them.
-
-    Each possible number of base fields is tried, until CRC_EXTRA and the wire order match.
-    """
+    """Return the definition with its extension fields marked."""
     fields = definition.fields
+    # pymavlink's classes do not mark extensions. Each possible number of base fields is tried, until CRC_EXTRA and
+    # the wire order match.
     for base_count in range(len(fields), -1, -1):
         guess = MessageDefinition(
             definition.id,

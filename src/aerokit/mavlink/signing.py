@@ -45,12 +45,12 @@ AllowUnsigned = Callable[[Frame], bool]
 
 
 def timestamp_at(unix_time_s: float) -> int:
-    """Convert a time, in seconds since 1970, to a timestamp; 0 for times before 2015."""
+    """Convert a Unix time to a signing timestamp; 0 for times before 2015."""
     return max(0, int((unix_time_s - EPOCH_S) * TICKS_PER_S))
 
 
 def is_signed_with_a_key(frame: Frame) -> bool:
-    """Return True if a frame is signed with a real key. While PX4 has no key, it signs with zeros."""
+    # While PX4 has no key, it signs with zeros.
     raw = frame.raw
     return bool(frame.incompat_flags & SIGNED) and (
         sha256(_NO_KEY + raw[:-_HASH_LENGTH]).digest()[:_HASH_LENGTH] != raw[-_HASH_LENGTH:]
@@ -58,7 +58,7 @@ def is_signed_with_a_key(frame: Frame) -> bool:
 
 
 def _stream_and_timestamp(frame: Frame) -> tuple[tuple[int, int, int], int]:
-    """Return the stream (system id, component id, link id) and the timestamp of a signed frame."""
+    """Return (system id, component id, link id) and the timestamp of a signed frame."""
     link_id, *timestamp = frame.raw[-SIGNATURE_LENGTH:-_HASH_LENGTH]
     return (frame.system_id, frame.component_id, link_id), int.from_bytes(timestamp, "little")
 
@@ -249,14 +249,15 @@ class Signing:
         return self._refusal(frame, now) is None
 
     def _check_signature(self, frame: Frame, now: float) -> Refusal | None:
-        """Like `_refusal`, but store the timestamp of a valid signature, so that the frame cannot be replayed."""
+        """Like `_refusal`, but store the timestamp of a valid signature."""
         refusal = self._refusal(frame, now)
         if refusal is None:
+            # With the timestamp stored, the frame cannot be replayed.
             self._store_timestamp(*_stream_and_timestamp(frame))
         return refusal
 
     def _refusal(self, frame: Frame, now: float) -> Refusal | None:
-        """Return the reason why a frame has no valid signature; None if it has one. Has no side effects."""
+        """Return the reason why a frame has no valid signature; None if it has one."""
         if not frame.incompat_flags & SIGNED:
             return Refusal.UNSIGNED
         if not self.has_signed(frame):
@@ -320,12 +321,10 @@ class TimestampFile:
         self._write(self.timestamp)  # Fails at once if the file is not writable, rather than in flight.
 
     def reserve(self, timestamp: int, ahead: int) -> None:
-        """Ensure that the stored timestamp is later than ``timestamp``: if it is not, write ``timestamp + ahead``.
-
-        If writing fails, the next attempt follows only at ``timestamp + ahead``, because it may block the event loop.
-        """
+        """Ensure that the stored timestamp is later than ``timestamp``. If not, write ``timestamp + ahead``."""
         if timestamp < self.timestamp:
             return
+        # Writing may block the event loop, so the next attempt follows only at this time, even after a failure.
         self.timestamp = min(timestamp + ahead, self._maximum)
         try:
             self._write(self.timestamp)
@@ -337,7 +336,6 @@ class TimestampFile:
         write_atomically(self._path, f"{timestamp}\n")
 
     def _read(self) -> int:
-        """Return the stored timestamp; 0 if there is no file."""
         try:
             with self._path.open("rb") as file:
                 text = file.read(_MAX_LENGTH).decode("ascii", "replace")

@@ -124,7 +124,8 @@ class SourceStatistics(SourceFields):
         self._unreceived += count
 
     def _on_gap(self, ahead: int, now: float) -> None:
-        """Process a frame after ``ahead`` missing frames. Count these as lost; one that arrives late is subtracted."""
+        """Process a frame after ``ahead`` missing frames."""
+        # A frame that arrives late is subtracted again.
         self.lost += ahead
         if ahead > _MAX_GAP:  # The frame may belong to another stream.
             self._begin_stream(now)
@@ -157,10 +158,8 @@ class SourceStatistics(SourceFields):
         return was_missing
 
     def _on_repeated(self, sequence: int, now: float) -> int:
-        """Process a frame that is older than `expected`, but not lost. Return a result of :meth:`out_of_order`.
-
-        A single such frame is a repetition. Several with consecutive numbers show that the sender rebooted.
-        """
+        """Process a frame that is older than `expected`, but not lost. Return a result of :meth:`out_of_order`."""
+        # A single old frame is a repetition. Several with consecutive numbers show that the sender rebooted.
         follows = sequence == (self._repeated_sequence + 1) & 0xFF
         is_direct_succession = follows and self._received_at_repetition == self.received
         self._late_run = self._late_run + 1 if is_direct_succession else 0
@@ -185,24 +184,23 @@ class SourceStatistics(SourceFields):
         return OTHERS if self.has_duplicates(now) else LATE
 
     def _continue_at(self, sequence: int) -> None:
-        """Make this sequence number the newest, without counting the numbers before it as lost."""
+        """Make this sequence number the newest."""
+        # The numbers before it do not count as lost.
         self.skip((sequence - self.expected) & 0xFF)
         self.expected += 1
         self._missing_base = self.expected
         self._missing = self._skipped_over = 0
 
     def _continue_other(self, sequence: int, now: float) -> int:
-        """Process a frame that continues the other of two streams. Return `IN_ORDER`, `LATE` or `OTHERS`.
-
-        The other stream replaces the current stream at once if the current stream has timed out, or after
-        `_MIN_RETURNS` frames if the other stream has more frames than the current stream.
-        """
+        """Process a frame that continues the other of two streams. Return a result of :meth:`out_of_order`."""
         current_count = self.received - self._stream_start
         is_other_longer = self._other_count > current_count
         is_over = now - self._advanced_at > _STREAM_TIMEOUT_S
         self._count_alternation(now)
         if is_other_longer:
             self._returns += 1
+        # The other stream replaces the current one at once if that has timed out, or after `_MIN_RETURNS` frames if
+        # it has more frames than the current one.
         if is_over or self._returns >= _MIN_RETURNS:
             # A shorter stream takes over only because the current one has ended. The count of its frames then starts
             # again at 0.
@@ -223,7 +221,6 @@ class SourceStatistics(SourceFields):
         return LATE if is_other_longer else OTHERS
 
     def _swap(self, sequence: int, now: float, current_count: int, other_count: int) -> None:
-        """Swap the two streams: the other stream becomes the sender's stream, the current stream the other one."""
         # The gap before the current stream was no loss, so it is subtracted. Frames of the gap may have arrived late,
         # so the result could be negative without max().
         self.lost = max(0, self.lost - self._skipped_over)
@@ -235,7 +232,6 @@ class SourceStatistics(SourceFields):
         self._continue_at(sequence)
 
     def _count_alternation(self, now: float) -> None:
-        """Count an alternation between two streams. The count starts again if the last alternation is too old."""
         if now - self._alternated_at > _EXPIRY_S:
             self._alternations = 0
         self._alternations += 1
@@ -262,11 +258,9 @@ class SourceLimit:
         self._swept_at = -math.inf
 
     def join(self, statistics: FramerStatistics) -> None:
-        """Include the senders of these statistics in the limit."""
         self._statistics.add(statistics)
 
     def leave(self, statistics: FramerStatistics) -> None:
-        """Exclude the senders of these statistics from the limit, which frees their places."""
         self._statistics.discard(statistics)
         self.free += len(statistics.sources)
 

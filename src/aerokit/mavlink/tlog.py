@@ -45,7 +45,7 @@ _compiled: Any = None if wire is None else wire.tlog_records
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[float, bytes]]:
-    """Yield the records of a file. If garbage is found, the search continues with the next byte."""
+    """Yield the time, in seconds since 1970, and the frame of each record."""
     data = b""  # a part of the file
     begin: int = 0  # position of the next record in `data`
     end: int | None
@@ -99,7 +99,8 @@ def _record_end(data: bytes, begin: int, min_time: int) -> int | None:
 
 
 def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
-    """Return True if a true record begins between ``begin`` and ``end``: it ends after ``end``, before another one."""
+    """Return True if a true record begins between ``begin`` and ``end``."""
+    # A true record ends after `end`, before another one.
     for inside in range(begin + 1, end):
         true_end = _frame_end(data, inside)
         if true_end is not None and true_end > end and _frame_end(data, true_end) is not None:
@@ -108,7 +109,7 @@ def _looks_shifted(data: bytes, begin: int, end: int) -> bool:
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
-    """Return the end of a frame according to its header, which may be beyond the data. None if there is no header."""
+    """Return the end of a frame according to its header; None if there is no header."""
     start = begin + 8  # The frame follows the time, which has 8 bytes.
     if len(data) - start < 3 or data[start] not in _MAGICS or _TIME.unpack_from(data, begin)[0] > _LAST_TIME:
         return None

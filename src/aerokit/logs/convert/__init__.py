@@ -144,7 +144,7 @@ def _writer_for(target: Path, table_format: str) -> Callable[[Path, LogReader], 
 
 
 def _write_records(log: LogReader, writer: _Writer, on_bytes: Callable[[int], object]) -> tuple[int, float, float, int]:
-    """Write all records of a log. Return their number, the first and the latest time, and the writer's ``written``."""
+    """Write all records. Return their number, the first and the latest time, and ``writer.written``."""
     entries, begins_at, ends_at = 0, 0.0, 0.0
     try:
         for entry in log.entries(on_bytes):
@@ -169,7 +169,7 @@ def _progress_callback(source: Path, on_progress: OnProgress | None) -> Callable
 
 
 def _move(complete: Path, target: Path) -> int:
-    """Flush the complete files to disk and move them to their final names. Return their total size."""
+    """Move complete files to their final names. Return their total size in bytes."""
     files = sorted(complete.iterdir()) if complete.is_dir() else [complete]
     for file in files:
         # Without fsync, a power failure could leave an empty file under the final name. Windows needs a writable file.

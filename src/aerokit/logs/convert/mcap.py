@@ -35,7 +35,6 @@ class McapWriter:
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
-        """Write a record, and the states that it changes."""
         message, system_id = record.message, record.system_id
         if message is not None:
             message_class = STANDARD[message.ID]
@@ -60,7 +59,6 @@ class McapWriter:
         self._file.close()
 
     def _write_states(self, record: LogRecord) -> None:
-        """Write the changed states, and Foxglove's topics that depend on them: log, location, transform and pose."""
         system_id, unix_s = record.system_id, record.unix_s
         latest = self._latest.setdefault(system_id, {})
         for state, value in record.states:
@@ -98,7 +96,6 @@ class McapWriter:
         self._put(unix_s, name, fields, lambda: Topic(name, schema))
 
     def _put(self, unix_s: float, name: str, fields: Mapping[str, Any], make_topic: Callable[[], Topic]) -> None:
-        """Add a message to a topic. The topic is registered with its first message."""
         channel = self._channels.get(name)
         if channel is None:
             channel = self._register(make_topic())
@@ -108,7 +105,7 @@ class McapWriter:
         self.written += 1
 
     def _register(self, topic: Topic) -> int:
-        """Register a channel for a topic; return the channel's id. A schema of several topics is registered once."""
+        """Register a channel for the topic, and return the channel's id."""
         data = topics.encoded(topic.schema)
         schema = self._schemas.get(data)
         if schema is None:

@@ -85,7 +85,6 @@ class CsvTable:
         self._number_format = ",".join(["%s", *["%r"] * (len(columns) - 1)]) + "\n"
 
     def add(self, unix_s: float, values: Sequence[Any]) -> None:
-        """Add a row. The time is written as ISO 8601 in UTC with microseconds."""
         # Most values are numbers, for which a call of _csv_cell would be slow. `value == value` is False for NaN.
         cells = [value if type(value) in _NUMBER_TYPES and value == value else _csv_cell(value) for value in values]
         self._writer.writerow([_iso_time(unix_s), *cells])
@@ -93,7 +92,7 @@ class CsvTable:
             self._flush()
 
     def add_numbers(self, unix_s: float, numbers: Sequence[float]) -> None:
-        """Add a row of ints and floats. Writes the same line as :meth:`add`, but twice as fast."""
+        """Like :meth:`add` for ints and floats, but twice as fast."""
         line = self._number_format % (_iso_time(unix_s), *numbers)
         if "nan" in line:  # A number is NaN, which becomes an empty cell.
             self.add(unix_s, numbers)
@@ -179,7 +178,6 @@ class FlightTableWriter:
         self._log = log
 
     def write(self, record: LogRecord) -> None:
-        """Store the record's states as the newest of its vehicle, and add a row if one of them is the position."""
         if not record.states:
             return
         latest = self._latest.setdefault(record.system_id, {})
@@ -210,13 +208,11 @@ class MessageTablesWriter:
         self.written: int = 0
 
     def write(self, record: LogRecord) -> None:
-        """Add a row to the table of a record."""
         add_row, make_row = self._converters.get(record.table) or self._open_table(record)
         add_row(record.unix_s, make_row(record))
         self.written += 1
 
     def _open_table(self, record: LogRecord) -> tuple[_AddRow, _MakeRow]:
-        """Create the table for records of this type, and return its two functions."""
         columns = self._log.columns(record)
         # The log is untrusted input, so all but letters, digits, "_" and "-" are replaced in the file name.
         name = re.sub(r"[^\w-]", "_", record.table) + self._kind.SUFFIX
@@ -280,7 +276,6 @@ def _row_maker(columns: Sequence[TableColumn], record: LogRecord) -> _MakeRow:
 
 
 def _cell(value: Any) -> Any:
-    """Convert a value for a table: bytes become hexadecimal digits, and a list becomes a string."""
     if isinstance(value, bytes):
         return value.hex()
     is_array = hasattr(value, "typecode")
@@ -292,10 +287,7 @@ def _first(values: Sequence[Any]) -> Any:
 
 
 def _value_getter(path: str) -> Callable[[dict[str, Any]], Any]:
-    """Return a function that gets the value at a path such as ``batteries.0.voltage_v`` from states.
-
-    The returned function returns None for unknown values.
-    """
+    """Return a function that looks up a path such as ``batteries.0.voltage_v``. It returns None for unknown values."""
     state, *steps = path.split(".")
 
     def get_value(latest: dict[str, Any]) -> Any:

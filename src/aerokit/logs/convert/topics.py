@@ -106,13 +106,13 @@ class MapFrame:
     def east_north_up_m(self, position: Position) -> tuple[float, float, float]:
         """Convert a position to metres east, north and up of the origin.
 
-        The origin has the latitude and longitude of the first position, and the altitude of home. The latter
-        is computed from the first position that has an altitude above sea level; an unknown height above home counts as
-        0. Without an altitude above sea level, the height above home is returned as the metres up.
+        The origin is the first position, at the altitude of home.
         """
         altitude, relative_m = position.altitude_amsl_m, position.altitude_relative_m or 0.0
         if self._origin is None:
             self._origin = position.latitude_deg, position.longitude_deg
+        # The altitude of home is computed from the first position that has an altitude above sea level. An unknown
+        # height above home counts as 0.
         if self._origin_amsl_m is None and altitude is not None:
             self._origin_amsl_m = altitude - relative_m
         up = relative_m if altitude is None or self._origin_amsl_m is None else altitude - self._origin_amsl_m
@@ -130,7 +130,6 @@ def frame_of(system_id: int) -> str:
 
 
 def state_topic(system_id: int, name: str, value: object) -> Topic:
-    """Return the topic of a state, such as ``/vehicle/1/attitude``, with the schema of this value."""
     schema = _schema_of(value)
     if schema.get("type") != "object":
         schema = {"type": "object", "properties": {"value": schema}}
@@ -138,7 +137,6 @@ def state_topic(system_id: int, name: str, value: object) -> Topic:
 
 
 def raw_topic(system_id: int, component_id: int, message: type[Message]) -> Topic:
-    """Return the topic of a MAVLink message, such as ``/mavlink/1/1/GPS_RAW_INT``. Its schema has the units."""
     properties: dict[str, Any] = {}
     for field in message.FIELDS:
         if field.name in SECRET_FIELDS:
@@ -172,7 +170,7 @@ def encoded(fields: Mapping[str, Any]) -> bytes:
 
 
 def state_fields(value: object) -> dict[str, Any]:
-    """Return the message of a state: its fields or, for a number, string or list, ``{"value": …}``."""
+    """Return the fields of a state. A number, text or list becomes ``{"value": …}``."""
     if isinstance(value, Snapshot):
         return {name: _plain(getattr(value, name)) for name in value.__match_args__}
     converted = to_jsonable(value)
@@ -180,15 +178,13 @@ def state_fields(value: object) -> dict[str, Any]:
 
 
 def raw_fields(message: Message) -> dict[str, Any]:
-    """Return the fields of a MAVLink message in raw units, except fields with secrets, such as passwords."""
+    """Return the fields of a message in raw units, without secrets such as passwords."""
     return {name: _plain(getattr(message, name)) for name in field_names(message) if name not in SECRET_FIELDS}
 
 
 def _plain(value: object) -> Any:
-    """Convert a value like `aerokit._internal.formatting.to_jsonable`.
-
-    For common types this is three times as fast, which matters because logs have millions of values.
-    """
+    """Like `aerokit._internal.formatting.to_jsonable`, but three times as fast for common types."""
+    # Logs have millions of values, so this function must be fast.
     kind = type(value)
     if kind is int or kind is str or value is None:
         return value
@@ -204,7 +200,7 @@ def location_fix(
     heading_deg: float | None = None,
     velocity: Velocity | None = None,
 ) -> dict[str, Any]:
-    """Return a ``foxglove.LocationFix``. The altitude is above mean sea level; 0 if it is unknown."""
+    """Return a ``foxglove.LocationFix``."""
     fix: dict[str, Any] = {
         "timestamp": _time(unix_s),
         "frame_id": frame_of(system_id),
@@ -242,7 +238,8 @@ def pose_in_frame(unix_s: float, east_north_up_m: Sequence[float], attitude: Att
 
 
 def log_entry(unix_s: float, system_id: int, text: StatusText) -> dict[str, Any]:
-    """Return a ``foxglove.Log`` for a status text; the level is 0 (unknown) if the log has no severity."""
+    """Return a ``foxglove.Log``."""
+    # Some logs have no severity. Level 0 means unknown.
     severity: int | None = text.severity
     level = 0
     if severity is not None and 0 <= severity < len(_FOXGLOVE_LEVELS):
@@ -267,20 +264,17 @@ def _vector(x: float, y: float, z: float) -> dict[str, float]:
 
 
 def _rotation(attitude: Attitude | None) -> dict[str, float]:
-    """Return the rotation of a body frame (forward, left, up) in the map frame (east, north, up) as a quaternion.
-
-    MAVLink's quaternion relates the axes forward, right, down to the axes north, east, down. Both changes of axes are
-    rotations by 180°, so each component of the result is a sum or difference of two of MAVLink's components.
-    """
+    """Return the quaternion of a body frame (forward, left, up) in the map frame (east, north, up)."""
     w, x, y, z = 1.0, 0.0, 0.0, 0.0
     if attitude is not None and all(map(math.isfinite, (attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg))):
         w, x, y, z = attitude.quaternion
+    # MAVLink's quaternion relates the axes forward, right, down to the axes north, east, down. Both changes of axes
+    # are rotations by 180°, so each component of the result is a sum or difference of two of MAVLink's components.
     half = math.sqrt(0.5)
     return {"x": half * (x + y), "y": half * (x - y), "z": half * (w - z), "w": half * (w + z)}
 
 
 def _schema_of(value: object) -> dict[str, Any]:
-    """Return the JSON schema of a value after its conversion to JSON. A field that is None gets the annotated type."""
     if isinstance(value, Snapshot):
         annotations = _annotations(type(value))
         fields = value.to_dict()
@@ -301,7 +295,6 @@ def _schema_of(value: object) -> dict[str, Any]:
 
 
 def _annotations(value_class: type) -> dict[str, str]:
-    """Return the annotations of a class and its bases."""
     annotations: dict[str, str] = {}
     for base in reversed(value_class.__mro__):
         annotations.update(inspect.get_annotations(base))
@@ -309,6 +302,5 @@ def _annotations(value_class: type) -> dict[str, str]:
 
 
 def _schema_of_annotation(annotation: str) -> dict[str, Any]:
-    """Return the JSON schema of a type annotation, such as ``"float | None"``."""
     json_type = _JSON_TYPES.get(annotation.partition(" | ")[0])
     return {} if json_type is None else {"type": json_type}

@@ -75,27 +75,26 @@ class _TrackWriter:
         self._path.write_text(self._text(), encoding="utf-8")
 
     def _record_mission(self, record: LogRecord) -> None:
-        """Store a mission for its sender and its receiver; which of them is a vehicle may be known only later."""
         message: Any = record.message
+        # Which of sender and receiver is a vehicle may be known only later.
         for system_id in {record.system_id, message.target_system}:
             if system_id not in self._missions:
                 self._missions[system_id] = RecordedMission(system_id)
             self._missions[system_id].add(record.unix_s, message)
 
     def _waypoints(self, system_id: int) -> list[Waypoint]:
-        """Return the last mission of a vehicle without the items that have no valid position. NaN is not valid."""
         if system_id not in self._missions:
             return []
         return [
             waypoint
             for waypoint in self._missions[system_id].waypoints
+            # These comparisons are False for NaN.
             if abs(waypoint.latitude_deg) <= 90
             and abs(waypoint.longitude_deg) <= 180
             and math.isfinite(waypoint.altitude_m)
         ]
 
     def _text(self) -> str:
-        """Return the content of the file."""
         raise NotImplementedError
 
 

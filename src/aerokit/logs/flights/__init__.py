@@ -58,7 +58,7 @@ _SAME_ALTITUDE_M = 5.0  # Two logged altitudes that differ by at most this count
 
 
 def check_log_name(path: Path) -> None:
-    """Raise FileFormatError if the name of the file does not have the suffix of a flight log."""
+    """Raise FileFormatError if the suffix of the name is not supported."""
     if path.suffix.lower() not in LOG_READERS:
         raise FileFormatError(f"{path} is not a flight log; supported suffixes: {', '.join(LOG_READERS)}")
 
@@ -98,7 +98,7 @@ def read_flight(
 
 
 def _complete(flight: FlightLog) -> None:
-    """Complete the flight once the whole log is read: end open time spans, and compute home, heights and failsafes."""
+    """Compute home, heights and failsafe evidence after the whole log is read."""
     _, last_disarmed_s = flight.armed[-1] if flight.armed else (0.0, 0.0)
     is_armed_at_end = math.isinf(last_disarmed_s)
     flight.set_armed(flight.duration_s, armed=False)  # ends an open span
@@ -118,7 +118,6 @@ def _complete(flight: FlightLog) -> None:
 
 
 def _armed_at_end_note(flight: FlightLog) -> str:
-    """Return a note that the log ends while the vehicle is armed, with its last state unless it is near the ground."""
     note = "the log ends while the vehicle is armed"
     is_silent = bool(flight.silences) and flight.silences[-1].ends_s >= flight.duration_s
     heard_s = flight.silences[-1].begins_s if is_silent else flight.duration_s
@@ -136,10 +135,6 @@ def _armed_at_end_note(flight: FlightLog) -> str:
 
 
 def _complete_altitudes(flight: FlightLog) -> None:
-    """Derive missing heights above home from altitudes above sea level, and correct rows in which both are the same.
-
-    While ArduPilot does not know one of the two altitudes, it logs the other one for both.
-    """
     home_amsl_m = flight.home.altitude_amsl_m if flight.home is not None else None
     if home_amsl_m is None:
         return
@@ -149,6 +144,7 @@ def _complete_altitudes(flight: FlightLog) -> None:
             amsl_m = amsl[row]
             if math.isnan(relative_m):
                 relative[row] = amsl_m - home_amsl_m
+            # While ArduPilot does not know one of the two altitudes, it logs the other one for both.
             # Unless home is near sea level, the two altitudes must differ. If they do not, the log has the same
             # altitude in both columns.
             elif abs(home_amsl_m) > _SAME_ALTITUDE_M and abs(relative_m - amsl_m) < _SAME_ALTITUDE_M:

@@ -143,12 +143,13 @@ def error_text(subsystem: int, code: int, text: str) -> str:
 
 
 def clean_text(text: str) -> str:
-    """Remove terminal control sequences and surrounding white space; PX4 ends status texts with a tab."""
+    """Remove terminal control sequences and surrounding white space."""
+    # PX4 ends status texts with a tab.
     return _CONTROL_CHARACTERS.sub("", text).strip()
 
 
 def ardupilot_system_id(parameters: Mapping[str, float]) -> int:
-    """Return the system id that is among ArduPilot's parameters; 1, the default, if none is or it is invalid."""
+    """Return the system id among the parameters. It is 1, ArduPilot's default, if it is missing or invalid."""
     system_id = parameters.get("MAV_SYSID", parameters.get("SYSID_THISMAV", 1))  # renamed in 4.7
     return int(system_id) if 1 <= system_id <= 255 else 1
 
@@ -223,7 +224,7 @@ _ACTIONS: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def failsafe_action(vehicle: str, parameter: str, value: float) -> str:
-    """Return the meaning of a failsafe parameter's value; empty if unknown. ``vehicle`` names the firmware."""
+    """Return the meaning of a failsafe parameter's value; empty if unknown."""
     firmware = next((firmware for firmware in _ACTIONS if firmware in vehicle), "")
     gcs_meanings = GCS_FAILSAFE_ACTIONS.get(firmware, {}).get(parameter)
     if gcs_meanings is not None:

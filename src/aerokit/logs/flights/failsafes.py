@@ -114,7 +114,6 @@ _LIMIT_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
-    """Return the evidence of failsafes that status texts contain."""
     evidence = []
     for text in texts:
         kind = failsafe_kind(text.text)
@@ -125,7 +124,7 @@ def evidence_in_texts(texts: Iterable[LoggedText]) -> list[FailsafeEvidence]:
 
 
 def evidence_in_fixes(flight: FlightLog) -> list[FailsafeEvidence]:
-    """Return evidence for each time at which a satellite receiver lost its 3D fix."""
+    """Return evidence for each loss of a 3D fix."""
     evidence = []
     for number, gps in flight.gps.items():
         had_fix, satellites_before = False, math.nan
@@ -174,7 +173,6 @@ def failsafes(flight: FlightLog) -> list[Failsafe]:
 
 
 def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -> bool:
-    """Return True if evidence belongs to the same failsafe as an earlier group of evidence."""
     group_kind, gap_s = _kind_of(group), evidence.time_s - group[-1].time_s
     if "general" in (group_kind, evidence.kind):
         # Without satellites, autopilots continue with dead reckoning before they react. PX4 announces "entering Hold
@@ -187,12 +185,10 @@ def _belongs_to(evidence: FailsafeEvidence, group: Sequence[FailsafeEvidence]) -
 
 
 def _kind_of(group: Sequence[FailsafeEvidence]) -> str:
-    """Return the first specific kind in a group of evidence; "general" if there is none."""
     return next((evidence.kind for evidence in group if evidence.kind != "general"), "general")
 
 
 def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_of_kind: bool) -> Failsafe:
-    """Return the failsafe for a group of evidence, with the reaction and the facts that explain it."""
     kind, time_s = _kind_of(group), group[0].time_s
     reaction, is_sure = _reaction(flight, time_s, group)
     acted = is_sure or any(evidence.is_action for evidence in group)
@@ -208,12 +204,9 @@ def _explain(flight: FlightLog, group: Sequence[FailsafeEvidence], *, is_first_o
 
 
 def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence]) -> tuple[str, bool]:
-    """Return a description of the reaction to a failsafe, and True if the reaction is the autopilot's.
+    """Return a description of the reaction, and True if it is the autopilot's.
 
-    The reaction is the first mode change that was not commanded or, without one, disarming. If the log does not contain
-    the cause of the change, an immediate change is attributed to the autopilot; a later change may be the pilot's.
-    Disarming is attributed to the autopilot only after evidence of a crash. Without a reaction, the text is empty.
-    ``time_s`` is the time of the first evidence in ``group``.
+    The description is empty if there was no reaction. ``time_s`` is the time of the first evidence in ``group``.
     """
     last_s = group[-1].time_s
     for change in flight.modes:
@@ -223,6 +216,8 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
         was_commanded = change.by_autopilot is False  # `by_autopilot` is None if the log does not contain the cause
         previous_mode = flight.mode_at(change.time_s - 1e-6)
         if is_near and was_armed and not was_commanded and previous_mode:
+            # If the cause is not in the log, an immediate change counts as the autopilot's. A later change may be the
+            # pilot's.
             is_sure = change.by_autopilot is True or change.time_s - last_s <= _AUTOPILOT_REACTION_S
             cause = "" if is_sure else "; cause not logged"
             return _mode_change_text(change, previous_mode, time_s) + cause, is_sure
@@ -230,6 +225,7 @@ def _reaction(flight: FlightLog, time_s: float, group: Sequence[FailsafeEvidence
     disarmed_s = next((end for _, end in flight.armed if time_s - _EARLY_DISARMING_S <= end <= until_s), None)
     # If the log ends while the vehicle is armed, the last time in `flight.armed` is the end of the log.
     if disarmed_s is not None and disarmed_s < flight.duration_s:
+        # Disarming counts as the autopilot's reaction only after evidence of a crash.
         is_sure = _kind_of(group) in CRASH_KINDS
         cause = "" if is_sure else "; cause not logged"
         return f"disarmed {max(disarmed_s - time_s, 0):.1f} s later{cause}", is_sure
@@ -244,7 +240,6 @@ def _mode_change_text(change: ModeChange, previous_mode: str, time_s: float) -> 
 
 
 def _location(flight: FlightLog, time_s: float) -> list[str]:
-    """Return a list with one text about height, distance and mode; an empty list if all three are unknown."""
     facts = []
     height = flight.track.at("altitude_relative_m", time_s)
     if not math.isnan(height):
@@ -259,7 +254,6 @@ def _location(flight: FlightLog, time_s: float) -> list[str]:
 
 
 def distance_from_home_m(flight: FlightLog, time_s: float) -> float | None:
-    """Return the horizontal distance from home at this time; None if unknown."""
     latitude, longitude = flight.track.at("latitude_deg", time_s), flight.track.at("longitude_deg", time_s)
     if flight.home is None or math.isnan(latitude):
         return None
@@ -420,7 +414,7 @@ def _missing_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 
 def failsafe_parameters(flight: FlightLog, kind: str) -> list[str]:
-    """Return names of parameters for this kind of failsafe. If the autopilot is unknown, those of every autopilot."""
+    """Return the names of the parameters that configure this kind of failsafe."""
     names = _LIMIT_PARAMETERS.get(kind, ())
     if flight.autopilot == "PX4":
         return [name for name in names if name.startswith(_PX4_PREFIXES)]
@@ -430,6 +424,5 @@ def failsafe_parameters(flight: FlightLog, kind: str) -> list[str]:
 
 
 def _texts_before(flight: FlightLog, time_s: float) -> list[str]:
-    """Return the last four status texts of the 15 s before a failsafe, without the text that reports it."""
     texts = [text for text in flight.texts if time_s - 15 <= text.time_s < time_s - 0.05]
     return [f"text {time_s - text.time_s:.1f} s before: {text.text}" for text in texts[-4:]]

@@ -132,10 +132,7 @@ def _fall(flight: FlightLog, begin_s: float, end_s: float, sink_m_s: float, has_
 
 
 def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
-    """Return True if all heights that are logged in the next 30 s, or until disarming, are about ``height_m``.
-
-    A vehicle above `_NEAR_HOME_HEIGHT_M` must also be disarmed in these 30 s, because it may otherwise be hovering.
-    """
+    """Return True if all heights of the next 30 s, or until disarming, are about ``height_m``."""
     disarmed_s = next((end for begin, end in flight.armed if begin <= time_s < end), time_s)
     until_s = min(disarmed_s, time_s + _DISARM_TIMEOUT_S)
     was_disarmed = disarmed_s <= until_s and disarmed_s < flight.duration_s  # an armed span also ends with the log
@@ -146,7 +143,6 @@ def _stays_at_height(flight: FlightLog, time_s: float, height_m: float) -> bool:
 
 
 def _reasons(flight: FlightLog, begin_s: float, end_s: float) -> list[str]:
-    """Return the log's evidence of a fall: disarming in the air, and status texts."""
     earliest_s = begin_s - _REASON_BEFORE_S
     reasons = [
         "disarmed in the air"

@@ -110,7 +110,6 @@ class TangentPlane:
         return (latitude_deg - self.latitude_deg) * self.north_m_per_deg, east_deg * self.east_m_per_deg
 
     def degrees(self, north_m: float, east_m: float) -> tuple[float, float]:
-        """Convert metres north and east of the origin to latitude and longitude."""
         return (
             self.latitude_deg + north_m / self.north_m_per_deg,
             self.longitude_deg + east_m / self.east_m_per_deg,
@@ -118,7 +117,7 @@ class TangentPlane:
 
 
 def battery_name(number: int) -> str:
-    """Return the name of a battery to display. Names count from 1, as ArduPilot's status texts and parameters do."""
+    # Names count from 1, as ArduPilot's status texts and parameters do.
     return f"battery {number + 1}"
 
 

@@ -13,7 +13,7 @@ from aerokit._internal.geo import check_place
 from aerokit._internal.values import Snapshot
 from aerokit.errors import FileFormatError
 from aerokit.logs.flights.codes import ardupilot_system_id, clean_text, skipped_rows_note
-from aerokit.logs.flights.from_ulog import utc_at_boot
+from aerokit.logs.flights.from_ulog import load_ulog, severity_of, utc_at_boot
 from aerokit.logs.flights.records import LogReader, LogRecord, TableColumn, name_with_unit
 from aerokit.position import Position
 from aerokit.vehicle.state.condition import StatusText
@@ -76,7 +76,6 @@ class _RowReader(LogReader):
     _skipped = 0  # the number of damaged rows
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
-        """Return the columns of a table from its first record, with units if the log has them."""
         return [
             TableColumn(
                 name_with_unit(name, self._unit(entry.table, name)),
@@ -115,7 +114,7 @@ def _column_kind(value: object) -> str:
 
 
 def _position(latitude: float, longitude: float, amsl_m: float | None, relative_m: float | None) -> Position | None:
-    """Create a position; None for impossible values, which estimators report before they work or if they fail."""
+    # Estimators report impossible positions before they work, and when they fail.
     try:
         check_place(latitude, longitude)
         position = Position(latitude, longitude, amsl_m, relative_m)
@@ -134,7 +133,6 @@ class BinReader(_RowReader):
     _reader: Any = None
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all records except those that describe formats. Values are multiplied by the factors of the formats."""
         self._reader = opened_bin(self.path)
         try:
             yield from self._rows(self._reader, on_bytes)
@@ -142,10 +140,6 @@ class BinReader(_RowReader):
             close_bin(self._reader)
 
     def _rows(self, reader: Any, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield a record for each row, except descriptions of tables and rows with an implausible time.
-
-        Report the progress to ``on_bytes``.
-        """
         count = 0
         system_id = _bin_system_id(reader)
         while (message := self._next(reader)) is not None:
@@ -187,7 +181,7 @@ class BinReader(_RowReader):
 
 
 def _bin_system_id(reader: Any) -> int:
-    """Return the system id according to the first logged value of its parameter. Then the reader is at the start."""
+    """Return the system id among the logged parameters, and rewind the reader."""
     parameters: dict[str, float] = {}
     with suppress(Exception), redirect_stdout(sys.stderr):  # `_next` reports damage
         while (row := reader.recv_match(type=["PARM"])) is not None:
@@ -197,7 +191,6 @@ def _bin_system_id(reader: Any) -> int:
 
 
 def _ardupilot_states(table: str, fields: Mapping[str, Any], reader: Any) -> States:
-    """Return the names and values of the states that a row changes."""
     decode = _ARDUPILOT.get(table)
     try:
         return () if decode is None else decode(fields, reader)
@@ -214,7 +207,7 @@ def _ardupilot_attitude(fields: Mapping[str, Any], _: Any) -> States:
 
 
 def _finite_or_none(value: float) -> float | None:
-    """Convert NaN, which batteries without a sensor have, to None."""
+    # Batteries without a sensor have NaN.
     return value if math.isfinite(value) else None
 
 
@@ -257,14 +250,8 @@ class UlogReader(_RowReader):
     """Reads a ``.ulg`` of PX4 with pyulog, which loads the whole log into memory."""
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield the rows of all topics and the logged texts, ordered by time, except those with an implausible time."""
-        pyulog = import_module("pyulog")
-        # pyulog prints to stdout, which may be for JSON.
-        with self.path.open("rb") as file, redirect_stdout(sys.stderr):
-            try:
-                log = pyulog.ULog(file)
-            except Exception as error:  # pyulog raises arbitrary errors for other files
-                raise FileFormatError(f"{self.path} is not a PX4 log: {error}") from error
+        with self.path.open("rb") as file:
+            log = load_ulog(file, self.path)
         if log.file_corruption:
             self.notes.append("the log is damaged: the readable part was converted")
         if not log.data_list:
@@ -310,11 +297,8 @@ def _rows(data: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
 
 
 def _texts(log: Any) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """Yield the logged status texts as rows of a table, like `_rows`."""
     for text in log.logged_messages:
-        # `log_level` is the ASCII code of a digit: 54 ("6") is info. MAV_SEVERITY has the numbers of the Linux kernel.
-        severity = max(0, min(7, int(text.log_level) - ord("0")))
-        yield text.timestamp, "logged_messages", {"severity": severity, "message": text.message}
+        yield text.timestamp, "logged_messages", {"severity": severity_of(text), "message": text.message}
 
 
 class _Px4States:
@@ -324,7 +308,6 @@ class _Px4States:
         self._home_amsl_m: float | None = None
 
     def states(self, table: str, row: Mapping[str, Any]) -> States:
-        """Return the names and values of the states that a row changes."""
         try:
             return self._states(table, row)
         except KeyError:  # the field has another name in this version of PX4

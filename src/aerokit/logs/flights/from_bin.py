@@ -93,7 +93,6 @@ class _Tables:
         return float(getattr(self._reader.clock, "timebase", 0.0) or 0.0)
 
     def has(self, table: str, *columns: str) -> bool:
-        """Return True if the log has rows of this table, and the table has these columns."""
         number = self._reader.name_to_id.get(table)
         if number is None or not len(self._reader.offsets[number]):
             return False
@@ -116,7 +115,7 @@ class _Tables:
         return times_and_columns
 
     def _chunks(self, table: str, columns: Sequence[str]) -> Iterator[list[list[Any]]]:
-        """Yield the times and the columns of up to `_CHUNK_ROWS` rows at a time; nothing if a column is missing."""
+        """Yield the times and the columns of up to `_CHUNK_ROWS` rows at a time."""
         if not self.has(table, *columns):
             return
         reader = self._reader
@@ -148,10 +147,7 @@ class _Tables:
             yield [times, *values]
 
     def _is_plausible(self, times: Sequence[float], row: int) -> bool:
-        """Return False if a row's time is after the end of the log, or out of order between two rows in order.
-
-        Rows have no checksum. One wrong time would move all later rows of a `TimeSeries`.
-        """
+        # Rows have no checksum. One wrong time would move all later rows of a `TimeSeries`.
         time = times[row]
         before = times[row - 1] if row else time
         after = times[row + 1] if row + 1 < len(times) else time
@@ -159,7 +155,6 @@ class _Tables:
         return time <= self._max_s and not (is_outlier and 0.0 <= before <= after + _MAX_DISORDER_S)
 
     def _first_time(self) -> int:
-        """Return the time of the first row in the file, which may be in any table."""
         # The order is that of the positions in the file. The lowest time could be that of a damaged row.
         first_rows = list(self._rows_at(0))
         if not first_rows:
@@ -212,7 +207,6 @@ def _scaled(values: Sequence[Any], scale: float | None) -> list[Any]:
 
 
 def _wrapped(angles: Sequence[float]) -> list[float]:
-    """Wrap angles to -180 to 180 degrees."""
     return [(angle + 180) % 360 - 180 for angle in angles]
 
 
@@ -223,7 +217,6 @@ class _Reader:
         self._flight, self._tables = flight, tables
 
     def read(self, on_share: Callable[[float], object]) -> None:
-        """Read all tables. ``on_share`` is called with the share of the work that is done, from 0 to 1."""
         flight, tables = self._flight, self._tables
         flight.autopilot = "ArduPilot"
         flight.begins_at = tables.unix_at_0 + tables.began_us / 1e6
@@ -330,7 +323,7 @@ class _Reader:
         self._flight.attitude_target.extend(times, roll_deg=roll, pitch_deg=pitch, yaw_deg=_wrapped(yaw))
 
     def _read_targets(self) -> None:
-        """Read the set-points of position and velocity. The log has positions relative to the estimator's origin."""
+        # The log has positions relative to the estimator's origin.
         origin = self._origin()
         plane = None if origin is None else TangentPlane(*origin)
         east = TimeSeries("m", "m_s")
@@ -348,14 +341,11 @@ class _Reader:
         self._add_heights(self._tables.rows("CTUN", "DAlt"))
 
     def _add_heights(self, heights: Iterator[tuple[Any, ...]]) -> None:
-        """Write height set-points into the rows of the position set-points, which are logged at the same rate.
-
-        If there are no position set-points, new rows are added.
-        """
         target = self._flight.position_target
         has_positions = len(target) > 0
         relative = target["altitude_relative_m"]
         for time, height in heights:
+            # Both set-points are logged at the same rate, so each height has a row.
             if has_positions:
                 row = max(target.index_at(time), 0)
                 relative[row] = height
@@ -363,7 +353,6 @@ class _Reader:
                 target.add(time, NAN, NAN, NAN, height)
 
     def _origin(self) -> tuple[float, float] | None:
-        """Return the latitude and longitude of the estimator's origin; None if the log does not contain it."""
         for _, kind, latitude, longitude in self._tables.rows("ORGN", "Type", "Lat", "Lng"):
             if kind != _HOME and (latitude or longitude):
                 return latitude, longitude

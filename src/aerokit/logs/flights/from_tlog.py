@@ -62,7 +62,7 @@ def read_tlog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
 
 
 def _first_autopilot(flight: FlightLog, system_id: int | None) -> tuple[m.Heartbeat, Frame]:
-    """Return the first valid heartbeat of an autopilot (with this system id, unless it is None), and its frame."""
+    """Return the first valid heartbeat of an autopilot, and its frame. A ``system_id`` of None means any."""
     records = 0
     for _, raw in read_tlog(flight.path):
         records += 1
@@ -131,7 +131,6 @@ class _Reader:
         self._handlers_of_vehicle = {_message_id_bytes(kind): handler for kind, handler in handlers.items()}
 
     def read(self, on_bytes: Callable[[int], object]) -> None:
-        """Read all messages of the log. ``on_bytes`` is called with the number of bytes read so far."""
         # This loop is optimised, because a log has millions of messages. Most of them are not decoded: only the fields
         # of the header are read.
         flight, source, link = self._flight, self._source, self._link
@@ -210,7 +209,6 @@ class _Reader:
         )
 
     def _finish(self, damaged: int) -> None:
-        """Complete the flight after the last message. ``damaged`` is the number of damaged messages."""
         flight = self._flight
         self._add_texts(flight.duration_s, self._texts.expire(math.inf))
         self._note_missing_heartbeats()
@@ -236,8 +234,8 @@ class _Reader:
         use_simulated_time(flight, self._clocks.speed)
 
     def _add_destinations(self) -> None:
-        """Use destinations (POSITION_TARGET_GLOBAL_INT) as set-points if the log has no continuous set-points."""
         setpoints, destinations = self._flight.position_target, self._destinations
+        # Destinations (POSITION_TARGET_GLOBAL_INT) replace continuous set-points only if the log has none.
         if setpoints.has("latitude_deg"):
             return
         has_heights = setpoints.has()  # NAV_CONTROLLER_OUTPUT has heights without positions
@@ -252,7 +250,7 @@ class _Reader:
         self._flight.position_target = merged
 
     def _vehicle_handlers(self) -> dict[type[Message], Callable[[float, Any], None]]:
-        """Return the handlers of messages that count only if the vehicle itself has sent them."""
+        """Return the handlers of messages that count only if the vehicle itself sent them."""
         return {
             m.Heartbeat: self._on_heartbeat,
             m.GlobalPositionInt: self._on_global_position,
@@ -325,8 +323,8 @@ class _Reader:
         self._last_heartbeat_s = time_s
 
     def _note_missing_heartbeats(self) -> None:
-        """Note for how long only other messages arrived. Silences, in which nothing arrived, have their own text."""
         self._end_heartbeat_gap(self._flight.duration_s)
+        # Silences, in which no message arrived, have their own text.
         missing_s = sum(
             end - begin - sum(max(min(end, s.ends_s) - max(begin, s.begins_s), 0.0) for s in self._flight.silences)
             for begin, end in self._armed_gaps
@@ -338,7 +336,6 @@ class _Reader:
             )
 
     def _record_other_heartbeat(self, time_s: float, system_id: int, raw: bytes) -> None:
-        """Record a ground station's heartbeat, or that the log contains another vehicle."""
         vehicle_type = raw[14:15] if raw[0] == MAGIC_V2 else raw[10:11]  # empty if the frame is too short
         if vehicle_type == bytes((MavType.GCS,)):
             self._flight.gcs_heartbeats.append(time_s)
@@ -423,8 +420,8 @@ class _Reader:
         self._add_velocity_target(time_s, message)
 
     def _on_local_target(self, time_s: float, message: m.PositionTargetLocalNed) -> None:
-        """Add a local set-point, converted with the newest local and global positions of the vehicle, if recent."""
         if message.type_mask & _NO_POSITION != _NO_POSITION:
+            # The set-point is converted with the vehicle's newest local and global positions.
             is_recent = time_s - min(self._position_at, self._local_position_at) <= _POSITION_MAX_AGE_S
             local_north, local_east, local_down = self._local_position if is_recent else (NAN, NAN, NAN)
             north, east, down = message.x - local_north, message.y - local_east, message.z - local_down
@@ -459,7 +456,6 @@ class _Reader:
         )
 
     def _on_battery_status(self, time_s: float, message: m.BatteryStatus) -> None:
-        """Add the values of a battery, and evidence of a failsafe if its charge state has become worse."""
         cells_mv = cell_voltages_mv(message)
         if message.id == 0 and cells_mv:
             self._has_battery_status = True
@@ -499,7 +495,7 @@ class _Reader:
 
 
 def _message_id_bytes(kind: type[Message]) -> bytes:
-    """Return a message's id as the three bytes of a MAVLink 2 header."""
+    # The id has three bytes in the header of MAVLink 2.
     return kind.ID.to_bytes(3, "little")
 
 

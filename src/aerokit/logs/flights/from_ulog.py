@@ -8,7 +8,7 @@ import sys
 from array import array
 from contextlib import redirect_stdout
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from aerokit.autopilots.px4 import Px4
 from aerokit.errors import FileFormatError
@@ -84,13 +84,8 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
         FileFormatError: the file is not a PX4 log.
         ModuleNotFoundError: pyulog is not installed.
     """
-    pyulog = import_module("pyulog")
-    # pyulog prints messages about damaged files to stdout, where the JSON of a command may go.
-    with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file, redirect_stdout(sys.stderr):
-        try:
-            log = pyulog.ULog(file, list(_TOPICS))
-        except Exception as error:  # pyulog raises arbitrary errors for other files
-            raise FileFormatError(f"{flight.path} is not a PX4 log: {error}") from error
+    with io.BufferedReader(_ProgressFile(flight.path, on_bytes), _BUFFER) as file:
+        log = load_ulog(file, flight.path, list(_TOPICS))
     if not log.data_list and not log.logged_messages:
         raise FileFormatError(f"{flight.path} contains no data of a flight")
     if log.file_corruption:
@@ -99,6 +94,22 @@ def read_ulog_flight(flight: FlightLog, system_id: int | None, on_bytes: Callabl
         lost_s = sum(dropout.duration for dropout in log.dropouts) / 1e3
         flight.notes.append(f"{len(log.dropouts)} logging dropouts, {lost_s:.1f} s in total")
     _Reader(flight, log).read()
+
+
+def load_ulog(file: BinaryIO, path: Path, topics: list[str] | None = None) -> Any:
+    """Load these topics of a log with pyulog, or all topics."""
+    pyulog = import_module("pyulog")
+    try:
+        with redirect_stdout(sys.stderr):  # pyulog prints about damage, but stdout may be for JSON
+            return pyulog.ULog(file, topics)
+    except Exception as error:  # pyulog raises arbitrary errors for other files
+        raise FileFormatError(f"{path} is not a PX4 log: {error}") from error
+
+
+def severity_of(text: Any) -> int:
+    # `log_level` is the character code of a digit: 54, the code of "6", is info. The Linux kernel's levels and
+    # MAV_SEVERITY have the same numbers.
+    return max(0, min(7, int(text.log_level) - ord("0")))
 
 
 class _ProgressFile(io.FileIO):
@@ -132,8 +143,9 @@ class _Topic:
         return self._data["timestamp"] * NAN
 
     def valid_array(self, field: str, flag: str) -> Any:
-        """Return a column with NaN where its flag is 0. Old versions of PX4 do not have all flags."""
+        """Return a column with NaN where its flag is 0."""
         values = self.array(field)
+        # Old versions of PX4 do not have all flags.
         if flag in self:
             values[self.array(flag) == 0] = NAN
         return values
@@ -143,7 +155,6 @@ class _Topic:
         yield from zip(self.times, *(self.array(field).tolist() for field in fields), strict=True)
 
     def changes(self, field: str) -> Iterator[tuple[float, float]]:
-        """Yield the time and the value of the first row, and of each row in which the value of the field changed."""
         previous = None
         for time_s, value in self.rows(field):
             if value != previous:
@@ -162,7 +173,6 @@ class _Reader:
         self._began_us = min([int(log.start_timestamp), *first_times])
 
     def read(self) -> None:
-        """Fill the flight with the texts, the parameters and all topics of the log."""
         flight, log = self._flight, self._log
         flight.autopilot = "PX4"
         flight.vehicle = _version(log)
@@ -177,10 +187,8 @@ class _Reader:
             flight.notes.append("no GNSS time in the log: times count from power-on")
         flight.system_id = int(log.initial_parameters.get("MAV_SYS_ID", 1))
         for text in log.logged_messages:
-            # `log_level` is the character code of a digit: 54, the code of "6", is info. The Linux kernel's levels and
-            # MAV_SEVERITY have the same numbers.
-            severity = max(0, min(7, int(text.log_level) - ord("0")))
-            flight.texts.append(LoggedText(self._time(text.timestamp), severity, clean_text(str(text.message))))
+            time_s, logged = self._time(text.timestamp), clean_text(str(text.message))
+            flight.texts.append(LoggedText(time_s, severity_of(text), logged))
         initial = [(log.start_timestamp, name, value) for name, value in log.initial_parameters.items()]
         for time_us, name, value in (*initial, *log.changed_parameters):
             if isinstance(value, (int, float)):
@@ -195,7 +203,7 @@ class _Reader:
         return max((int(time_us) - self._began_us) / 1e6, 0.0)
 
     def _topics(self, *names: str) -> list[tuple[int, _Topic]]:
-        """Return the instances of one topic, the first of ``names`` that the log has, as (number, topic)."""
+        """Return number and data of each instance of the first of these topics that the log has."""
         for name in names:
             instances = [data for data in self._data if data.name == name]
             if instances:
@@ -232,7 +240,6 @@ class _Reader:
             self._flight.add_mode(time_s, name, reason, by_autopilot)
 
     def _read_failsafe_flags(self) -> None:
-        """Add evidence of failsafes for the flags that were set while the vehicle was armed."""
         flight, flags = self._flight, self._topic("failsafe_flags")
         if flags is None:
             return
@@ -255,7 +262,6 @@ class _Reader:
                 )
 
     def _read_movement(self) -> None:
-        """Read home, track, velocity, attitude and airspeed."""
         flight = self._flight
         home = self._topic("home_position")
         if home is not None:
@@ -302,7 +308,6 @@ class _Reader:
         _extend(columns, topic.times, **{name: numpy.degrees(angle) for name, angle in angles.items()})
 
     def _read_targets(self) -> None:
-        """Read the set-points. PX4 logs positions in metres from the local origin."""
         flight = self._flight
         self._add_angles(flight.attitude_target, self._topic("vehicle_attitude_setpoint"), "q_d")
         setpoint = self._topic("vehicle_local_position_setpoint")
@@ -315,6 +320,7 @@ class _Reader:
             east_m_s=setpoint.array("vy"),
             down_m_s=setpoint.array("vz"),
         )
+        # PX4 logs positions in metres from the local origin.
         origin = self._origin(self._topic("vehicle_local_position"))
         if origin is None:
             return
@@ -329,7 +335,7 @@ class _Reader:
         )
 
     def _origin(self, local: _Topic | None) -> tuple[float, float, float] | None:
-        """Return the last origin of the local frame. PX4 may move the origin on the ground, before the flight."""
+        # PX4 may move the origin on the ground, before the flight, so the last one is returned.
         origin = None
         if local is not None:
             for _, latitude, longitude, altitude in local.rows("ref_lat", "ref_lon", "ref_alt"):
@@ -338,7 +344,6 @@ class _Reader:
         return origin
 
     def _read_equipment(self) -> None:
-        """Read batteries, GPS receivers, the estimator, vibration and links."""
         flight = self._flight
         for number, battery in self._topics("battery_status"):
             remaining = battery.array("remaining") * 100
@@ -383,7 +388,6 @@ class _Reader:
         self._read_links()
 
     def _read_links(self) -> None:
-        """Read the loss of messages and the values of the telemetry radio."""
         # PX4 may have several links. The data of the link that received the most messages is used.
         links = [topic for _, topic in self._topics("telemetry_status") if "rx_message_lost_rate" in topic]
         if links:
@@ -403,17 +407,15 @@ class _Reader:
 
 
 def _drop_damaged_rows(topics: list[Any]) -> int:
-    """Drop the rows whose time is impossible, and the topics that are then empty. Return the number of these rows.
-
-    Rows have no checksum. The time of a row is impossible if it is far from those of both neighbours, or later than the
-    whole log.
-    """
+    """Drop rows with an impossible time, and topics that are then empty. Return the number of these rows."""
     numpy = import_module("numpy")
     all_times = [topic.data["timestamp"].astype("int64") for topic in topics]
     last_us = max((int(times[-2]) for times in all_times if len(times) > 1), default=_MAX_TIME_US)
     damaged = 0
     for topic, times in zip(topics, all_times, strict=True):
         before, after = numpy.append(times[:1], times[:-1]), numpy.append(times[1:], times[-1:])
+        # Rows have no checksum. A time is impossible if it is far from those of both neighbours, or later than the
+        # whole log.
         is_spike = (times > after + _MAX_DISORDER_US) | (times < before - _MAX_DISORDER_US)
         is_damaged = is_spike & (before <= after + _MAX_DISORDER_US) | (times > last_us + _MAX_LATE_US)
         if is_damaged.any():
@@ -435,7 +437,7 @@ def _version(log: Any) -> str:
 
 
 def utc_at_boot(log: Any) -> float:
-    """Return the Unix time at which PX4 booted and its clock was 0; 0 if the log has no GNSS time."""
+    """Return the Unix time at which PX4 booted; 0 if the log has no GNSS time."""
     for data in log.data_list:
         is_gps = data.name in ("vehicle_gps_position", "sensor_gps")
         if is_gps and {"time_utc_usec", "timestamp"} <= data.data.keys():

@@ -101,12 +101,12 @@ class LinkCounter:
         return self._second + 1
 
     def add_silence(self, begins_s: float, ends_s: float, paused_s: float) -> None:
-        """Record a silence of the vehicle, with the seconds in which no message of any system was recorded."""
+        """Record a silence of the vehicle. In ``paused_s`` of it, no message of any system was recorded."""
         is_recorded = ends_s - begins_s - paused_s >= MIN_SILENCE_S
         self._silences.append(Silence(begins_s, ends_s, is_recorded))
 
     def end(self, received: int, received_s: float, ends_s: float, paused_s: float) -> None:
-        """Count the last frames, up to ``received_s``. If the log ends `MIN_SILENCE_S` later or more, add a silence."""
+        """Count the last frames. The last of them arrived at ``received_s``."""
         self._received += received
         if ends_s - received_s < MIN_SILENCE_S:
             self._add_row(self._second + 1)
@@ -117,13 +117,10 @@ class LinkCounter:
             self._series.add(ends_s, *_ALL_LOST)
 
     def _add_row(self, second: int) -> None:
-        """Add a row for the counted second, and start to count ``second``.
-
-        If there are seconds between these two, no frames arrived in them: rows for the first and the last of them show
-        a loss of 100 %.
-        """
+        """Add a row for the counted second, and start to count ``second``."""
         sent = self._received + self._lost
         self._series.add(self._second, 100 * self._lost / sent if sent else NAN, self._received)
+        # No frames arrived in the seconds between. Rows for the first and the last of them show a loss of 100 %.
         if second - self._second > 1:
             self._series.add(self._second + 1, *_ALL_LOST)
             self._series.add(second - 1, *_ALL_LOST)
@@ -131,15 +128,12 @@ class LinkCounter:
 
 
 def is_real_time(speed: float) -> bool:
-    """Return True if ``speed`` is about 1. It is the speed of the vehicle's clock relative to the recording's."""
+    """Return True if the vehicle's clock is about as fast as the recording's."""
     return abs(math.log(speed)) <= _MAX_CLOCK_DRIFT
 
 
 def use_simulated_time(flight: FlightLog, speed: float) -> None:
-    """Convert all times of a recording to the vehicle's seconds, if the vehicle is a simulation at another speed.
-
-    Speeds and turn rates stay as recorded, because the vehicle itself reports them per second of its own time.
-    """
+    """Convert all times to the vehicle's seconds, if the vehicle is a simulation at another speed."""
     if is_real_time(speed):
         return
     recorded_s = flight.duration_s
@@ -148,6 +142,7 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
         f"this is a simulation at {format_value(speed)} times real speed, as the vehicle's clock shows: all times and"
         f" durations in this report are simulated; the recording took {recorded_s:.0f} s"
     )
+    # Speeds and turn rates stay as recorded, because the vehicle reports them per second of its own time.
     for series in _all_series(flight):
         for row, time_s in enumerate(series.times):
             series.times[row] = time_s * speed
@@ -166,7 +161,6 @@ def use_simulated_time(flight: FlightLog, speed: float) -> None:
 
 
 def _all_series(flight: FlightLog) -> list[TimeSeries]:
-    """Return all time series of a flight, including those of each battery and receiver."""
     all_series: list[TimeSeries] = []
     for field in fields(flight):
         value = getattr(flight, field.name)

@@ -79,7 +79,7 @@ class LogReader:
 
 
 def name_with_unit(name: str, unit: str) -> str:
-    """Return a name with its unit appended, unless the name ends with it: ``alt`` in mm becomes ``alt_mm``."""
+    """Append the unit to a name that does not end with it: ``alt`` in mm becomes ``alt_mm``."""
     suffix = _UNITS.get(unit, unit).replace("/", "_").replace("*", "").replace("^", "")
     suffix = "".join(character for character in suffix if character.isalnum() or character == "_")
     has_suffix = name.lower().endswith(f"_{suffix.lower()}")
@@ -99,12 +99,6 @@ class TlogReader(LogReader):
         self._capabilities: dict[tuple[int, int], int] = {}
 
     def entries(self, on_bytes: Callable[[int], object]) -> Iterator[LogRecord]:
-        """Yield all messages of the standard dialect that have a valid checksum.
-
-        ``param_value`` of PARAM_VALUE and PARAM_SET is the value of an autopilot's parameter. PX4 sends an integer's
-        bits in this field, which are decoded once a heartbeat of the autopilot was read. Values of other components
-        stay as they were sent, because their encoding is unknown.
-        """
         framer, decode = self._framer, STANDARD.decode
         count = 0
         states: tuple[tuple[str, Any], ...] = ()
@@ -126,10 +120,9 @@ class TlogReader(LogReader):
         self._check_and_note(count)
 
     def _decode_parameter(self, message: Message, system_id: int, component_id: int) -> Message:
-        """Replace an autopilot's value in PARAM_VALUE and PARAM_SET by the decoded value. Others stay the same.
-
-        HEARTBEAT and AUTOPILOT_VERSION are evaluated, because they show how a vehicle encodes integer parameters.
-        """
+        """Decode the ``param_value`` of an autopilot's parameter. Return other messages unchanged."""
+        # HEARTBEAT and AUTOPILOT_VERSION show how a vehicle encodes integer parameters. PX4 sends their bits as a
+        # float.
         if isinstance(message, Heartbeat):
             if system_id not in self._autopilots and is_autopilot(message):
                 self._autopilots[system_id] = component_id, autopilot_for(message)
@@ -139,6 +132,7 @@ class TlogReader(LogReader):
             if isinstance(message, ParamSet):
                 system_id, component_id = message.target_system, message.target_component
             autopilot_id, autopilot = self._autopilots.get(system_id, (0, None))
+            # Other components' values stay as they were sent, because their encoding is unknown.
             if autopilot is not None and component_id in (0, autopilot_id):  # 0 means all components
                 capabilities = self._capabilities.get((system_id, autopilot_id))
                 value = value_of(message, autopilot.encodes_parameters_bytewise(capabilities))
@@ -146,10 +140,6 @@ class TlogReader(LogReader):
         return message
 
     def columns(self, entry: LogRecord) -> list[TableColumn]:
-        """Return a column for each field, in the order and units of the message definition.
-
-        Arrays have a column for each element, except texts and arrays of bytes, which have one.
-        """
         assert entry.message is not None
         columns = []
         for field in entry.message.FIELDS:
@@ -167,8 +157,8 @@ class TlogReader(LogReader):
     def _states(
         self, system_id: int, component_id: int, unix_s: float, message: Message
     ) -> tuple[tuple[str, Any], ...]:
-        """Return the states that an autopilot's message changes: none before the autopilot's first HEARTBEAT."""
         vehicle = self._vehicles.get(system_id)
+        # A vehicle has states from the first HEARTBEAT of its autopilot on.
         if vehicle is None:
             if not isinstance(message, Heartbeat) or not is_autopilot(message):
                 return ()
@@ -177,7 +167,6 @@ class TlogReader(LogReader):
         return vehicle.update(unix_s, message) if vehicle.component_id == component_id else ()
 
     def _check_and_note(self, records: int) -> None:
-        """Raise FileFormatError if nothing could be read, and add notes about skipped messages."""
         if not records:
             raise FileFormatError(f"{self.path} contains no MAVLink messages: it is not a .tlog, or it is empty")
         statistics = self._framer.statistics
@@ -203,7 +192,7 @@ class _VehicleStates:
         self._expired_at = 0.0
 
     def update(self, unix_s: float, message: Message) -> tuple[tuple[str, Any], ...]:
-        """Decode a message; return the names and values of the states that it changes."""
+        """Return the names and values of the states that a message changes."""
         now = max(unix_s, self._now + 1e-6)  # always increases, although the clock may have been set back
         self._now = now
         telemetry = self._telemetry

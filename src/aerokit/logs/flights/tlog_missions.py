@@ -45,7 +45,6 @@ class RecordedMission:
         return [self._items[number] for number in sorted(self._items)]
 
     def add(self, _time_s: float, message: MissionMessage) -> None:
-        """Record a message that the vehicle sent or received. Other messages are ignored."""
         sender = None if message.received_frame is None else message.received_frame.system_id
         if self._system_id not in (sender, message.target_system):
             return
@@ -67,7 +66,7 @@ class RecordedMission:
             self._add(message)
 
     def _on_file_transfer(self, message: m.FileTransferProtocol) -> None:
-        """Collect the blocks of ArduPilot's mission file while a program uploads or downloads the file."""
+        """Collect the blocks of ArduPilot's mission file while it is uploaded or downloaded."""
         ftp = FtpMessage.decode(message.payload)
         if ftp.opcode in _OPENING:
             self._is_file_open = ftp.data.rstrip(b"\0") == _MISSION_PATH
@@ -82,7 +81,7 @@ class RecordedMission:
                 self._read_file()
 
     def _read_file(self) -> None:
-        """Once the file is complete, store its items as the mission. With NO_CLEAR, keep the other items too."""
+        """Store the items of the file as the mission, once the file is complete."""
         if len(self._file) < HEADER.size:
             return
         try:
@@ -94,6 +93,7 @@ class RecordedMission:
             self._is_file_open = False
             return
         self._is_file_open = False
+        # With NO_CLEAR, the vehicle keeps the other items of its mission.
         if not header.options & NO_CLEAR:
             self._items.clear()
         for number, item in enumerate(items, header.first_index):

@@ -59,14 +59,14 @@ class RecordedModeCommands:
     def attribute_modes(self, speed: float) -> None:
         """Mark the mode changes that were commanded.
 
-        ``speed`` is the number of the vehicle's seconds in a recorded second: 1.0 unless the vehicle is a simulation.
-        The maximum age of a command is in the vehicle's seconds.
+        ``speed`` is the number of the vehicle's seconds in a recorded second.
         """
         for times in self._command_times.values():
             times.sort()
         changes: list[ModeChange] = []
         for change in self._flight.modes:
             age_s = min(self._command_age_s(change, _ANY_MODE), self._command_age_s(change, change.name))
+            # The maximum age is in the vehicle's seconds.
             is_commanded = age_s * speed < _COMMAND_MAX_AGE_S
             changes.append(change.replace(reason="ordered", by_autopilot=False) if is_commanded else change)
         self._flight.modes = changes

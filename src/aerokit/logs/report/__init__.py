@@ -99,7 +99,6 @@ def report_html(flight: FlightLog) -> str:
 
 
 def _render(flights: list[FlightLog], statistics: list[FlightStatistics], summaries: list[list[str]]) -> str:
-    """Return the HTML of a report on one flight, or of a comparison of two."""
     if len(flights) == 1:
         (flight,) = flights
         optional_sections = [make_section(flight) for make_section in SECTIONS]

@@ -88,10 +88,7 @@ def points(columns: TimeSeries, name: str, digits: int = 3) -> tuple[list[float]
 
 
 def rows_to_draw(values: Sequence[float], max_rows: int = MAX_POINTS) -> list[int]:
-    """Select about ``max_rows`` rows to draw, so that the chart still shows all peaks and the longer gaps.
-
-    With many gaps, up to one and a half times as many rows are selected.
-    """
+    """Select about ``max_rows`` rows, so that a chart of them shows all peaks and the longer gaps."""
     count = len(values)
     if count <= max_rows:
         return list(range(count))
@@ -119,7 +116,7 @@ def mode_colours(flight: FlightLog) -> dict[str, str]:
 
 
 def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: Any) -> dict[str, Any] | None:
-    """Return one column as a line of a chart over time; None if all of its values are unknown."""
+    """Return a column as a line of a chart over time; None if all of its values are unknown."""
     if not columns.has(column):
         return None
     x, y = points(columns, column, digits)
@@ -127,7 +124,6 @@ def line(name: str, columns: TimeSeries, column: str, digits: int = 3, **style: 
 
 
 def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) -> dict[str, Any] | None:
-    """Return a line of set-points, in the style that distinguishes them from measured values."""
     trace = line(name, columns, column, digits, line={"color": _SETPOINT, "dash": "dot", "width": 1.5})
     if trace is not None:
         trace["connectgaps"] = True
@@ -137,7 +133,7 @@ def setpoint_line(name: str, columns: TimeSeries, column: str, digits: int = 3) 
 def over_time(
     flight: FlightLog, name: str, unit: str, traces: Sequence[dict[str, Any] | None], **layout: Any
 ) -> Chart | None:
-    """Return a timeline with these lines; None if there are no lines. Lines without a colour get one of the palette."""
+    """Return a timeline with these lines; None if there are no lines."""
     drawn = [trace for trace in traces if trace is not None]
     if not drawn:
         return None
@@ -155,13 +151,11 @@ def over_time(
 
 
 def time_range(begin_s: float, end_s: float) -> list[float]:
-    """Return the range of a time axis: the given times with margins."""
     margin = max(0.02 * (end_s - begin_s), 0.5)
     return [round(begin_s - margin, 2), round(end_s + margin, 2)]
 
 
 def timeline_shapes(flight: FlightLog) -> list[dict[str, Any]]:
-    """Return Plotly's shapes for the background of all timelines: bands of modes, and lines at failsafes and falls."""
     spans: dict[str, list[str]] = {}
     for change, end in flight.mode_spans():
         band = f"M{change.time_s:.2f},0H{end:.2f}V1H{change.time_s:.2f}Z"
@@ -186,10 +180,6 @@ def _path_shape(paths: Sequence[str], **style: Any) -> dict[str, Any]:
 
 
 def track_parts(flight: FlightLog) -> list[Part]:
-    """Return the parts of the report that show the track from above; empty if the log has no positions.
-
-    Coordinates are metres from home. Each mode has its own colour.
-    """
     places = metres_from_home(flight)
     if not places or flight.home is None:
         return []
@@ -209,7 +199,6 @@ def track_parts(flight: FlightLog) -> list[Part]:
 
 
 def simplification_note(deviation_m: float) -> list[Part]:
-    """Return a note on how far a drawn line deviates from the track; empty if the line has all points of the track."""
     if not deviation_m:
         return []
     return [Paragraphs([f"The line is simplified: no recorded position is more than {deviation_m:.2f} m from it."])]
@@ -218,10 +207,9 @@ def simplification_note(deviation_m: float) -> list[Part]:
 def drawn_track(
     places: Sequence[tuple[float, float]], max_rows: int = MAX_TRACK_POINTS, keep: Iterable[int] = ()
 ) -> tuple[list[int], float]:
-    """Choose the places of a track that are drawn. Places in ``keep`` are always drawn.
+    """Return the indices of the places to draw, and the largest distance of a place from the drawn line.
 
-    Return the indices of these places, and the largest distance of any place from the drawn line. If all places are
-    NaN, nothing is drawn.
+    Places in ``keep`` are always drawn. If all places are NaN, nothing is drawn.
     """
     if len(places) <= MAX_POINTS:  # short lines are drawn completely
         has_known = any(rounded(north) is not None and rounded(east) is not None for north, east in places)
@@ -234,7 +222,6 @@ def drawn_track(
 
 
 def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return Plotly's layout for a map that contains these traces."""
     axes: dict[str, dict[str, Any]] = {}
     for name, direction in (("x", "east"), ("y", "north")):
         values: list[float] = []
@@ -251,7 +238,7 @@ def map_layout(traces: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _track_lines(flight: FlightLog, places: Sequence[tuple[float, float]]) -> tuple[list[dict[str, Any]], float]:
-    """Return the track as one Plotly line per mode, and the largest distance of a position from the drawn track."""
+    """Return one line per mode, and the largest distance of a position from the drawn track."""
     times, heights = flight.track.times, flight.track["altitude_relative_m"]
     changes = flight.modes or [ModeChange(0.0, "")]
     # The rows at which the modes begin, and the end of the last mode.
@@ -292,12 +279,11 @@ def _hover_text(time_s: float, height_m: float) -> str:
 
 
 def rounded(value: float) -> float | None:
-    """Round a coordinate for drawing. Return None, which interrupts the line, if it is unknown or damaged."""
+    """Round a coordinate for drawing; None if it is unknown or damaged."""
     return round(value, 2) if abs(value) <= MAX_COORDINATE else None
 
 
 def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
-    """Return a dotted line through the position set-points; an empty list if there are none."""
     target = flight.position_target
     places = [
         plane.metres(latitude, longitude)
@@ -319,7 +305,6 @@ def _setpoint_path(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any
 
 
 def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
-    """Return a dashed line through the mission items without home; an empty list if there are none."""
     items = [item for item in flight.mission if not math.isnan(item.latitude_deg) and flight.item_label(item) != "home"]
     if not items:
         return []
@@ -335,7 +320,7 @@ def _mission(flight: FlightLog, plane: TangentPlane) -> list[dict[str, Any]]:
 
 
 def _circular_fence(flight: FlightLog) -> list[dict[str, Any]]:
-    """Return the circular fence that the parameters define. Fences of polygons are not in the logs."""
+    # Fences of polygons are not in the logs.
     end_s, parameter_at = flight.duration_s, flight.parameter_at
     radius = parameter_at("GF_MAX_HOR_DIST", end_s)  # PX4
     fence_type = parameter_at("FENCE_TYPE", end_s)  # ArduPilot; bit 1 is the circle
@@ -357,7 +342,6 @@ def _circular_fence(flight: FlightLog) -> list[dict[str, Any]]:
 
 
 def _failsafe_markers(flight: FlightLog, places: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
-    """Return markers where the vehicle was at the times of failsafes and falls."""
     events_by_legend: tuple[tuple[str, str, Sequence[Failsafe | Fall]], ...] = (
         ("failsafe", "x", failsafes(flight)),
         ("fall", "triangle-down", falls(flight)),
@@ -384,7 +368,6 @@ def _marker(
     size: int,
     texts: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Return a trace of markers. Hovering over a marker shows its text in ``texts``, by default the name."""
     return {
         **_coordinates(places),
         "mode": "markers",

@@ -71,7 +71,6 @@ _CHARTS: tuple[tuple[str, str, Callable[[FlightLog], TimeSeries | None], str], .
 def comparison(
     flights: tuple[FlightLog, FlightLog], statistics: tuple[FlightStatistics, FlightStatistics]
 ) -> list[Section]:
-    """Return all sections of a comparison of two flights."""
     failsafe_sections = [failsafe_section(flight) for flight in flights]
     return [
         _differences(statistics),
@@ -91,7 +90,6 @@ def _first(by_number: dict[int, TimeSeries]) -> TimeSeries | None:
 
 
 def _armed_at(flight: FlightLog) -> float:
-    """Return the time of the first arming; 0 if the vehicle was never armed."""
     armed_s, _ = flight.armed[0] if flight.armed else (0.0, 0.0)
     return armed_s
 
@@ -143,7 +141,6 @@ def _overlay_section(
     get_series: Callable[[FlightLog], TimeSeries | None],
     column: str,
 ) -> Section:
-    """Return a section with one chart of the same column of both flights, over the time since arming."""
     traces, names_without_data = [], []
     for number, flight in enumerate(flights):
         columns = get_series(flight)

@@ -36,7 +36,6 @@ def number(value: float) -> str:
 
 
 def date(unix_s: float) -> str:
-    """Format a time as UTC. If the clock was not set, return "at an unknown time"."""
     if unix_s < _A_YEAR_S:
         return "at an unknown time"
     return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"

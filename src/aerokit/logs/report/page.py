@@ -96,14 +96,13 @@ def page(
     ``summaries`` has a heading, the sentences, and the sentences to emphasise, for each flight. ``colours`` maps themes
     ("light", "dark") to colours by name. ``shapes`` are Plotly's shapes for the background of all timelines.
 
-    The Content-Security-Policy allows only the two included scripts, and no network access. Against hostile logs, this
-    policy is a second barrier after escaping.
-
     Raises:
         ModuleNotFoundError: plotly is not installed.
     """
     scripts = [import_module("plotly.offline").get_plotlyjs(), _resource("draw.js")]
     hashes = " ".join(f"'sha256-{_hash(script)}'" for script in scripts)
+    # The policy allows only the two included scripts, and no network access. Against hostile logs, it is a second
+    # barrier after escaping.
     policy = (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:;"
         " form-action 'none'; base-uri 'none'"
@@ -133,18 +132,17 @@ def _resource(name: str) -> str:
 
 
 def _hash(script: str) -> str:
-    """Return the hash of a script for the Content-Security-Policy. Line ends are normalized first, as browsers do."""
+    # Browsers normalize line ends before they compute the hash.
     data = script.replace("\r\n", "\n").replace("\r", "\n").encode()
     return base64.b64encode(hashlib.sha256(data).digest()).decode()
 
 
 def _escape(text: str) -> str:
-    """Escape text for HTML. Characters that could disguise text (control, bidirectional, invisible) become U+FFFD."""
+    """Escape text for HTML, and replace characters that could disguise it."""
     return escape(printable(text.replace("\t", " ").replace("\xa0", " ")))
 
 
 def _json(charts: Sequence[Chart], colours: Mapping[str, Mapping[str, str]], shapes: Sequence[dict[str, Any]]) -> str:
-    """Serialize the charts as JSON in which no character can end the surrounding script element."""
     by_name = {
         chart.name: {
             "traces": chart.traces,
@@ -156,6 +154,7 @@ def _json(charts: Sequence[Chart], colours: Mapping[str, Mapping[str, str]], sha
     }
     content = {"colours": colours, "shapes": shapes, "charts": by_name}
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    # No character may end the surrounding script element.
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -186,7 +185,6 @@ def _section(number: int, section: Section) -> Iterator[str]:
 
 
 def _part(part: Part) -> Iterator[str]:
-    """Yield the HTML of a part of a section."""
     if isinstance(part, Chart):
         size = " large" if part.height > 400 else ""
         yield (
@@ -205,7 +203,6 @@ def _part(part: Part) -> Iterator[str]:
 
 
 def _table(table: Table) -> Iterator[str]:
-    """Yield the HTML of a table. Long tables are collapsed, and very long ones are not printed."""
     count = len(table.rows)
     if count > MAX_OPEN_ROWS:
         print_attribute = ' data-print="no"' if count > MAX_PRINTED_ROWS else ""

@@ -41,7 +41,6 @@ _WRITTEN_BY_AUTOPILOT = (
 
 
 def _with_parts(section: Section, *optional_parts: Part | None) -> Section:
-    """Add the parts that are not None to the section. Without any, the section shows its text for missing data."""
     parts = [part for part in optional_parts if part is not None]
     return replace(section, parts=parts, missing="" if parts else section.missing)
 
@@ -91,7 +90,6 @@ def mode_table(flight: FlightLog) -> Table:
 
 
 def failsafe_section(flight: FlightLog) -> Section:
-    """Return the section that shows each failsafe with its context."""
     all_failsafes = failsafes(flight)
     if not all_failsafes:
         return Section(
@@ -148,7 +146,7 @@ def _velocity(flight: FlightLog) -> Section:
 def _actual_and_setpoint(
     flight: FlightLog, quantity: str, unit: str, setpoints: TimeSeries, actual: TimeSeries, columns: Mapping[str, str]
 ) -> list[Part | None]:
-    """Return a chart for each of ``columns`` (maps labels to columns), and a note if there are no set-points."""
+    """Return a chart for each entry of ``columns``, which maps labels to names of columns."""
     charts = [
         over_time(
             flight,
@@ -165,7 +163,7 @@ def _actual_and_setpoint(
 
 
 def _air_speed_line(flight: FlightLog) -> dict[str, Any] | None:
-    """Return the line of air speeds; None if the log has none, or only zeros, as without a sensor."""
+    # Without a sensor, all air speeds are 0.
     has_speed = flight.air.has("air_speed_m_s") and max(flight.air.known("air_speed_m_s")) > 0
     return line("air speed", flight.air, "air_speed_m_s", 2) if has_speed else None
 
@@ -221,7 +219,6 @@ def _estimator(flight: FlightLog) -> Section:
 
 
 def _fix_type_axis(flight: FlightLog) -> dict[str, Any]:
-    """Return an axis whose labels are the names of the fix types that occur in the log."""
     values = sorted({value for gps in flight.gps.values() for value in gps.known("fix_type")})
     names = [_FIX_NAMES[int(value)] if 0 <= value < len(_FIX_NAMES) else f"{value:g}" for value in values]
     return {"tickmode": "array", "tickvals": values, "ticktext": names}
@@ -318,7 +315,6 @@ def _parameters(flight: FlightLog) -> Section:
 
 
 def _title(shown_count: int, count: int, noun: str) -> str:
-    """Return a title for a table whose rows may have been cut off."""
     return f"all {count} {noun}" if shown_count == count else f"first {shown_count} of {count} {noun}"
 
 
@@ -347,8 +343,8 @@ def _mission(flight: FlightLog) -> Section | None:
 
 
 def _has_altitude(item: Waypoint) -> bool:
-    """Return True if an item has an altitude. In an item without a position, such as RTL, 0 means no altitude."""
     has_position = not math.isnan(item.latitude_deg)
+    # In an item without a position, such as RTL, 0 means no altitude.
     return math.isfinite(item.altitude_m) and (has_position or item.altitude_m != 0)
 
 

@@ -26,7 +26,6 @@ _OTHER_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def silence_sentences(flight: FlightLog) -> list[str]:
-    """Return sentences about silences that began while armed, and about the failsafe if the vehicle was silent."""
     silences = [
         silence for silence in flight.silences if any(begin <= silence.begins_s <= end for begin, end in flight.armed)
     ]
@@ -42,7 +41,6 @@ def silence_sentences(flight: FlightLog) -> list[str]:
 
 
 def _pauses(pauses: list[Silence]) -> list[str]:
-    """Return a list with one sentence about possible pauses of the recording; empty if there are none."""
     if not pauses:
         return []
     longest = max(pauses, key=lambda pause: pause.ends_s - pause.begins_s)
@@ -68,7 +66,7 @@ def _sentence(flight: FlightLog, silence: Silence) -> str:
 
 
 def _state(flight: FlightLog, time_s: float) -> str:
-    """Return the height and the mode as text, such as "12.5 m above home in LOITER"; empty if both are unknown."""
+    """Return height and mode, such as "12.5 m above home in LOITER"; empty if both are unknown."""
     height_m = flight.track.at("altitude_relative_m", time_s)
     mode = flight.mode_at(time_s)
     parts = []
@@ -80,7 +78,7 @@ def _state(flight: FlightLog, time_s: float) -> str:
 
 
 def ground_station_failsafe(flight: FlightLog, time_s: float) -> str:
-    """Return a sentence about the vehicle's configured reaction to a lost ground station, or that it is unknown."""
+    """Return a sentence about the vehicle's configured reaction to a lost ground station."""
     firmware = next((name for name in GCS_FAILSAFE_ACTIONS if name in flight.vehicle), "")
     if not firmware:
         return "How the vehicle reacts to a lost ground station is unknown."

@@ -72,9 +72,9 @@ def simplify(
 
 
 def _deviation(places: Sequence[tuple[float, float]], first: int, last: int) -> tuple[float, int]:
-    """Find the point between ``first`` and ``last`` that is farthest from the straight line segment between them.
+    """Find the point between ``first`` and ``last`` that is farthest from the line segment between them.
 
-    Return the square of its distance, negated because a heap has the smallest value first, and its index.
+    Return the negative square of its distance, and its index.
     """
     x, y = places[first]
     last_x, last_y = places[last]

@@ -127,12 +127,10 @@ def metres_from_home(flight: FlightLog) -> list[tuple[float, float]]:
 
 
 def time_in_modes(flight: FlightLog) -> dict[str, float]:
-    """Return how many seconds the vehicle was armed in each mode, in the order of first use.
-
-    If it was never armed, the times in the whole log are returned.
-    """
+    """Return the armed seconds in each mode, in the order of first use."""
     seconds_by_mode: dict[str, float] = {}
     for change, end in flight.mode_spans():
+        # If the vehicle was never armed, the whole log counts.
         for armed_from, armed_to in flight.armed or [(0.0, flight.duration_s)]:
             seconds = min(end, armed_to) - max(change.time_s, armed_from)
             if seconds > 0:
@@ -159,11 +157,12 @@ class _ArmedSpans:
         return known
 
     def mean(self, columns: TimeSeries, name: str) -> float | None:
-        """Return the time-weighted average of a column in the spans. The last value of the column counts for 1 s."""
+        """Return the time-weighted average of a column in the spans."""
         times, values = columns.times, columns[name]
         total, weight = 0.0, 0.0
         for begin, end in self._spans:
             for row in range(bisect_left(times, begin), bisect_right(times, end)):
+                # The last value of the column counts for 1 s.
                 until_s = times[row + 1] if row + 1 < len(times) else times[row] + 1.0
                 seconds = min(until_s, end) - times[row]
                 if math.isfinite(values[row]):
@@ -182,7 +181,6 @@ def _max(values: list[float]) -> float | None:
 
 
 def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> float:
-    """Return the length in metres of the track's parts in these rows. Steps below `_MIN_STEP_M` are noise."""
     length_m = 0.0
     counted: tuple[float, float] | None = None  # the end of the last step that `length_m` includes
     previous_row = None
@@ -204,7 +202,7 @@ def _path_length(north_east: list[tuple[float, float]], rows: list[int]) -> floa
 
 
 def findings(flight: FlightLog) -> list[str]:
-    """Return sentences about each fall and hard landing; empty if there is none, as in most flights."""
+    """Return sentences about each fall and hard landing."""
     sentences = []
     for fall in falls(flight):
         sentences.append(f"{fall_text(fall)}.")
@@ -214,11 +212,7 @@ def findings(flight: FlightLog) -> list[str]:
 
 
 def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
-    """Return texts with the values that were measured in the descent, as far as the log has them.
-
-    The values are throttle, tilt, attitude error, motor outputs and battery current. An unusual value is followed by
-    advice on what to look at.
-    """
+    """Describe what was measured in the descent, with advice if a value is unusual."""
     begin_s = fall.begins_s
     end_s = fall.time_s - 0.2  # excludes the impact
     angles = ("roll_deg", "pitch_deg")
@@ -248,7 +242,7 @@ def fall_measurements(flight: FlightLog, fall: Fall) -> list[str]:
 
 
 def _currents(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _DescentValues]:
-    """Return each battery's current during a descent. The keys are labels in the report: "battery 1 current"."""
+    """Return each battery's current during a descent. The keys are labels, such as "battery 1 current"."""
     currents = {}
     for index, battery in sorted(flight.batteries.items()):
         current = _descent_values(battery, "current_a", begin_s, end_s)
@@ -268,7 +262,6 @@ class _DescentValues(Snapshot):
 
     @property
     def is_low(self) -> bool:
-        """True if the median during the descent is less than half of the median just before the descent."""
         return self.median < _LOW_POWER_SHARE * self.before
 
     def text(self, unit: str) -> str:
@@ -278,7 +271,6 @@ class _DescentValues(Snapshot):
 
 
 def _descent_values(series: TimeSeries, name: str, begin_s: float, end_s: float) -> _DescentValues | None:
-    """Summarize the known values of a column in a time span. Return None if the span has none."""
     values = series.between(name, begin_s, end_s)
     if not values:
         return None
@@ -288,10 +280,7 @@ def _descent_values(series: TimeSeries, name: str, begin_s: float, end_s: float)
 
 
 def _motors_in_descent(flight: FlightLog, begin_s: float, end_s: float) -> dict[str, _DescentValues]:
-    """Return the pulses of the motors in a descent, by output number.
-
-    An output counts as a motor if arming and flying raised its pulse by `_MOTOR_RAISED_US` or more.
-    """
+    """Return the pulses of the motors in a descent, by output number."""
     armings = [armed_at for armed_at, _ in flight.armed if armed_at < begin_s]
     motors: dict[str, _DescentValues] = {}
     if not armings:
@@ -299,6 +288,7 @@ def _motors_in_descent(flight: FlightLog, begin_s: float, end_s: float) -> dict[
     for name in flight.outputs:
         idle_us = flight.outputs.at(name, armings[-1] - 0.1)  # just before arming
         pulses = _descent_values(flight.outputs, name, begin_s, end_s)
+        # An output counts as a motor if arming and flying raised its pulse.
         if pulses is not None and pulses.before - idle_us >= _MOTOR_RAISED_US:
             _, number, _ = name.split("_")  # such as "output_3_us"
             motors[number] = pulses
@@ -306,7 +296,6 @@ def _motors_in_descent(flight: FlightLog, begin_s: float, end_s: float) -> dict[
 
 
 def _motor_outputs(flight: FlightLog, begin_s: float, end_s: float) -> str:
-    """Describe the motor outputs in a descent; empty if the log does not show which outputs drive motors."""
     motors = _motors_in_descent(flight, begin_s, end_s)
     if not motors:
         return ""
@@ -347,7 +336,6 @@ def fall_text(fall: Fall) -> str:
 
 
 def summary(flight: FlightLog, statistics: FlightStatistics) -> list[str]:
-    """Return the sentences of the summary, the most important first."""
     sentences = [
         *findings(flight),
         *silence_sentences(flight),
@@ -379,7 +367,6 @@ def _flight_sentence(flight: FlightLog, statistics: FlightStatistics) -> str:
 
 
 def _until_impact(flight: FlightLog, armed_s: float) -> str:
-    """Return a note with the armed time before an impact; empty if the vehicle was armed less than 1 s after it."""
     impact_s = next((fall.time_s for fall in falls(flight) if fall.has_impact and not fall.is_hard_landing), math.inf)
     armed_before_s = sum(max(min(end, impact_s) - begin, 0.0) for begin, end in flight.armed)
     return f" ({span(armed_before_s)} until the impact)" if armed_s - armed_before_s >= 1.0 else ""
@@ -407,7 +394,6 @@ def _battery_sentence(statistics: FlightStatistics) -> str:
 
 
 def _failsafes_sentence(flight: FlightLog) -> str:
-    """Return sentences about the failsafes, the warnings, and missing parameters that would explain the warnings."""
     acted, warnings, warning_kinds = [], [], []
     for failsafe in failsafes(flight):
         at = f"{failsafe.title} at {clock(failsafe.time_s)}"
@@ -429,15 +415,12 @@ def _failsafes_sentence(flight: FlightLog) -> str:
 
 
 def _unknown_actions(flight: FlightLog, kinds: Iterable[str]) -> list[str]:
-    """Return the names of missing parameters that decide how the vehicle reacts to these kinds of failsafes.
-
-    If the log has any parameter of a kind, nothing is returned for this kind. If it has none, the parameters with ACT
-    or ENABL in the name are returned, or all parameters of the kind if no name contains these.
-    """
+    """Return the names of missing parameters that decide how the vehicle reacts to these kinds of failsafes."""
     unknown: list[str] = []
     for kind in dict.fromkeys(kinds):
         names = failsafe_parameters(flight, kind)
         if not any(name in flight.parameters for name in names):
+            # Names with ACT or ENABL choose the reaction. If no name contains these, all names are returned.
             unknown += [name for name in names if "ACT" in name or "ENABL" in name] or names
     return unknown
 
