@@ -357,7 +357,7 @@ class Changes(AsyncIterator[T]):
         return self._cell.value
 
     def _total(self) -> int:
-        """Return the number of values, or of changes, received so far."""
+        """Return the number of values received so far. Without ``every_arrival``, repeated values do not count."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:

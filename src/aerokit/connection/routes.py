@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Evidence, from a frame of another peer, on whether that peer continues the owner's stream; None: unknown."""
+    """What a frame of another peer shows about whether it continues the owner's stream. None means unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
@@ -135,7 +135,7 @@ class _Route:
     heartbeat_at: float
     silent_since: float  # `heartbeat_at`, or later if the event loop was blocked after that time
     sequence: int  # sequence number of the last heartbeat
-    # `counters.expected` at the last heartbeat, from which `rate` is computed. It counts on beyond 255.
+    # `counters.expected` at the last heartbeat, used to compute `rate`. Unlike sequence numbers, it never wraps around.
     expected: int
 
     def __init__(self) -> None:
@@ -154,8 +154,8 @@ class Routes:
 
     1. at once, if it is another port of the same host and has continued the stream with three frames, while the owner
        sent nothing for the time of three frames;
-    2. when the owner is gone, if the peer is on the same host (as after a reboot), continues the stream, or signs with
-       our key; or if the system has no vehicle object; or if the program allows every host (``may_move``).
+    2. when the owner is gone, if one of these is true: the peer is on the same host (as after a reboot), it continues
+       the stream, it signs with our key, the system has no vehicle object, or ``may_move`` allows every host.
 
     Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.
@@ -209,8 +209,8 @@ class Routes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers to which a message for a component is sent.
 
-        If the component is 0 or unknown, these are all peers of the system. If the system is 0 or unknown, it is every
-        peer.
+        A message for component 0 or an unknown component goes to all peers of the system. A message for system 0 or an
+        unknown system goes to every peer.
         """
         if system_id == 0:
             return EVERY_PEER
@@ -296,7 +296,7 @@ class Routes:
         expected = 0
         if route.counters is not None:
             expected = route.counters.expected
-            # While silent, the owner may have sent 50 % more frames than at its measured rate, and a burst of eight.
+            # The owner may have sent frames that were lost: 50 % more than at its measured rate, and a burst of eight.
             max_ahead = 8 + 1.5 * route.rate * silent_s
             # With a larger range, more than half of the 256 sequence numbers would match by chance.
             if max_ahead < 128:
@@ -306,8 +306,8 @@ class Routes:
         boot_ms = boot_time_ms(frame)
         clock_matches: bool | None = None
         if expected_ms is None:
-            # The owner's clock is unknown, so the sequence numbers alone decide. `continues_owner` needs a matching
-            # clock, so the clock counts as matching if the sequence numbers are known.
+            # The owner's clock is unknown. It counts as matching, so that the sequence numbers alone decide. If they
+            # are unknown, too, nothing is proven.
             clock_matches = None if sequence_matches is None else True
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence

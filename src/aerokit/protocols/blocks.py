@@ -160,7 +160,7 @@ class BlockRequests:
             self._requeue_overtaken(block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
-        """Return None if it is unknown which transmission was answered."""
+        """Return when the answered transmission was sent. None if it is unknown which one was answered."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0

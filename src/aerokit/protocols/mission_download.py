@@ -247,7 +247,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     def _time_out(self, now: float) -> None:
         self._outbox += self.cancellation()
-        # The caller's items have no home, so their numbers begin at 0 after it.
+        # The caller's item 0 is the first one after home.
         missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)
         has_count = bool(self._indices)  # A restart resets `_count` to None.
         details = f"missing: {format_ranges(missing) or 'home'}" if has_count else "no MISSION_COUNT was received"

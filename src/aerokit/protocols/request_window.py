@@ -163,7 +163,7 @@ class RequestWindow(Generic[KeyT]):
 
     def _timeout_s(self, attempts: int) -> float:
         round_trip = self._round_trip
-        # Each silence of the whole link lengthens the wait. Without one, a third attempt waits no longer than a second.
+        # Each silence of the whole link lengthens the wait. The loss of single frames does not.
         seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
         if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:
             seconds = min(seconds, max(FEW_LEFT_TIMEOUT_S, 2 * round_trip.smoothed_s))

@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called at the end of a burst, after its last ``bytes_received`` and before the first of the next burst."""
+        """Called after the last ``bytes_received`` of a burst."""
 
 
 @runtime_checkable

@@ -289,8 +289,8 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         """Return True if datagrams of a sender other than the present peer may be delivered."""
         host, *_ = source
-        # A receiver that keeps peers checks the frames before it calls `keep_peer`, so another port of the same host is
-        # accepted at once.
+        # Another port of the same host need not wait for silence if the receiver keeps peers: such a receiver checks
+        # the frames before it calls `keep_peer`.
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 

@@ -91,7 +91,7 @@ class Copies:
 
     @property
     def was_accepted(self) -> bool:
-        """True if the first copy of the last checked frame was accepted."""
+        """True if the last checked frame, or a copy of it, was accepted."""
         return self._current is not None and self._current.is_accepted
 
     @property
@@ -200,7 +200,7 @@ class MergedStreams:
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # The copy over the link in use completes the evidence for all links that were faster.
+            # A copy is evidence only once the link in use has delivered it, too. It then counts for all faster links.
             is_new = link == used.link or candidate.link in (link, used.link)
             if is_new and self.copies.arrived_over(candidate.link):
                 candidate.record_copy(now)

@@ -65,7 +65,7 @@ class DefinedParameterServer(ExtendedParameterServer):
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
         """Set a value, now or later. Return PARAM_ACK, and the value and type to report.
 
-        A setting in `slow` is set after its time.
+        A setting in `slow` is set later.
         """
         setting = self.definition.settings.get(name)
         if setting is None:
