@@ -157,9 +157,9 @@ class Connection:
         """Encode a message with the next sequence number, and write it. Never blocks.
 
         A message for one component goes to the peer from which that component was last received. A message for a
-        whole system goes to every peer with components of that system, and a message for all or for an unknown target
-        goes to every peer. With several links, a message for a vehicle is not sent at all if the link in use leads to
-        another vehicle with the same id (:class:`DuplicateSender` reports this) and no other link works.
+        whole system goes to every peer with components of that system. A message for all or for an unknown target goes
+        to every peer. With several links, :class:`DuplicateSender` may report that the link in use leads to another
+        vehicle with the same id. Messages to the vehicle are then not sent until another link works.
 
         With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``. The
         message itself is not changed.
@@ -318,9 +318,9 @@ class Connection:
     def observe_frames(self, callback: FrameObserver) -> Detach:
         """Call ``callback(frame, peer)`` with every received frame, after the subscribers got the message.
 
-        Frames with message ids outside the dialect are included, and their checksums are not checked. Frames that are
-        refused because a second peer sends them under the ids of a known component are excluded. The callback must
-        return quickly; its exceptions are logged. Observers cost time, because every frame must then become an object.
+        Frames with message ids outside the dialect are included, and their checksums are not checked. Frames of a
+        second peer under the ids of a known component are refused, and not included. The callback must return quickly;
+        its exceptions are logged. Observers cost time, because every frame must then become an object.
         """
         return self._observers.add(callback)
 

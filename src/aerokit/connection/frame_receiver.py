@@ -40,7 +40,7 @@ class PeerTable:
     """Remote peers and their framers.
 
     A sender becomes a peer with its first valid frame, and from then on gets broadcasts. When the table is full, the
-    idle peer that is oldest in the table is evicted; if no peer is idle, new senders are ignored.
+    oldest of the idle peers is evicted. If no peer is idle, new senders are ignored.
 
     ``evict_idle_peer`` is :meth:`Routes.evict_idle_peer`. ``configure(framer)`` is called with each new framer,
     ``on_evict(peer)`` with each evicted peer.

@@ -146,16 +146,18 @@ class _Route:
 class Routes:
     """Routing table: maps each (system id, component id) to the peer that owns the route.
 
-    The first peer that sends a HEARTBEAT under these ids owns the route; frames of other peers under the same ids are
+    The first peer that sends a HEARTBEAT under these ids owns the route. Frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer continues the owner's stream if its sequence numbers and, where known,
     its time since boot are those expected of the owner. The owner is gone once its TCP client has disconnected, or
-    after 3.5 s without a heartbeat, not counting pauses of the event loop. Another peer takes over the route
-    (``RouteChanged``)
+    after 3.5 s without a heartbeat, not counting pauses of the event loop.
+
+    Another peer takes over the route (``RouteChanged``)
 
     1. at once, if it is another port of the same host and has continued the stream with three frames, while the owner
        sent nothing for the time of three frames;
-    2. when the owner is gone, if one of these is true: the peer is on the same host (as after a reboot), it continues
-       the stream, it signs with our key, the system has no vehicle object, or ``may_move`` allows every host.
+    2. when the owner is gone, if the peer is on the same host (as after a reboot), continues the stream, or signs with
+       our key;
+    3. when the owner is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
 
     Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.

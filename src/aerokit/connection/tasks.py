@@ -101,7 +101,7 @@ class Cancellation:
     """Cancel scope that can be cancelled before it is entered, and from callbacks of the loop. Enter it once.
 
     A plain ``anyio.CancelScope`` cannot be created in a callback if sniffio is installed (a dependency of trio, openai
-    and others), because anyio then detects the running library only in tasks.
+    and others). anyio then detects the running library only in tasks.
     """
 
     def __init__(self) -> None:

@@ -149,8 +149,8 @@ class BlockRequests:
         if sent_at is None:
             sent_at = self._sent_at_of_answer(block, now)
         self._timeouts = 0
-        # No time is measured if it is unknown which transmission was answered (None), or if the server was still busy
-        # with a burst when the request was sent.
+        # No time is measured if the answered transmission is unknown (None), or was sent while the server was busy with
+        # a burst.
         if sent_at is None or sent_at <= self._busy_until:
             self.window.on_answer(None)
             return

@@ -62,8 +62,8 @@ class Exchange(ABC, Generic[ResultT]):
     def link_changed(self, now: float) -> None:
         """Called after a switch to another link, which leads to another port of the vehicle.
 
-        Does nothing by default, because most exchanges repeat unanswered requests anyway. An exchange whose state the
-        vehicle keeps for each port overrides this method to restart.
+        Does nothing by default, because most exchanges repeat unanswered requests anyway. Exchanges that the vehicle
+        continues only over the same port override this method to restart.
         """
         return
 

@@ -159,8 +159,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An ERROR that arrives too soon after the request for the list is ignored, because it answers an earlier
-            # message, e.g. a repeated item of an upload.
+            # An ERROR that arrives too soon after the request for the list is ignored. It answers an earlier message,
+            # e.g. a repeated item of an upload.
             if now - self._list_requested_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (

@@ -333,8 +333,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._sent_end = max(self._sent_end, seq + 1)
 
     def _is_in_flight(self, seq: int, now: float) -> bool:
-        # The vehicle would answer a duplicate by another request, and each request for an item that was already
-        # requested makes us send a whole window again. An item in flight is therefore not repeated.
+        # An item in flight is not repeated. The vehicle would answer the duplicate by another request for the next
+        # item, and a repeated request makes us send a whole window again.
         sent_at = self._sent_at.get(seq)
         return sent_at is not None and now - sent_at < self._in_flight_s
 

@@ -24,9 +24,9 @@ __all__ = ["ParameterList", "merge_update"]
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
     """Merge a PARAM_VALUE that is not part of a list into a known parameter.
 
-    If values are not sent bytewise, the message may have the wrong type: in its answer to PARAM_SET, ArduPilot reports
-    an integer as a float if the value is the default. The message may also have a rounded value: an INT32 beyond 2**24
-    loses its last bits. The known type or value is then kept.
+    If values are not sent bytewise, the known type and value are kept in two cases. The type may be wrong: ArduPilot
+    answers PARAM_SET of an integer with a float if the value is the default. The value may be rounded: an INT32 beyond
+    2**24 loses its last bits.
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
@@ -86,7 +86,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ---------------------------------------------------------------------------- as an exchange
 
     def start(self, now: float) -> None:
-        """Request the list and, unless the round trip was measured before, one value by index to measure it."""
+        """Request the list. If the round trip is unknown, also request one value by index to measure it."""
         self._start_clock(now)
         self._send_list_request(now)
         if self.round_trip.smoothed_s is None:

@@ -92,9 +92,9 @@ READ_WINDOW = 20
 class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """Read some parameters by name. The result has one answer for each name.
 
-    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. ``probe=True`` detects such names: if a
-    name is not answered in time, it is requested again, together with the parameter of index 0, which always exists. If
-    index 0 is answered several times, but the name never, the name's result is a ParameterRejected without a code.
+    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. ``probe=True`` detects such names. A name
+    that is not answered in time is requested again, together with index 0, which always exists. If index 0 is answered
+    several times, but the name never, the name's result is a ParameterRejected without a code.
 
     ``alternatives`` maps names to other names of the same parameter. The vehicle has at most one of these names, so an
     answer for one name makes the result of all others a ParameterRejected. ``possibly_stale`` maps names to old values

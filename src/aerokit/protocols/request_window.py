@@ -20,8 +20,7 @@ QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
 # Once at most FEW_LEFT requests are left, each is sent twice, from attempt DUPLICATE_FROM_ATTEMPT on. Otherwise a
 # transfer over a bad radio would wait long for its last few requests.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
-# The last few requests are repeated after at most two round trips, or this time if it is longer, because few repeated
-# requests cost little.
+# The last few requests wait for at most two round trips or this time, whichever is longer. Repeating them costs little.
 FEW_LEFT_TIMEOUT_S = 0.5
 # Maximum seconds to wait for an answer. A queue that delayed the answers may be empty by then.
 MAX_TIMEOUT_S = 2.0

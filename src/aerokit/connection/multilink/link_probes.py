@@ -40,8 +40,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, or every five seconds if the link is costly and not in use.
 
-    Answers are recorded in ``choices``. If a link leads to a second vehicle with the same system id, this is reported
-    once, and again only if the link has led to the known vehicle in between. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A link to a second vehicle with the same system id is reported once. It is
+    reported again if it has led to the known vehicle in between. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(

@@ -62,8 +62,9 @@ class SessionFtpServer(Generic[FilesT]):
 
     A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
     ``burst_interval_s`` seconds, and none while ``is_congested()``. A burst ends after 35 kB, and the client must
-    request the next burst, so that a single request with a forged sender cannot cause a whole file to be sent. If a
-    request is repeated, its stored reply is sent again. Replies with file content are not stored, but made anew.
+    request the next burst. A single request with a forged sender therefore cannot cause a whole file to be sent.
+
+    If a request is repeated, its stored reply is sent again. Replies with file content are not stored, but made anew.
     Subclasses for firmware that behaves differently override methods.
     """
 
