@@ -121,7 +121,7 @@ _HEARTBEAT_ID = Heartbeat.ID
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# Pauses of the event loop are logged from this length on, because they delay a heartbeat, which is sent at 1 Hz.
+# Pauses of the event loop are logged from this length on, because they delay our heartbeat.
 BLOCKED_WARNING_S = 1.0
 
 BLOCKING_CODE_HINT = (

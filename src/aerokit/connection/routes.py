@@ -40,7 +40,7 @@ class RouteClaim:
 
     The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
     the component claims the route. When the owner sends again, the claim starts anew. Only the sequence number of the
-    claim's first frame is evidence, because a peer could try many numbers until one continues the owner's.
+    claim's first frame is evidence, because a peer could try many numbers until one matches.
     """
 
     __slots__ = (

@@ -42,7 +42,7 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# Ranges are adapted to take this many time-outs of the round trip, so that the pause between two ranges is negligible.
+# A range should take about this many time-outs of the round trip, so that the pause after it is negligible.
 MIN_RANGE_TIMEOUTS = 60
 
 MAX_EARLY_ENDS = 3

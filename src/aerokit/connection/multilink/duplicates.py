@@ -117,7 +117,7 @@ class Copies:
 # For this time after a switch to another link, answers to earlier requests may arrive over the previous link.
 ANSWER_TIMEOUT_S = 3.0
 
-# A component counts as reachable over a link until it has sent nothing over this link for this time.
+# A component counts as reachable over a link for this time after its last frame over this link.
 COMPONENT_TTL_S = 10.0
 
 MAX_STREAMS = 1024

@@ -151,7 +151,7 @@ class LinkProbes:
         return max(0.0, now - sent_at)
 
     def _report_other_vehicle(self, frame: Frame, candidate: Candidate) -> None:
-        """Report that the link seems to lead to another vehicle with the same system id, once until that changes."""
+        """Report once that the link seems to lead to another vehicle with the same system id."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)
