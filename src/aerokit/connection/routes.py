@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """What a frame of another peer shows about whether it continues the owner's stream. None means unknown."""
+    """Evidence that another peer's frame continues the owner's stream, or that it does not. None means unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
