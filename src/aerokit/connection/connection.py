@@ -393,7 +393,8 @@ class Connection:
         """Return a probable problem with signatures, for error texts; "" if there is none.
 
         If this program has a signing key, the problem is that it has refused frames of any sender. Without a key, it
-        is that the last heartbeat of this component was signed. ``component_id`` 0 means any component of the system.
+        is that the last heartbeat of this component was signed; this check needs a ``system_id``. ``component_id`` 0
+        means any component of the system.
         """
         return self._gate.describe(
             heartbeat
