@@ -136,8 +136,8 @@ class Bus:
     ) -> Frame | None:
         """Deliver the frames in order, like :meth:`deliver`, until a sink sets :attr:`one_at_a_time`.
 
-        Returns the frame that this sink got, which is the last one delivered; None if no sink did so. Calls
-        ``before_heartbeat(frame, *context)`` before each HEARTBEAT is delivered.
+        Returns the frame whose sink set it, or None if no sink did. Calls ``before_heartbeat(frame, *context)`` before
+        each HEARTBEAT is delivered.
         """
         plans, decode = self._plans, self.dialect.decode
         for frame in frames:

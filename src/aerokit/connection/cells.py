@@ -175,10 +175,10 @@ class StateCell(Generic[T]):
     ) -> T:
         """Wait until ``predicate(value)`` has been true for ``held_for`` seconds, and return the value.
 
-        The predicate is checked for the current value, however old, and for every value received, so a condition that
-        is true for only one message is not missed. A value is taken as unchanged until the next one is received, so the
-        vehicle's silence counts towards ``held_for``; time before this call does not. Call :meth:`fresh` afterwards if
-        the value must be recent. Exceptions of the predicate are raised here.
+        The predicate is checked for the current value, however old, and for every value received. A condition that is
+        true for only one message is therefore not missed. A value is taken as unchanged until the next one is received,
+        so the vehicle's silence counts towards ``held_for``. Time before this call does not count. Call :meth:`fresh`
+        afterwards if the value must be recent. Exceptions of the predicate are raised here.
 
         Raises:
             OperationTimeout: the condition was not met within ``timeout`` seconds; the error names ``description`` and
@@ -357,7 +357,7 @@ class Changes(AsyncIterator[T]):
         return self._cell.value
 
     def _total(self) -> int:
-        """Return the number of values, or of changes, received so far."""
+        """Return the number of values received so far. Without ``every_arrival``, repeated values do not count."""
         return self._cell._arrivals if self._every_arrival else self._cell._changes
 
     async def _next_arrival(self) -> None:

@@ -157,9 +157,9 @@ class Connection:
         """Encode a message with the next sequence number, and write it. Never blocks.
 
         A message for one component goes to the peer from which that component was last received. A message for a
-        whole system goes to every peer with components of that system, and a message for all or for an unknown target
-        goes to every peer. With several links, a message for a vehicle is not sent at all if the link in use leads to
-        another vehicle with the same id (:class:`DuplicateSender` reports this) and no other link works.
+        whole system goes to every peer with components of that system. A message for all or for an unknown target goes
+        to every peer. With several links, :class:`DuplicateSender` may report that the link in use leads to another
+        vehicle with the same id. Messages to the vehicle are then not sent until another link works.
 
         With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``. The
         message itself is not changed.
@@ -318,9 +318,9 @@ class Connection:
     def observe_frames(self, callback: FrameObserver) -> Detach:
         """Call ``callback(frame, peer)`` with every received frame, after the subscribers got the message.
 
-        Frames with message ids outside the dialect are included, and their checksums are not checked. Frames that are
-        refused because a second peer sends them under the ids of a known component are excluded. The callback must
-        return quickly; its exceptions are logged. Observers cost time, because every frame must then become an object.
+        Frames with message ids outside the dialect are included, and their checksums are not checked. Frames of a
+        second peer under the ids of a known component are refused, and not included. The callback must return quickly;
+        its exceptions are logged. Observers cost time, because every frame must then become an object.
         """
         return self._observers.add(callback)
 
@@ -390,11 +390,11 @@ class Connection:
         return self._unix_epoch_s + self._clock()
 
     def describe_signature_problems(self, system_id: int = 0, component_id: int = 0) -> str:
-        """Return how signatures may block communication with a component, for error texts; "" if nothing suggests it.
+        """Return a probable problem with signatures, for error texts; "" if there is none.
 
-        If this program has a signing key, the text counts the frames from all senders that it has refused. Without a
-        key, the text says that the component signs its frames if its last heartbeat was signed. For this,
-        ``system_id`` is required; ``component_id`` 0 means any component of the system.
+        If this program has a signing key, the problem is that it has refused frames of any sender. Without a key, it
+        is that the last heartbeat of this component was signed; this check needs a ``system_id``. ``component_id`` 0
+        means any component of the system.
         """
         return self._gate.describe(
             heartbeat
@@ -562,17 +562,16 @@ class Connection:
         return encoder.encode(message, 0.0 if encoder.signing is None else self.unix_time())
 
     def _write(self, data: bytes, message: Message | None, to: int | None) -> bool:
-        """Write a frame to the peers that lead to the target of ``message``.
+        """Write a frame to the peers that lead to the target of ``message``, or to all peers if it has no target.
 
-        ``to`` selects the peers of this system instead. A frame without a target goes to all peers. Returns False if
-        nothing was sent.
+        With ``to``, the target is the system with this id instead. Returns False if nothing was sent.
         """
         system_id = getattr(message, "target_system", 0) if to is None else to
         peers = self._routes.peers_of(system_id, getattr(message, "target_component", 0), message)
         dropped_before = self.link.dropped_writes
         for peer in peers:
             self.link.write(data, peer)
-        # EVERY_PEER is any number of peers: one of them may have got the frame although a write to another was dropped.
+        # With EVERY_PEER, the number of peers is unknown: some may have got the frame although a write was dropped.
         is_written = peers is EVERY_PEER or self.link.dropped_writes - dropped_before < len(peers)
         if is_written:
             self._observers.record_sent(data, self._clock())

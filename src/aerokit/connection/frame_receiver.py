@@ -40,7 +40,7 @@ class PeerTable:
     """Remote peers and their framers.
 
     A sender becomes a peer with its first valid frame, and from then on gets broadcasts. When the table is full, the
-    idle peer that is oldest in the table is evicted; if no peer is idle, new senders are ignored.
+    oldest of the idle peers is evicted. If no peer is idle, new senders are ignored.
 
     ``evict_idle_peer`` is :meth:`Routes.evict_idle_peer`. ``configure(framer)`` is called with each new framer,
     ``on_evict(peer)`` with each evicted peer.
@@ -121,7 +121,7 @@ _HEARTBEAT_ID = Heartbeat.ID
 
 logger: logging.Logger = logging.getLogger("aerokit")
 
-# Pauses of the event loop are logged from this length on, because they delay a heartbeat, which is sent at 1 Hz.
+# Pauses of the event loop are logged from this length on, because they delay our heartbeat.
 BLOCKED_WARNING_S = 1.0
 
 BLOCKING_CODE_HINT = (

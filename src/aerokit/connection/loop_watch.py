@@ -52,9 +52,9 @@ def loop_clock() -> Callable[[], float]:
 class LoopWatch:
     """Detects pauses of the event loop by a timer that fires late.
 
-    Data that arrives during a pause waits until it is read. After a pause, all data gets as its receive time the time
-    at which the loop last ran before the pause, until no waiting data is left. A pause shorter than
-    ``CHECK_INTERVAL_S + LATE_THRESHOLD_S`` may not be detected. The age of data may then be too small by its length.
+    Data that arrives during a pause is read after the pause. It is unknown when it arrived. Its receive time is
+    therefore the time at which the loop last ran before the pause. A pause shorter than ``CHECK_INTERVAL_S +
+    LATE_THRESHOLD_S`` may not be detected. Data may then be older than its receive time says, by at most the pause.
 
     ``on_blocked`` gets the maximum length of each pause that delays the timer by more than ``BLOCKED_THRESHOLD_S``.
     ``on_slept`` gets the time that the computer was suspended. ``on_caught_up`` is called when all waiting data has
@@ -160,7 +160,7 @@ class LoopWatch:
         self._timer = self._loop.call_at(self._due, self._tick)
 
     def _assume_waiting_data(self) -> float:
-        """Assume that data has waited since the loop last ran. Return that time."""
+        """Return `oldest_arrival`. If it is infinite, first set it to the time at which the loop last ran."""
         if self.oldest_arrival == math.inf:
             self.oldest_arrival = self._ran_at
             self.late_after = -math.inf

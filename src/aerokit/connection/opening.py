@@ -206,7 +206,7 @@ def _check_distinct(addresses: Sequence[str | Link], targets: Sequence[Link | Li
 
 
 def _target_key(target: Link | LinkAddress) -> object:
-    """Return a key that only one open link can have. None if the system chooses the port or pty."""
+    """Return a key that two links cannot share. None if the system chooses a new port or pty for each link."""
     if isinstance(target, Link):
         return id(target)
     gets_new_endpoint = (target.kind in ("udpin", "tcpin") and not target.port) or (

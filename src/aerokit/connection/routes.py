@@ -28,7 +28,7 @@ CLAIM_MIN_FRAMES = 3
 
 
 class Evidence(NamedTuple):
-    """Evidence, from a frame of another peer, on whether that peer continues the owner's stream; None: unknown."""
+    """Evidence that another peer's frame continues the owner's stream, or that it does not. None means unknown."""
 
     expected: int  # the owner's next sequence number
     sequence_matches: bool | None
@@ -40,7 +40,7 @@ class RouteClaim:
 
     The owner is the peer to which the component's messages are sent at present. Another peer that sends with the ids of
     the component claims the route. When the owner sends again, the claim starts anew. Only the sequence number of the
-    claim's first frame is evidence, because a peer could try many numbers until one continues the owner's.
+    claim's first frame is evidence, because a peer could try many numbers until one matches.
     """
 
     __slots__ = (
@@ -135,7 +135,7 @@ class _Route:
     heartbeat_at: float
     silent_since: float  # `heartbeat_at`, or later if the event loop was blocked after that time
     sequence: int  # sequence number of the last heartbeat
-    # `counters.expected` at the last heartbeat, from which `rate` is computed. It counts on beyond 255.
+    # `counters.expected` at the last heartbeat, used to compute `rate`. Unlike sequence numbers, it never wraps around.
     expected: int
 
     def __init__(self) -> None:
@@ -146,16 +146,18 @@ class _Route:
 class Routes:
     """Routing table: maps each (system id, component id) to the peer that owns the route.
 
-    The first peer that sends a HEARTBEAT under these ids owns the route; frames of other peers under the same ids are
+    The first peer that sends a HEARTBEAT under these ids owns the route. Frames of other peers under the same ids are
     dropped (``DuplicateSender``). Another peer continues the owner's stream if its sequence numbers and, where known,
     its time since boot are those expected of the owner. The owner is gone once its TCP client has disconnected, or
-    after 3.5 s without a heartbeat, not counting pauses of the event loop. Another peer takes over the route
-    (``RouteChanged``)
+    after 3.5 s without a heartbeat, not counting pauses of the event loop.
+
+    Another peer takes over the route (``RouteChanged``)
 
     1. at once, if it is another port of the same host and has continued the stream with three frames, while the owner
        sent nothing for the time of three frames;
     2. when the owner is gone, if the peer is on the same host (as after a reboot), continues the stream, or signs with
-       our key; or if the system has no vehicle object; or if the program allows every host (``may_move``).
+       our key;
+    3. when the owner is gone, from any host, if the system has no vehicle object, or if ``may_move`` is True.
 
     Once refused (``RouteChangeRefused``), a peer is judged anew only after the owner has sent again. The route of a
     system with a vehicle object never expires.
@@ -209,8 +211,8 @@ class Routes:
     def peers_of(self, system_id: int, component_id: int, message: Message | None = None) -> Collection[Peer]:
         """Return the peers to which a message for a component is sent.
 
-        If the component is 0 or unknown, these are all peers of the system. If the system is 0 or unknown, it is every
-        peer.
+        A message for component 0 or an unknown component goes to all peers of the system. A message for system 0 or an
+        unknown system goes to every peer.
         """
         if system_id == 0:
             return EVERY_PEER
@@ -296,7 +298,7 @@ class Routes:
         expected = 0
         if route.counters is not None:
             expected = route.counters.expected
-            # While silent, the owner may have sent 50 % more frames than at its measured rate, and a burst of eight.
+            # The owner may have sent frames that were lost: 50 % more than at its measured rate, and a burst of eight.
             max_ahead = 8 + 1.5 * route.rate * silent_s
             # With a larger range, more than half of the 256 sequence numbers would match by chance.
             if max_ahead < 128:
@@ -306,8 +308,8 @@ class Routes:
         boot_ms = boot_time_ms(frame)
         clock_matches: bool | None = None
         if expected_ms is None:
-            # The owner's clock is unknown, so the sequence numbers alone decide. `continues_owner` needs a matching
-            # clock, so the clock counts as matching if the sequence numbers are known.
+            # The owner's clock is unknown. It counts as matching, so that the sequence numbers alone decide. If they
+            # are unknown, too, nothing is proven.
             clock_matches = None if sequence_matches is None else True
         elif boot_ms is not None:
             tolerance_ms = 1500 + 50 * silent_s  # 1.5 s of delay, and a drift of 5 % of the silence

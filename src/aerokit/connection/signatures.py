@@ -85,9 +85,9 @@ class SignatureGate:
         self.on_change()
 
     def admits(self, frame: Frame, *, may_hand_over: bool = True) -> bool:
-        """Return True if a frame may be delivered. It may cause the switch of :meth:`key_handover`.
+        """Return True if a frame may be delivered. A frame with the new key causes the switch of :meth:`key_handover`.
 
-        ``may_hand_over`` is False for a frame from another peer than its component's.
+        ``may_hand_over`` is False for a frame from another peer than its component's. Such a frame causes no switch.
         """
         handover = self._handover
         is_of_handover = handover is not None and may_hand_over and handover.concerns(frame)
@@ -136,10 +136,9 @@ class SignatureGate:
         self._logged_keep_error = error
 
     def describe(self, heartbeats: Iterable[Heartbeat]) -> str:
-        """Return how signatures may block communication, for error texts. Empty if they do not seem to.
+        """Return a probable problem with signatures, for error texts. Empty if there is none.
 
-        With a key, the text lists the frames refused so far. Otherwise it says that a sender of ``heartbeats`` signs
-        its frames.
+        With a key, the problem is that frames were refused. Without a key, it is that one of ``heartbeats`` is signed.
         """
         signing = self._encoder.signing
         if signing is not None:

@@ -20,10 +20,12 @@ if TYPE_CHECKING:
 class BackgroundTasks:
     """Tasks that end with an ``async with`` block. Their exceptions go to ``on_error``, not to the block.
 
-    This is not a task group, because the program's block would then run inside its cancel scope. Cancelling the
-    program's task, ``asyncio.timeout`` and ``asyncio.TaskGroup`` interact with cancel scopes differently in each
-    version of Python and anyio; some swallow or exchange exceptions. If the program cancels a scope of its own, these
-    tasks continue: heartbeats are sent while a shielded program lands its vehicle.
+    This is not a task group, because the program's block would then run inside the group's cancel scope. There,
+    ``task.cancel()``, ``asyncio.timeout`` and ``asyncio.TaskGroup`` behave differently in each version of Python and
+    anyio; in some versions, exceptions are lost or exchanged.
+
+    If the program cancels a scope of its own, these tasks continue: heartbeats are sent while a shielded program lands
+    its vehicle.
     """
 
     def __init__(self, on_error: Callable[[Exception], None]) -> None:
@@ -98,8 +100,8 @@ async def run_shielded(work: Coroutine[Any, Any, None]) -> None:
 class Cancellation:
     """Cancel scope that can be cancelled before it is entered, and from callbacks of the loop. Enter it once.
 
-    If sniffio is installed (a dependency of trio, openai and others), anyio detects the running library in tasks
-    only: creating an ``anyio.CancelScope`` in a callback raises.
+    A plain ``anyio.CancelScope`` cannot be created in a callback if sniffio is installed (a dependency of trio, openai
+    and others). anyio then detects the running library only in tasks.
     """
 
     def __init__(self) -> None:

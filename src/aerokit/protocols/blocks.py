@@ -149,8 +149,8 @@ class BlockRequests:
         if sent_at is None:
             sent_at = self._sent_at_of_answer(block, now)
         self._timeouts = 0
-        # No time is measured if it is unknown which transmission was answered (None), or if the server was still busy
-        # with a burst when the request was sent.
+        # No time is measured if the answered transmission is unknown (None), or was sent while the server was busy with
+        # a burst.
         if sent_at is None or sent_at <= self._busy_until:
             self.window.on_answer(None)
             return
@@ -160,7 +160,7 @@ class BlockRequests:
             self._requeue_overtaken(block.transmission_number)
 
     def _sent_at_of_answer(self, block: _BlockRequest, now: float) -> float | None:
-        """Return None if it is unknown which transmission was answered."""
+        """Return when the answered transmission was sent. None if it is unknown which one was answered."""
         if block.attempts == 1:
             return block.sent_at
         fastest_s = self._round_trip.fastest_s or 0.0

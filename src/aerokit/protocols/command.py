@@ -98,8 +98,8 @@ be older when it is processed, if the event loop was blocked.
 """
 
 # The arrival of a HEARTBEAT triggers the repetition of an order, but not before this fraction of ``attempt_timeout``
-# has passed. If it were 1, a HEARTBEAT that arrives slightly early would not count, and the repetition would be late by
-# a second.
+# has passed. With a fraction of 1, a HEARTBEAT that arrives slightly early would not count, and the repetition would be
+# late by a second.
 MIN_RESEND_FRACTION = 0.75
 
 
@@ -176,8 +176,8 @@ class CommandExchange(Exchange[CommandAck]):
     stations, or from other components than the target, are ignored.
 
     A command without ``order_status`` is a request, and is repeated every ``attempt_timeout`` seconds. An order is
-    repeated only after a new HEARTBEAT, and only until it takes effect or ends. An order is therefore never sent again
-    to a silent vehicle.
+    repeated only after a new HEARTBEAT, so it is never sent again to a silent vehicle. Once ``order_status.end`` has a
+    text, the order is not repeated.
 
     Args:
         message: the command.
@@ -338,7 +338,7 @@ class CommandExchange(Exchange[CommandAck]):
         self._sent_count += 1
         self._sent_at = now
         wait_s = self._attempt_timeout
-        # The deadline of an order is earlier, because the order then checks for a HEARTBEAT and for its own end.
+        # The deadline of an order is earlier: from then on, `_expire_order` checks whether the order may be repeated.
         if self._order_status is not None:
             wait_s = min(MIN_RESEND_FRACTION * wait_s, ATTEMPT_TIMEOUT_S)
         self.deadline = now + wait_s

@@ -62,8 +62,8 @@ class Exchange(ABC, Generic[ResultT]):
     def link_changed(self, now: float) -> None:
         """Called after a switch to another link, which leads to another port of the vehicle.
 
-        Does nothing by default, because most exchanges repeat unanswered requests anyway. An exchange whose state the
-        vehicle keeps for each port overrides this method to restart.
+        Does nothing by default, because most exchanges repeat unanswered requests anyway. Exchanges that the vehicle
+        continues only over the same port override this method to restart.
         """
         return
 
@@ -203,7 +203,7 @@ class MessageStream:
         self._has_started = False
 
     def on_message(self, now: float, messages: int) -> None:
-        """Record a message. ``messages`` is 1 plus the number of messages lost directly before it.
+        """Record a message. ``messages`` is the number sent since the previous message, including lost ones.
 
         It is 0 or less for a repeated or delayed message. The time before such a message is not measured.
         """
@@ -245,7 +245,7 @@ _MAX_RANGES = 10
 
 
 def is_addressed_to(message: Any, system_id: int, component_id: int) -> bool:
-    """Return True if a message is for this component, or for all (target 0), as messages of old firmware are."""
+    """Return True if a message is for this component or for all (target 0). Old firmware sends without targets (0)."""
     return message.target_system in (0, system_id) and message.target_component in (0, component_id)
 
 

@@ -177,10 +177,12 @@ class SettingWrite(Transfer[Setting]):
     """Set one setting. The result is the setting as the component reports it afterwards.
 
     A PARAM_EXT_ACK with the requested value, or a refusal, completes the write. IN_PROGRESS extends the wait. If no
-    answer arrives, the value is read. PARAM_EXT_SET is sent again only if the component still reports ``before``, the
-    value from before the write. If the component keeps reporting it, the write fails. Any other value that it reports
-    twice is the result: the component rounded or clamped the value, or another station set it. A later change by
-    another station is therefore not undone.
+    answer arrives, the value is read:
+
+    - The value from before the write (``before``). PARAM_EXT_SET is sent again. The write fails if the component keeps
+      this value.
+    - Another value. The component rounded or clamped the value, or another station set it. PARAM_EXT_SET is not sent
+      again, because it would undo the other station's change. A value reported twice is the result.
 
     Raises from ``result()``:
         ParameterRejected: the component refused (``code`` is the PARAM_ACK), or keeps the previous value.

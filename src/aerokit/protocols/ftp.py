@@ -243,7 +243,7 @@ class FtpClient:
     def next_sequence(self, replies: int = 1) -> int:
         """Return the sequence number of a new request.
 
-        Its ``replies`` take the numbers that follow. The next request has the number of the last reply.
+        Its replies have the next ``replies`` numbers. The request after it has the same number as the last reply.
         """
         sequence = self._sequence % SEQUENCE_COUNT
         self._sequence = sequence + replies

@@ -167,7 +167,7 @@ class FtpDownload(FtpExchange[int]):
                 if burst.contains(reply):
                     self._on_block(burst, reply, now)
                     return
-            # A NAK belongs to a burst if its offset is possible as the end of the file, whatever its error is.
+            # A NAK with any error belongs to a burst if the file may end at its offset.
             elif (end := burst.file_end(reply)) is not None:
                 self._end_burst(burst, end, reply)
                 return
@@ -308,11 +308,10 @@ class FtpDownload(FtpExchange[int]):
 
     def _request_burst(self, now: float) -> None:
         offset = self._reassembly.tail
+        # The full blocks of the burst. If the size is unknown, ArduPilot's burst length is assumed.
         blocks = BURST_BLOCKS if self._size is None else max(BURST_BLOCKS, (self._size - offset) // DATA_SIZE)
-        # The sequence numbers of the replies are reserved. A later request with one of them would look like a
-        # repetition of this request, and the server would only repeat its last reply. The request, the full blocks, a
-        # shorter block and the NAK have one number each. If the size is unknown, ArduPilot's burst length is assumed.
-        # At most half of all numbers are reserved, because the numbers of a longer burst wrap around in any case.
+        # The numbers of the request, each block, a shorter block and the NAK are reserved, because a later request with
+        # one of them would look like a repetition. More than half of all numbers would wrap around in any case.
         sequence = self._client.next_sequence(min(blocks + 3, SEQUENCE_COUNT // 2))
         self._bursts.append(_Burst(sequence, offset, now))
         self._is_bursting = True

@@ -42,7 +42,7 @@ FIRST_RANGE, MIN_RANGE, MAX_RANGE = 512, 64, 40_000
 # Gaps of at least this many blocks are requested as ranges.
 LONG_GAP = 8
 
-# Ranges are adapted to take this many time-outs of the round trip, so that the pause between two ranges is negligible.
+# A range should take about this many time-outs of the round trip, so that the pause after it is negligible.
 MIN_RANGE_TIMEOUTS = 60
 
 MAX_EARLY_ENDS = 3
@@ -179,7 +179,7 @@ class LogDownload(Transfer[int]):
 
     def _first_long_gap(self) -> tuple[int, int] | None:
         min_length = LONG_GAP * LOG_BLOCK
-        start, end = 0, 0  # the gap that is being measured: consecutive offsets in `gaps`, which has one for each block
+        start, end = 0, 0  # of a gap: consecutive offsets in `gaps`, which has the offset of each missing block
         for offset in self._reassembly.gaps:
             is_new_gap = offset != end
             if is_new_gap:
@@ -209,7 +209,7 @@ class LogDownload(Transfer[int]):
         if self._received_blocks < self._requested_blocks / 2:
             self._max_range_blocks = max(self._max_range_blocks // 2, MIN_RANGE)
         elif self._requested_blocks >= self._max_range_blocks and self._stream.interval_s:
-            # Ranges get just so long that the pause between two ranges is negligible.
+            # Longer ranges are useful only until the pause between two ranges is negligible.
             useful_blocks = MIN_RANGE_TIMEOUTS * self.round_trip.timeout_s() / self._stream.interval_s
             self._max_range_blocks = min(2 * self._max_range_blocks, max(int(useful_blocks), FIRST_RANGE), MAX_RANGE)
 

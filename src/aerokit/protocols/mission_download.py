@@ -159,8 +159,8 @@ class MissionDownload(MissionExchange[DownloadResult]):
         if result == MavMissionResult.DENIED:
             self._wait_while_busy(result, now)
         elif result == MavMissionResult.ERROR:
-            # An ERROR that arrives too soon after the request for the list is ignored, because it answers an earlier
-            # message, e.g. a repeated item of an upload.
+            # An ERROR that arrives too soon after the request for the list is ignored. It answers an earlier message,
+            # e.g. a repeated item of an upload.
             if now - self._list_requested_at >= MIN_ROUND_TRIP_FRACTION * (self.round_trip.smoothed_s or 0.0):
                 self._restart_after_error(now)
         elif result not in (
@@ -247,7 +247,7 @@ class MissionDownload(MissionExchange[DownloadResult]):
 
     def _time_out(self, now: float) -> None:
         self._outbox += self.cancellation()
-        # The caller's items have no home, so their numbers begin at 0 after it.
+        # The caller's item 0 is the first one after home.
         missing = tuple(seq - self.offset for seq in self._indices if seq not in self._items and seq >= self.offset)
         has_count = bool(self._indices)  # A restart resets `_count` to None.
         details = f"missing: {format_ranges(missing) or 'home'}" if has_count else "no MISSION_COUNT was received"

@@ -33,9 +33,9 @@ IN_FLIGHT_ROUND_TRIPS = 0.8
 class UploadResult(Snapshot):
     """Result of an upload that was not refused.
 
-    ``is_confirmed`` is True if the vehicle has confirmed the plan. Otherwise all items were sent, but the answers are
-    ambiguous, and the plan must be read back; ``item`` is then the index of the first unconfirmed item, and otherwise
-    has no meaning. ``opaque_id`` identifies the plan on the vehicle; 0 if the vehicle sends none.
+    ``is_confirmed`` is True if the vehicle has confirmed the plan. If it is False, all items were sent, but the answers
+    are ambiguous. The plan must then be read back, and ``item`` is the index of the first unconfirmed item.
+    ``opaque_id`` identifies the plan on the vehicle; 0 if the vehicle sends none.
     """
 
     is_confirmed: bool
@@ -204,8 +204,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         if result == MavMissionResult.ACCEPTED:
             # Before all items were sent, an ACCEPTED can only answer an earlier upload.
             if self._is_requesting and self._sent_end == self._end:
-                # Items are sent ahead, so even then it may be a delayed answer to an earlier upload, unless the vehicle
-                # has requested the last item.
+                # Items may be sent before they are requested. Unless the vehicle has requested the last one, this may
+                # be a delayed answer to an earlier upload.
                 was_last_requested = self._confirmed_end == self._end - 1
                 is_confirmed = was_last_requested and not self._was_tail_repeated
                 self._succeed(now, is_confirmed=is_confirmed, opaque_id=ack.opaque_id)
@@ -228,10 +228,9 @@ class MissionUpload(MissionExchange[UploadResult]):
         return self.is_partial and not self._is_requesting
 
     def _on_error(self, now: float) -> None:
-        # PX4 sends ERROR when it is busy, when an item arrives after the end, when MISSION_COUNT arrives twice, and for
-        # real errors. ArduPilot sends ERROR for an item after the end. Before an ERROR ends the upload, an item is
-        # therefore repeated. A second ERROR that arrives within a round trip may answer what was sent before the
-        # repetition, so it is ignored.
+        # ERROR need not mean that the upload has failed. PX4 also sends it when it is busy, when MISSION_COUNT arrives
+        # twice and, like ArduPilot, for an item after the end. An item is therefore repeated, and only another ERROR
+        # ends the upload. Within a round trip, an ERROR may answer an earlier message, so it is ignored.
         if not self._is_requesting:
             self._wait_while_busy(now)
         elif self._error_at is None:
@@ -280,7 +279,7 @@ class MissionUpload(MissionExchange[UploadResult]):
 
     def _time_out(self, now: float) -> None:
         self._outbox += self.cancellation()
-        # The caller's items have no home, so their numbers begin at 0 after it.
+        # The caller's item 0 is the first one after home.
         missing = tuple(range(max(self._confirmed_end - self.offset, 0), self._end - self.offset))
         unconfirmed = f"items not confirmed: {format_ranges(missing) or 'home'}"
         details = unconfirmed if self.was_started else "no item was requested"
@@ -334,8 +333,8 @@ class MissionUpload(MissionExchange[UploadResult]):
         self._sent_end = max(self._sent_end, seq + 1)
 
     def _is_in_flight(self, seq: int, now: float) -> bool:
-        # The vehicle would answer a duplicate by another request, and each request for an item that was already
-        # requested makes us send a whole window again. An item in flight is therefore not repeated.
+        # An item in flight is not repeated. The vehicle would answer the duplicate by another request for the next
+        # item, and a repeated request makes us send a whole window again.
         sent_at = self._sent_at.get(seq)
         return sent_at is not None and now - sent_at < self._in_flight_s
 

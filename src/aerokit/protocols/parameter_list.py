@@ -24,9 +24,9 @@ __all__ = ["ParameterList", "merge_update"]
 def merge_update(known: Parameter, reported: Parameter, bytewise: bool) -> Parameter:
     """Merge a PARAM_VALUE that is not part of a list into a known parameter.
 
-    If values are not sent bytewise, the message may have the wrong type: in its answer to PARAM_SET, ArduPilot reports
-    an integer as a float if the value is the default. The message may also have a rounded value: an INT32 beyond 2**24
-    loses its last bits. The known type or value is then kept.
+    If values are not sent bytewise, the known type and value are kept in two cases. The type may be wrong: ArduPilot
+    answers PARAM_SET of an integer with a float if the value is the default. The value may be rounded: an INT32 beyond
+    2**24 loses its last bits.
     """
     value, type_ = reported.value, reported.type
     if not bytewise and known.type.is_integer:
@@ -49,7 +49,7 @@ NEAR_END = 20
 # The list's stream counts as started once it has sent this many values. The list is then not requested again.
 MIN_STREAMED = 2
 
-# With each value of the stream, the longest pause shrinks by this factor, because it may have been an exception.
+# With each value of the stream, the longest pause shrinks by this factor, so that a single long pause is forgotten.
 PAUSE_DECAY = 0.98
 
 # An index counts as nonexistent after this many PARAM_ERROR messages.
@@ -60,9 +60,9 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     """Download of all parameters: requests the list once, then missing indices as soon as a gap appears.
 
     The vehicle reports the number of parameters. If this number changes during the transfer, indices shift: ArduPilot
-    reveals a group of parameters when the group is enabled, PX4 counts only the parameters in use. If a name then has
-    two indices, or has lost its index, all values received before the change are requested again. Values with index
-    65535 are not part of the list.
+    reveals a group of parameters when the group is enabled, PX4 counts only the parameters in use. Unless each name
+    still has exactly one index, all values received before the change are requested again. Values with index 65535 are
+    not part of the list.
 
     Raises from ``result()``:
         ParameterTimeout: no progress for ``idle_timeout_s`` seconds; ``missing`` has the missing indices.
@@ -86,7 +86,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     # ---------------------------------------------------------------------------- as an exchange
 
     def start(self, now: float) -> None:
-        """Request the list and, unless the round trip was measured before, one value by index to measure it."""
+        """Request the list. If the round trip is unknown, also request one value by index to measure it."""
         self._start_clock(now)
         self._send_list_request(now)
         if self.round_trip.smoothed_s is None:
@@ -142,8 +142,8 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
     def _on_refusal(self, message: ParamError) -> None:
         # The error means that the list has become shorter. PX4 also sends it if it has no room for the value, but
         # hardly ever `MAX_REFUSALS` times for one index. If later parameters were received, they no longer fit the
-        # count, so `_finish_when_complete` drops stale values, which are requested again, and the answers correct the
-        # count. Only the index in the message is used, because PX4 does not fill in the name.
+        # count. `_finish_when_complete` then requests values again, and their answers correct the count. Only the index
+        # in the message is used, because PX4 does not fill in the name.
         index = message.param_index
         if message.error != MavParamError.DOES_NOT_EXIST or index not in self._window or index in self._received:
             return
@@ -233,7 +233,7 @@ class ParameterList(ValueList[ParameterTable, Parameter]):
             return
         names = {parameter.name for parameter in parameters}
         is_consistent = len(names) == count == len(self._parameters)  # Each name has exactly one index, and vice versa.
-        # If there are no values from before a change of the count, inconsistent values are the result.
+        # Inconsistent values are the result if requesting them again cannot help.
         if not is_consistent and self._drop_stale(count):
             self._must_request_missing = True
         else:

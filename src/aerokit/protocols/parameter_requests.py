@@ -92,9 +92,9 @@ READ_WINDOW = 20
 class ParameterReads(ParameterRequests, NamedReads[Parameter]):
     """Read some parameters by name. The result has one answer for each name.
 
-    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. ``probe=True`` detects such names: if a
-    name is not answered in time, it is requested again, together with the parameter of index 0, which always exists. If
-    index 0 is answered several times, but the name never, the name's result is a ParameterRejected without a code.
+    ArduPilot, and PX4 before 1.17, do not answer requests for unknown names. ``probe=True`` detects such names. A name
+    that is not answered in time is requested again, together with index 0, which always exists. If index 0 is answered
+    several times, but the name never, the name's result is a ParameterRejected without a code.
 
     ``alternatives`` maps names to other names of the same parameter. The vehicle has at most one of these names, so an
     answer for one name makes the result of all others a ParameterRejected. ``possibly_stale`` maps names to old values
@@ -141,8 +141,8 @@ class ParameterReads(ParameterRequests, NamedReads[Parameter]):
             self._is_probe_wanted = True
 
     def _on_value(self, message: ParamValue, now: float) -> None:
-        # An answer to another station also counts. A name is rejected only after so many probes that such a coincidence
-        # has no effect, see `_loss_probability`.
+        # An answer to another station also counts. This does no harm, because a name is rejected only after several
+        # probes (see `_loss_probability`).
         is_probe_answer = message.param_index == PROBE_INDEX and self._window.attempts(PROBE) > 0
         if is_probe_answer:
             self._count_probe()
@@ -186,13 +186,13 @@ WRITE_WINDOW = 10
 class ParameterWrites(ParameterRequests):
     """Set some parameters. The result has the value that the vehicle reports for each parameter afterwards.
 
-    ``before`` has the values from before the writes, as far as they are known. The answers are handled as follows:
+    ``before`` has the values from before the writes, as far as they are known. The answers to a write are:
 
-    - The requested value with the requested type completes a write.
-    - If there is no answer, the value is read.
-    - The value from before, or any value if that is unknown: the write may have been lost, so PARAM_SET is sent again.
+    - The requested value with the requested type. The write is complete.
+    - No answer. The value is read.
+    - The value from before, or any value if that is unknown. The write may have been lost, so PARAM_SET is sent again.
       If the same value is reported eight times in a row, it is the result.
-    - Another value: the vehicle has rounded or clamped the request, or another station has set the value. PARAM_SET is
+    - Another value. The vehicle has rounded or clamped the request, or another station has set the value. PARAM_SET is
       not sent again, because it would undo the other station's change. A value reported twice in a row is the result.
 
     ``recent`` has the names that an earlier call has just written. Their first answer with the requested value may

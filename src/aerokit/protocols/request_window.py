@@ -20,8 +20,7 @@ QUEUED_FACTOR, QUEUED_MARGIN_S = 1.5, 0.02
 # Once at most FEW_LEFT requests are left, each is sent twice, from attempt DUPLICATE_FROM_ATTEMPT on. Otherwise a
 # transfer over a bad radio would wait long for its last few requests.
 FEW_LEFT, DUPLICATE_FROM_ATTEMPT = 5, 3
-# The last few requests are repeated after at most two round trips, or this time if it is longer, because few repeated
-# requests cost little.
+# The last few requests wait for at most two round trips or this time, whichever is longer. Repeating them costs little.
 FEW_LEFT_TIMEOUT_S = 0.5
 # Maximum seconds to wait for an answer. A queue that delayed the answers may be empty by then.
 MAX_TIMEOUT_S = 2.0
@@ -163,7 +162,7 @@ class RequestWindow(Generic[KeyT]):
 
     def _timeout_s(self, attempts: int) -> float:
         round_trip = self._round_trip
-        # Each silence of the whole link lengthens the wait. Without one, a third attempt waits no longer than a second.
+        # Each silence of the whole link lengthens the wait. The loss of single frames does not.
         seconds = round_trip.timeout_s(min(attempts, 2) + self._silences)
         if len(self) <= FEW_LEFT and round_trip.smoothed_s is not None:
             seconds = min(seconds, max(FEW_LEFT_TIMEOUT_S, 2 * round_trip.smoothed_s))

@@ -67,7 +67,8 @@ def rtcm_messages(data: bytes) -> list[bytes]:
         subject = f"rtcm (byte {begin} of {len(data)})"
         if 0 < remaining <= HEADER_SIZE and data[begin] == PREAMBLE:
             raise InvalidArgument(
-                f"{subject} is not allowed: the message is incomplete: it ends in or after its header"
+                f"{subject} is not allowed: a message has at least {HEADER_SIZE + CRC_SIZE} bytes, but only"
+                f" {remaining} were given"
             )
         size = _frame_size(data, begin) if remaining > HEADER_SIZE else None
         if size is None:

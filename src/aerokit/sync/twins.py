@@ -294,10 +294,10 @@ class StateCell(CellTwin[T]):
     ) -> T:
         """Wait until ``predicate(value)`` has been true for ``held_for`` seconds, and return the value.
 
-        The predicate is checked for the current value, however old, and for every value received, so a condition that
-        is true for only one message is not missed. A value is taken as unchanged until the next one is received, so the
-        vehicle's silence counts towards ``held_for``; time before this call does not. Call :meth:`fresh` afterwards if
-        the value must be recent. Exceptions of the predicate are raised here.
+        The predicate is checked for the current value, however old, and for every value received. A condition that is
+        true for only one message is therefore not missed. A value is taken as unchanged until the next one is received,
+        so the vehicle's silence counts towards ``held_for``. Time before this call does not count. Call :meth:`fresh`
+        afterwards if the value must be recent. Exceptions of the predicate are raised here.
 
         Raises:
             OperationTimeout: the condition was not met within ``timeout`` seconds; the error names ``description`` and
@@ -397,9 +397,9 @@ class Connection(ConnectionTwin):
         """Encode a message with the next sequence number, and write it. Never blocks.
 
         A message for one component goes to the peer from which that component was last received. A message for a
-        whole system goes to every peer with components of that system, and a message for all or for an unknown target
-        goes to every peer. With several links, a message for a vehicle is not sent at all if the link in use leads to
-        another vehicle with the same id (:class:`DuplicateSender` reports this) and no other link works.
+        whole system goes to every peer with components of that system. A message for all or for an unknown target goes
+        to every peer. With several links, :class:`DuplicateSender` may report that the link in use leads to another
+        vehicle with the same id. Messages to the vehicle are then not sent until another link works.
 
         With ``to``, the message is sent to the peers of the system with this id, not to those of ``target_system``. The
         message itself is not changed.

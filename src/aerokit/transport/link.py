@@ -71,7 +71,7 @@ class BurstListener(Receiver, Protocol):
     """A receiver that processes the data of one read burst together. Used by links with `Link.reports_bursts`."""
 
     def burst_ended(self) -> None:
-        """Called at the end of a burst, after its last ``bytes_received`` and before the first of the next burst."""
+        """Called after the last ``bytes_received`` of a burst."""
 
 
 @runtime_checkable
@@ -391,8 +391,8 @@ class MemoryLink(BaseLink):
             return
         first_due, _ = self._inbox[0]
         now = max(self._loop.time(), first_due)  # A timer may fire early by the clock's resolution.
-        # Due items are counted before the delivery, because the callbacks may write at the far end, which appends data
-        # that is due at once. It must arrive in a later iteration of the event loop. The first item is always due.
+        # Due items are counted before the delivery. Data that the far end writes in response may be due at once, but
+        # must arrive in a later iteration of the event loop. The first item is always due.
         due_count = 1 if len(self._inbox) == 1 else sum(due <= now for due, _ in self._inbox)
         for _ in range(due_count):
             if not self._inbox:  # The receiver has closed the link in its callback.

@@ -303,7 +303,7 @@ class MultiLink(Link):
 
 
 class _MemberReceiver:
-    """Receiver of one of the links."""
+    """Receiver of one link; forwards callbacks to the `MultiLink`."""
 
     def __init__(self, owner: MultiLink, index: int) -> None:
         self._owner, self._index = owner, index

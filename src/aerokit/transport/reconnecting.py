@@ -238,8 +238,8 @@ class ReconnectingLink(Link):
             logger.debug("the link still cannot be opened: %s", error)
             return False
         if current.is_lost:  # The new link was lost while it was being opened.
-            # If `_receiver` is None, this link has ended as well, at the end of a recording. Otherwise another attempt
-            # follows.
+            # The end of a recording ends this link, too; `_receiver` is then None. After any other loss, another
+            # attempt follows.
             return self._receiver is None
         self._is_up = True
         if self._lost_at is not None:

@@ -145,8 +145,7 @@ class TcpConnect(_TcpLink):
         except BaseException:
             self._stream = None  # Without this, closing the stream would count as the loss of an open link.
             stream.close()
-            # After a failure, uvloop does not call `connection_lost`, and would leave the socket open until it is
-            # garbage-collected. So both are done here.
+            # After a failure, uvloop neither closes the socket nor calls `connection_lost`, which removes the stream.
             sock.close()
             self._remove_stream(stream, None)
             raise

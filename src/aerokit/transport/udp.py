@@ -218,8 +218,8 @@ class UdpListen(_UdpLink):
 class UdpConnect(_UdpLink):
     """``udpout:`` link: sends to one remote address, and receives only from that host and port.
 
-    The socket is not connected, because uvloop stops reading a connected socket at the first "connection refused",
-    which only means that the vehicle has not started yet.
+    The socket is not connected. uvloop would stop reading a connected socket at the first "connection refused", which
+    only means that the vehicle has not started yet.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -242,8 +242,9 @@ class UdpConnect(_UdpLink):
 class UdpBroadcast(_UdpLink):
     """``udpbcast:`` link (IPv4): broadcasts until a peer answers, then uses that peer only.
 
-    After 3.5 s of silence it broadcasts again, and accepts another peer. Another port of the same host is accepted at
-    once. Data for one peer is never broadcast. ``peers`` are the IP addresses and networks to accept; None: all.
+    After 3.5 s of silence it broadcasts again, and accepts another peer. If the receiver keeps peers, another port of
+    the same host is accepted at once. Data for one peer is never broadcast. ``peers`` are the IP addresses and networks
+    to accept; None: all.
     """
 
     _received_at: float  # time of the last datagram from `_remote`; set together with `_remote`
@@ -289,8 +290,8 @@ class UdpBroadcast(_UdpLink):
     def _is_accepted(self, source: Any) -> bool:
         """Return True if datagrams of a sender other than the present peer may be delivered."""
         host, *_ = source
-        # A receiver that keeps peers checks the frames before it calls `keep_peer`, so another port of the same host is
-        # accepted at once.
+        # Another port of the same host need not wait for silence if the receiver keeps peers: such a receiver checks
+        # the frames before it calls `keep_peer`.
         is_same_host = self._keeps_peers and self._remote is not None and self.host_of(self._remote) == host
         return (is_same_host or self._is_remote_silent()) and self._allowed.allows(host)
 

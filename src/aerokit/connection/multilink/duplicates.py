@@ -23,8 +23,8 @@ COPY_WINDOW_S = 3.0
 # only be a duplicate if the first copy was accepted.
 LATE_COPY_WINDOW_S = 10.0
 
-# A frame with the same bytes as an earlier frame counts as a new frame, not as a copy, if the sender has sent at least
-# this many frames in between. Sequence numbers repeat after 256 frames, so the bytes may be equal by chance.
+# An equal frame counts as a new frame, not as a copy, if the sender has sent at least this many frames in between.
+# Sequence numbers repeat after 256 frames, so the frames may be equal by chance.
 COPY_WINDOW_FRAMES = 128
 
 
@@ -45,8 +45,8 @@ class _Seen:
 class Copies:
     """Remembers which frame arrived over which link, and detects copies: equal frames over different links.
 
-    An equal frame over the same link is not a copy: the sender has sent a new frame that is equal by chance, with a
-    sequence number that has wrapped around.
+    An equal frame over the same link is not a copy. It is a new frame that is equal by chance, because sequence numbers
+    wrap around.
     """
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ class Copies:
 
     @property
     def was_accepted(self) -> bool:
-        """True if the first copy of the last checked frame was accepted."""
+        """True if the last checked frame, or a copy of it, was accepted."""
         return self._current is not None and self._current.is_accepted
 
     @property
@@ -117,7 +117,7 @@ class Copies:
 # For this time after a switch to another link, answers to earlier requests may arrive over the previous link.
 ANSWER_TIMEOUT_S = 3.0
 
-# A component counts as reachable over a link until it has sent nothing over this link for this time.
+# A component counts as reachable over a link for this time after its last frame over this link.
 COMPONENT_TTL_S = 10.0
 
 MAX_STREAMS = 1024
@@ -200,7 +200,7 @@ class MergedStreams:
         if used is None or used.is_other_hardware or not self.copies.arrived_over(used.link):
             return
         for candidate in choice.candidates.values():
-            # The copy over the link in use completes the evidence for all links that were faster.
+            # A copy is evidence only once the link in use has delivered it, too. It then counts for all faster links.
             is_new = link == used.link or candidate.link in (link, used.link)
             if is_new and self.copies.arrived_over(candidate.link):
                 candidate.record_copy(now)
@@ -254,8 +254,8 @@ def _accepts_over_unused_link(frame: Frame, candidate: Candidate | None, choice:
         # Both links carry the same stream. The link in use has lost this frame, or delivers it later. Telemetry is
         # refused if a newer frame was already accepted; an answer is valid in any case.
         return is_answer or not stream.has_newer(frame)
-    # The links carry separate streams. The frame is needed if only this link reaches the component, or if it answers a
-    # request that was sent before the switch to the link in use.
+    # The links carry separate streams. This frame is needed in two cases: only this link reaches the component, or the
+    # frame answers a request from before the switch to the link in use.
     is_on_used_link = frame.received_at - stream.received_at[choice.used.link] <= COMPONENT_TTL_S
     is_after_change = frame.received_at - choice.changed_at <= ANSWER_TIMEOUT_S
     return not is_on_used_link or (is_answer and candidate is choice.previous and is_after_change)

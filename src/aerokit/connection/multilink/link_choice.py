@@ -20,8 +20,7 @@ UNPROBED_TIMEOUT_S = 2.5
 # This many consecutive matching clock samples prove that a second link leads to the same vehicle.
 MIN_CLOCK_MATCHES = 3
 
-# A vehicle that answers this many TIMESYNC probes after the request for its hardware id, but not the request itself,
-# has no hardware id to report.
+# After this many answers to TIMESYNC probes, an answer to an earlier request for the hardware id is no longer expected.
 MAX_ANSWERS_WITHOUT_HARDWARE = 3
 
 MAX_HARDWARE_REQUESTS = 20
@@ -87,7 +86,7 @@ class Candidate:
     def record_clock(self, matches: bool, *, may_prove: bool) -> None:
         """Record whether the time in a probe's answer matches the vehicle's clock.
 
-        ``may_prove`` is False while the hardware id may still be received.
+        ``may_prove`` is False while an answer with the hardware id is expected.
         """
         if matches:
             self._clock_matches, self._clock_mismatches = self._clock_matches + 1, 0
@@ -160,7 +159,7 @@ class Candidate:
         return self.is_available and not self.is_stalled and now - self.received_at <= timeout_s
 
     def failure(self) -> str:
-        """Return the reason why the link is no longer used, for events."""
+        """Return why this link cannot be used any more, for events."""
         if self.is_other_hardware:
             return "another vehicle"
         if not self.is_available:
@@ -206,8 +205,8 @@ class LinkChoice:
         self.clock: VehicleClock = VehicleClock()
         self.hardware: HardwareId | None = None
         """The vehicle's hardware id, which was received over the link in use at that time."""
-        # Index of the link whose next id replaces `hardware`, because this link delivered `hardware`, or showed that
-        # the vehicle rebooted; -1: none.
+        # Index of the link whose next id replaces `hardware` even if it differs; -1 if there is none. This link has
+        # delivered `hardware`, or has shown that the vehicle rebooted.
         self._hardware_link = -1
         self.used: Candidate | None = None
         """The link in use; None before the first choice."""
@@ -237,8 +236,8 @@ class LinkChoice:
     def record_answer(self, link: int, at: float, vehicle_s: float, round_trip_s: float, now: float) -> None:
         """Record a probe's answer. The vehicle's clock showed ``vehicle_s`` when ours showed ``at``."""
         candidate = self.candidates[link]
-        # True if the link in use has not answered since the previous answer over this link. Recording the new answer
-        # would change the result, so it follows below.
+        # True if the link in use has not answered since the previous answer over this link. `record_round_trip` changes
+        # this time, so it is called afterwards.
         is_used_silent = self.used is not None and self.used.answered_at < candidate.answered_at
         candidate.record_round_trip(round_trip_s, now)
         if candidate is self.used:
@@ -331,7 +330,7 @@ class LinkChoice:
         hardware = used.hardware
         if hardware is None or not hardware.has_value:
             return
-        # If the id contradicts one from another link, the link in use counts as a link to another vehicle.
+        # An id that contradicts the id from another link is not adopted: the link in use leads to another vehicle.
         is_from_same_link = self._hardware_link == used.link
         if self.hardware is None or is_from_same_link or not self.hardware.contradicts(hardware):
             self.hardware, self._hardware_link = hardware, used.link
@@ -349,8 +348,7 @@ class LinkChoice:
             extra_transit_s = ((chosen.round_trip_s or 0.0) - (previous.round_trip_s or 0.0)) / 2
             self.fresh_after = previous.received_at + extra_transit_s + JITTER_S
             # The chosen link was proven by comparison with the previous one (see `may_be_used`), so both lead to one
-            # vehicle, unless the hardware id of the previous link shows another one. Nothing else makes the previous
-            # link doubted, because its clock is not compared while it is in use.
+            # vehicle. Only a hardware id can disprove this, because the clock of a link in use is not compared.
             previous.is_proven = not previous.is_other_hardware
         self.previous = previous
         self.used = chosen

@@ -40,8 +40,8 @@ _AUTOPILOT = int(MavComponent.AUTOPILOT1)
 class LinkProbes:
     """Probes each link to a system twice a second, or every five seconds if the link is costly and not in use.
 
-    Answers are recorded in ``choices``. If a link leads to a second vehicle with the same system id, this is reported
-    once, and again only if the link has led to the known vehicle in between. ``send(message, peer)`` sends a probe.
+    Answers are recorded in ``choices``. A link to a second vehicle with the same system id is reported once. It is
+    reported again if it has led to the known vehicle in between. ``send(message, peer)`` sends a probe.
     """
 
     def __init__(
@@ -92,9 +92,9 @@ class LinkProbes:
             del self._pending[next(iter(self._pending))]
         self._pending[ts1] = system_id, candidate.link, now
         self._send(m.Timesync(tc1=0, ts1=ts1, target_system=system_id, target_component=_AUTOPILOT), peer)
-        # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack), so the ack of
-        # this request may be taken for that of another REQUEST_MESSAGE. No order is a REQUEST_MESSAGE, and
-        # `request_message` waits for the message itself.
+        # PX4 acknowledges a command over each of its ports (mavlink_main.cpp, vehicle_command_ack). The ack of this
+        # request may therefore be taken for that of another REQUEST_MESSAGE. This does no harm: no order is a
+        # REQUEST_MESSAGE, and `request_message` waits for the message itself.
         if choice.should_request_hardware(candidate, is_attached=is_attached):
             request = m.CommandLong(
                 system_id, _AUTOPILOT, MavCmd.REQUEST_MESSAGE, confirmation=0, param1=float(m.AutopilotVersion.ID),
@@ -119,7 +119,7 @@ class LinkProbes:
         if round_trip_s is not None and choice is not None and link in choice.candidates:
             # The vehicle read its clock at about the middle of the round trip.
             choice.record_answer(link, now - round_trip_s / 2, message.tc1 / 1e9, round_trip_s, now)
-            self._report_doubt(frame, choice.candidates[link])
+            self._report_other_vehicle(frame, choice.candidates[link])
         return True
 
     def record_hardware(self, frame: Frame, link: int) -> None:
@@ -131,10 +131,10 @@ class LinkProbes:
         if isinstance(message, m.AutopilotVersion) and choice is not None and link in choice.candidates:
             choice.record_hardware(link, HardwareId.from_message(message))
             for candidate in choice.candidates.values():
-                self._report_doubt(frame, candidate)
+                self._report_other_vehicle(frame, candidate)
 
     def _consume_budget(self, now: float) -> bool:
-        """Return False if no probe may be sent now to a system without a vehicle object."""
+        """Take a probe from the budget of the systems without a vehicle object. Return False if none is left."""
         self._budget = min(UNATTACHED_RATE_HZ, self._budget + UNATTACHED_RATE_HZ * (now - self._budget_at))
         self._budget_at = now
         if self._budget < 1:
@@ -150,8 +150,8 @@ class LinkProbes:
         del self._pending[answer.ts1]
         return max(0.0, now - sent_at)
 
-    def _report_doubt(self, frame: Frame, candidate: Candidate) -> None:
-        """Report a second vehicle with the same system id, once for each doubt."""
+    def _report_other_vehicle(self, frame: Frame, candidate: Candidate) -> None:
+        """Report once that the link seems to lead to another vehicle with the same system id."""
         key = frame.system_id, candidate.link
         if not candidate.is_doubted:
             self._reported.discard(key)

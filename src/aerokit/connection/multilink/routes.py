@@ -210,7 +210,7 @@ class MultiLinkRoutes:
             now = self._now()
             self._choose(system_id, choice, now)
             if choice.used.is_other_hardware:
-                return ()  # DuplicateSender has reported the other vehicle. The effect is that of a lost link.
+                return ()  # The link leads to another vehicle, which DuplicateSender has reported. Nothing is sent.
             if message is None or message.ID in COMMANDS:
                 choice.record_command(now)
             return self._peers_on(self._link_reaching(choice, (system_id, component_id)), system_id, component_id)
@@ -286,7 +286,7 @@ class MultiLinkRoutes:
     def update(self, now: float) -> None:
         for system_id, choice in self._choices.items():
             for link, candidate in choice.candidates.items():
-                # The counts are first, because frames may have waited while the event loop was blocked.
+                # After a pause of the event loop, `received_at` is too old until the counts are recorded.
                 if counters := self._counters.get((system_id, link), {}).values():
                     received = sum(counter.received for counter in counters)
                     lost = sum(counter.lost for counter in counters)
@@ -350,8 +350,8 @@ class MultiLinkRoutes:
             return
         if before is not None:
             # Unsent data is discarded, because it must not arrive after newer commands that are sent over the new link.
-            # The link cannot tell for which system the data is. Data for other systems is lost, too, which their
-            # commands and transfers treat like any other loss: nothing arrives late.
+            # The link cannot tell for which system the data is, so data for other systems is lost, too. Their commands
+            # and transfers repeat it like any other lost data.
             self._link.discard_unsent_of(before.link)
             self._merged.reset(system_id)
             name = self._link.names[used.link]

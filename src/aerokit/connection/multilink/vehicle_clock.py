@@ -111,8 +111,8 @@ class HardwareId(NamedTuple):
     """Hardware id from AUTOPILOT_VERSION. If all fields are zero, the vehicle has no hardware id.
 
     ArduPilot sends the processor's serial number as ``uid2`` (on Linux and in simulation the machine id), and no
-    ``uid``. PX4 sends both; in simulation ``uid2`` is a constant and ``uid`` the system id. Equal ids therefore prove
-    nothing, while different ids prove that there are two vehicles.
+    ``uid``. PX4 sends both; in simulation ``uid2`` is a constant and ``uid`` the system id. Different ids therefore
+    prove that there are two vehicles, but equal ids do not prove that there is only one.
     https://mavlink.io/en/messages/common.html#AUTOPILOT_VERSION
     """
 

@@ -190,9 +190,9 @@ class RunningCommands:
     Sends IN_PROGRESS while they run, and handles COMMAND_CANCEL.
 
     A repeated transmission (COMMAND_LONG with a confirmation) does not execute its command again. The answer is
-    IN_PROGRESS while the command runs, and its result for five seconds after the end. Only a stop command is executed
-    again after its end. While a command runs, another one with the same MAV_CMD is TEMPORARILY_REJECTED, unless it
-    stops the first one. New commands are also rejected in this way while ``MAX_RUNNING_COMMANDS`` run.
+    IN_PROGRESS while the command runs, and its result for five seconds after the end. While a command runs, another
+    one with the same MAV_CMD is TEMPORARILY_REJECTED, unless it stops the first one. New commands are also rejected in
+    this way while ``MAX_RUNNING_COMMANDS`` run.
     """
 
     def __init__(self, host: ServerHost, server: CommandDispatcher) -> None:
@@ -220,7 +220,8 @@ class RunningCommands:
             self._server.answer(command, MavResult.IN_PROGRESS, running.progress)
             return None
         ended = self._ended.get((command.command, command.sender))
-        if ended is not None and not is_stop:  # The first transmission of a new command to stop may have been lost.
+        # A stop command is executed again, because it may be a new one whose first transmission was lost.
+        if ended is not None and not is_stop:
             ended_command, outcome, ended_at = ended
             if _is_repeated(command, ended_command) and self._host.now - ended_at <= RESULT_MAX_AGE_S:
                 self._server.answer(command, *outcome)

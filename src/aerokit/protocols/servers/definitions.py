@@ -18,8 +18,8 @@ _ZEROS: dict[str, SettingValue] = {"bool": False, "float": 0.0, "double": 0.0, "
 class DefinedParameterServer(ExtendedParameterServer):
     """Settings that a camera definition defines.
 
-    Write-only settings are not listed. The answer to a value that the definition does not allow is VALUE_UNSUPPORTED;
-    the answer to a change of a read-only or excluded setting is FAILED.
+    Write-only settings are not listed. A value that the definition does not allow is answered with VALUE_UNSUPPORTED,
+    a change of a read-only or excluded setting with FAILED.
     """
 
     def __init__(self, host: ServerHost, definition: CameraDefinition) -> None:
@@ -65,7 +65,7 @@ class DefinedParameterServer(ExtendedParameterServer):
     def set(self, name: str, data: bytes, kind: int) -> tuple[int, bytes, int]:
         """Set a value, now or later. Return PARAM_ACK, and the value and type to report.
 
-        A setting in `slow` is set after its time.
+        A setting in `slow` is set later.
         """
         setting = self.definition.settings.get(name)
         if setting is None:

@@ -229,7 +229,7 @@ class FileTree:
     def open(self, path: str, *, writing: bool = False, create: bool = False) -> FileHandle:
         """Open a file. ``create`` creates a missing file and empties an existing one.
 
-        A file in a mount can be written only with ``writing``. Any other file can always be written.
+        ``writing`` matters only for files in a mount. Other files can be written without it.
         """
         mounted = self.mounted(path)
         if mounted is not None:

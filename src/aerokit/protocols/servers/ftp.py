@@ -62,8 +62,9 @@ class SessionFtpServer(Generic[FilesT]):
 
     A session is closed when its client has sent nothing for ``session_timeout_s``. A burst sends ``burst`` blocks every
     ``burst_interval_s`` seconds, and none while ``is_congested()``. A burst ends after 35 kB, and the client must
-    request the next burst, so that a single request with a forged sender cannot cause a whole file to be sent. If a
-    request is repeated, its stored reply is sent again. Replies with file content are not stored, but made anew.
+    request the next burst. A single request with a forged sender therefore cannot cause a whole file to be sent.
+
+    If a request is repeated, its stored reply is sent again. Replies with file content are not stored, but made anew.
     Subclasses for firmware that behaves differently override methods.
     """
 
@@ -112,7 +113,7 @@ class SessionFtpServer(Generic[FilesT]):
         for peer in self._peers.values():
             with suppress(FileFault):
                 self._close_all(peer)
-            if peer.checksum_file is not None:  # No later step will close it.
+            if peer.checksum_file is not None:  # The file is still open if the checksum is not complete.
                 with suppress(FileFault):
                     peer.checksum_file.close()
         self._peers.clear()
@@ -126,10 +127,10 @@ class SessionFtpServer(Generic[FilesT]):
         return request.client
 
     def _is_repeated(self, peer: FtpPeer, request: FtpPacket, reply: FtpPacket) -> bool:
-        """Return True if this request repeats the latest one, and ``reply`` answers the latest one."""
-        # Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0. The last
-        # reply of a burst has a higher number, so that the whole burst is sent again.
+        """Return True if the request repeats the client's latest request, and ``reply`` answers that request."""
+        # Equal sequence numbers are not sufficient, because MAVProxy starts each operation with number 0.
         is_same = peer.request is not None and request.repeats(peer.request)
+        # The last reply of a burst has a higher number. If its request is repeated, the whole burst is sent again.
         reply_sequence = (request.sequence + 1) & 0xFFFF
         return is_same and request.opcode == reply.request_opcode and reply_sequence == reply.sequence
 
@@ -169,7 +170,7 @@ class SessionFtpServer(Generic[FilesT]):
             self._answer(peer, request)
 
     def _answer(self, peer: FtpPeer, request: FtpPacket) -> None:
-        """Execute a request. A handler that returns None answers later."""
+        """Execute a request, and send the answer. A handler that returns None sends the answer itself, later."""
         handler = _HANDLERS.get(request.opcode)
         peer.request = request
         peer.reply = None  # The reply to the previous request must not be sent again.

@@ -78,9 +78,11 @@ class MissionServer:
 
     An upload that ``validate`` has accepted replaces the whole list. A missing item is requested again every
     ``retry_interval_s`` seconds. An upload without progress for ``timeout_s`` seconds ends with OPERATION_CANCELLED.
-    During an upload, uploads of other clients and requests to clear are DENIED; downloads are answered. While
-    ``validate`` decides on a MISSION_CLEAR_ALL, uploads and other requests to clear are DENIED, but a repeated request
-    is ignored. Subclasses for firmware that behaves differently override methods.
+
+    During an upload, uploads of other clients and all MISSION_CLEAR_ALL are DENIED. While ``validate`` decides on a
+    MISSION_CLEAR_ALL, uploads and other MISSION_CLEAR_ALL are DENIED. Downloads are always answered.
+
+    Subclasses for firmware that behaves differently override methods.
     """
 
     retry_interval_s: ClassVar[float] = 0.5
@@ -300,8 +302,8 @@ class MissionServer:
         self._end(upload, _Result.OPERATION_CANCELLED)
 
     def _on_item(self, message: AnyItem, channel: Channel) -> None:
-        # As in ArduPilot (MissionItemProtocol.cpp), the sequence is checked before the sender, and the upload's channel
-        # gets the answer.
+        # As in ArduPilot (MissionItemProtocol.cpp), another sender's item is DENIED only if its number is the expected
+        # one. The answer is sent over the channel of the upload.
         upload = self._uploads.get(self._key(message.mission_type))
         if upload is None or message.mission_type != upload.mission_type:
             self._answer_item(message, _Result.ERROR, channel)

@@ -76,13 +76,13 @@ class ZenohConnect(NetworkLink):
     ) -> None:
         super().__init__(f"zenoh://{check_name('fleet', fleet)}/{check_name('name', name)}")
         if control not in CONTROL_MODES:
-            raise InvalidArgument(f"control = {control!r} is not allowed: it must be {', '.join(CONTROL_MODES)}")
+            raise InvalidArgument(f"control = {control!r} is not allowed: it must be 'free', 'take' or 'never'")
         self.client: str = check_name("client", client or _own_name())
         """Name of this client on the network."""
         self._keys = KeySpace(fleet, name)
         self._options = options or NetworkOptions()
         self._open_timeout_s = open_timeout_s
-        # True until a beacon shows that this client has control, so that the request is repeated.
+        # True while control must be requested, which ends when a beacon shows that this client has it.
         self._takes_control = control == "take"
         self._nonce = random.getrandbits(32)  # distinguishes this link from others that use the same client name
         self._tracker = VehicleSideTracker(self._nonce, "never" if control == "never" else "free")

@@ -217,8 +217,8 @@ class ClientFilter:
         """Count a refused frame. Return a notice of it, or nothing if another was sent a moment ago."""
         self.refused += 1
         name = f"message {frame.message_id}" if message is None else message.NAME
-        # A late command gets no answer. A client that has sent the command again would process it as the answer to the
-        # new command.
+        # A late command gets no answer, because the client may have sent it again. The client would take an answer to
+        # the first transmission for an answer to the second one.
         answer = b"" if message is None or is_late else _answer(frame, message, reason)
         noticed_at, unreported = self._notices.get(name, (-NOTICE_INTERVAL_S, 0))
         # A notice with an answer is sent at once, because the client waits for the answer to its command.
@@ -374,8 +374,9 @@ class VehicleSideTracker:
         self._delays = DelayEstimator()
 
     def receive_beacon(self, beacon: Beacon, now: float) -> bool:
-        """Record a beacon. Return False if it is late, outdated, or not from the tracked vehicle side.
+        """Record a beacon. Return False for a beacon that is ignored.
 
+        A beacon is ignored if it is late, if a newer one was already received, or if another vehicle side has sent it.
         A vehicle side is a program that serves the vehicle to clients.
         """
         if beacon.epoch != self.epoch:
