@@ -14,7 +14,7 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# A function that takes a plan, and calls the plan with the scheduler of the flight.
+# Calls its argument, a function that schedules faults, with the scheduler of the flight.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
@@ -42,8 +42,8 @@ class FaultInjector:
         def is_true() -> bool:
             return condition(true_point(self._vehicle))
 
-        def schedule_when_true(plan: Callable[[FlightScheduler], None]) -> None:
-            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(plan, scheduler)))
+        def schedule_when_true(schedule: Callable[[FlightScheduler], None]) -> None:
+            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(schedule, scheduler)))
 
         return FaultInjector(self._vehicle, schedule_when_true)
 

@@ -125,7 +125,7 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def vehicles(self) -> list[aerokit.Vehicle]:
-        """The program's vehicles, connected."""
+        """The connected `aerokit.Vehicle` of each flight."""
         return [flight.vehicle for flight in self._flights]
 
     @property
@@ -223,10 +223,10 @@ class SimulatedFleet(Sequence[Flight]):
                 " use flight.run(main), and in a fixture `async with open_flight()`"
             )
 
-    def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
-        """Call ``plan`` with the scheduler at the current time, and run events that are due."""
+    def _schedule_with(self, schedule: Callable[[FlightScheduler], None]) -> None:
+        """Call ``schedule`` with the scheduler at the current time, and run events that are due."""
         self._refresh()
-        plan(self._scheduler)
+        schedule(self._scheduler)
         if self._server is not None:
             self._server.wake()
 
