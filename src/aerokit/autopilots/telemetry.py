@@ -136,7 +136,7 @@ _ALSO_STREAMED = (
 # Class names of messages that at least one autopilot sends as a stream. Other messages are sent when needed.
 STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
 
-# Lowest type byte that counts as each FIRMWARE_VERSION_TYPE, and the suffix of its version texts.
+# Pairs of a FIRMWARE_VERSION_TYPE and the suffix of version texts. Bytes between two types count as the lower type.
 _VERSION_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 
 

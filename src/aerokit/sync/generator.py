@@ -353,7 +353,7 @@ def _class(page: Page, twin: Twin) -> str:
 
 
 def _opener(page: Page, path: str) -> str:
-    """Return the source of a blocking function that opens an object on a loop thread, such as ``connect``."""
+    """Return the source of the blocking version of a function such as ``connect``."""
     module, _, name = path.rpartition(".")
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):

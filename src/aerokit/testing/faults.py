@@ -25,7 +25,7 @@ class FaultInjector:
     reboot of the vehicle. Raises InvalidArgument for a time or share out of range.
     """
 
-    # With these slots, setting an attribute of `Faults` on this object by mistake raises AttributeError.
+    # With slots, setting an attribute of `Faults` here instead of on `all` raises AttributeError.
     __slots__ = ("_schedule_with", "_vehicle")
 
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:

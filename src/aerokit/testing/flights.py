@@ -146,7 +146,7 @@ class SimulatedFleet(Sequence[Flight]):
         save_picture([flight.track for flight in self], path)
 
     def _closest_approach(self) -> tuple[float, float, str]:
-        """Return the minimum 3D distance between two vehicles in metres, its time, and their names."""
+        """Return the minimum 3D distance between two vehicles in metres, the time, and the names of these vehicles."""
         closest = (math.inf, 0.0, "")
         for first, second in combinations(self, 2):
             distance_m, time_s = min_distance_m(first.track, second.track)

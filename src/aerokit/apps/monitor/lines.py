@@ -54,7 +54,7 @@ def age(seconds: float) -> str:
 
 
 class VehicleText:
-    """Texts of one vehicle. While no heartbeats arrive, values are dim, and one line shows for how long."""
+    """Texts of one vehicle. Without heartbeats, values are dim, and one line says how long the vehicle is silent."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
