@@ -69,8 +69,7 @@ _SECONDS: dict[str, Rule] = {
 def checks_arguments(cls: type[ClassT]) -> type[ClassT]:
     """Class decorator that checks the arguments of the class's own public methods.
 
-    Inherited, static and class methods, and properties, are not checked. Time-outs and other durations must be above
-    0.
+    Inherited methods, static methods, class methods and properties are not checked. Durations must be above 0.
     """
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and inspect.isfunction(member):

@@ -104,11 +104,11 @@ class ReadOnly:
     """
 
     def __setattr__(self, name: str, value: object) -> None:
-        """Set an attribute of the program or of this library; refuse one that reports the vehicle's state."""
+        """Refuse to set an attribute that reports the vehicle's state. Set any other attribute."""
         attribute = inspect.getattr_static(type(self), name, None)
         is_setter = isinstance(attribute, property) and attribute.fset is not None
         is_descriptor = hasattr(type(attribute), "__get__")
-        # A program may replace a method, for example by a mock. Attributes without a descriptor are those that the
+        # A program may replace a method, for example by a mock. Without a descriptor, the attribute is one that the
         # constructor sets or the program adds.
         if name.startswith("_") or is_setter or callable(attribute) or not is_descriptor:
             object.__setattr__(self, name, value)

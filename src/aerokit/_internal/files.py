@@ -61,7 +61,7 @@ def decompress(data: bytes, name: str) -> bytes:
     """Decompress ``.xz`` data. Other data is returned unchanged.
 
     Raises FileFormatError if the data is damaged, needs too much memory, or decompresses to more than
-    :data:`MAX_FILE_SIZE`. The text begins with ``name``.
+    :data:`MAX_FILE_SIZE`. The error text begins with ``name``.
     """
     if not data.startswith(_XZ_MAGIC):
         return data

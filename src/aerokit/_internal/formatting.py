@@ -20,8 +20,8 @@ def to_jsonable(value: object) -> Any:
 
     - an object with ``to_dict()`` (position, state, event): a dictionary of its fields, whose names include the units;
     - a MAVLink message: the same, with its name first: ``{"message": "HEARTBEAT", …}``;
-    - a string, a boolean or None: unchanged, also a member of an enum whose members are strings;
-    - any other enum member: its name in the standard; a combination of flags: a list of names;
+    - a string, a boolean or None: unchanged;
+    - an enum member: its name in the standard; a combination of flags: a list of names;
     - a time: ISO 8601; a duration: seconds; bytes: hexadecimal digits; infinity and NaN: None;
     - a mapping: a dictionary; any other iterable: a list;
     - an exception, or anything else: its text.

@@ -56,18 +56,18 @@ class Readiness(NamedTuple):
 def readiness(vehicle: Vehicle, reasons: Sequence[str] | None = None, *, changes_mode: bool = False) -> Readiness:
     """Return the reasons why a vehicle cannot arm, and why it cannot fly. Nothing is sent.
 
-    ``reasons`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against arming follow from the
-    known state. With ``changes_mode``, the present mode is no reason, because `Vehicle.arm` will change it.
+    ``reasons`` is the result of ``vehicle.why_not_armable()``. With None, the reasons against arming are derived from
+    the received states. With ``changes_mode``, the present mode is not checked, because `Vehicle.arm` will change it.
     """
     grouped = _grouped(vehicle, reasons)
-    if reasons is not None or changes_mode:  # `reasons` already includes the mode
+    if reasons is not None or changes_mode:  # `reasons` includes a refusal because of the mode
         return grouped
     against_arming = dict.fromkeys([*_refused_mode(vehicle), *grouped.against_arming])
     return grouped._replace(against_arming=tuple(against_arming))
 
 
 def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
-    """Like `readiness`, without the reason that the mode itself does not allow arming."""
+    """Like `readiness`, but do not check whether the mode itself allows arming."""
     missing = vehicle.missing_for_flight()
     against_arming = tuple(_needed_to_arm(vehicle, missing) if reasons is None else reasons)
     sensors = vehicle.sensors.latest
@@ -79,7 +79,7 @@ def _grouped(vehicle: Vehicle, reasons: Sequence[str] | None) -> Readiness:
         all_reasons = dict.fromkeys([*missing, *against_arming])
         return Readiness(refusals, tuple(text for text in all_reasons if text not in refusals))
     is_known = not any(text.startswith(REPORTS_ABOUT_ARMING) for text in against_arming)
-    # `against_arming` may contain a status text that consists of a prefix and a reason from `missing`.
+    # `against_arming` may contain a status text, such as "PreArm: …", whose reason is also in `missing`.
     without_prefix = {vehicle.autopilot.arming_reason(text) for text in against_arming}
     against_flight = tuple(text for text in missing if text not in against_arming and text not in without_prefix)
     return Readiness(against_arming, against_flight, is_known)
@@ -96,7 +96,7 @@ def _needed_to_arm(vehicle: Vehicle, missing: Sequence[str]) -> list[str]:
     needed = []
     for text in missing:
         is_missing_position = text.startswith(("the estimator has no ", "no GPS receiver has "))
-        # A report that was not received shows nothing about the vehicle, which may have the estimate.
+        # If a report was not received, the vehicle may nevertheless have the estimate.
         is_missing_report = text.startswith(("estimator (", "position (", "home (")) and text.endswith(" not received)")
         if (needs_position or not is_missing_position) and not is_missing_report:
             needed.append(text)
@@ -121,14 +121,14 @@ def not_armable(vehicle: Vehicle, missing: list[str]) -> list[str]:
     arms_in = None if mode is None else mode.name
     if unarmable is not None:
         arms_in = unarmable["arms_in"]
-    # In modes that need no position, ArduPilot arms although most of these conditions are missing.
+    # In modes that need no position, ArduPilot arms without most of these conditions.
     if arms_in is None or not autopilot.modes_without_position or arms_in in autopilot.modes_without_position:
         return []
     estimator = vehicle.estimator.latest
     if estimator is not None and estimator.missing:
         change = "" if unarmable is None else ", to which arming would change the mode"
         headline = f"{autopilot.firmware} needs a position to arm in {arms_in}{change}"
-        # A value that was not received may exist on the vehicle, so its absence here is no known reason.
+        # The vehicle may have a value that was not received, so such a value is not named as a reason.
         return [headline, *(text for text in missing if not text.endswith(" not received)"))]
     return []
 
@@ -210,7 +210,7 @@ class ArmingCheckRequests:
 
 async def run_arming_checks(vehicle: Vehicle) -> None:
     """Ask a vehicle why it cannot arm. It answers with status texts."""
-    with contextlib.suppress(AerokitError):  # the state shows whether the vehicle answers
+    with contextlib.suppress(AerokitError):  # the vehicle is silent, which its state shows
         await vehicle.why_not_armable()
 
 

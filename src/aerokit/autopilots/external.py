@@ -31,8 +31,8 @@ class ExternalRule(Snapshot):
     - ``required``: the names of each parameter in several firmware versions, and its suitable values. The autopilot
       ignores the measurements unless all these parameters have one of these values.
     - ``sole_source``: the name of each parameter, and its suitable values. If all have one of these values, the
-      measurement is the estimator's only source of position or velocity. The vehicle must have the first parameter; of
-      the others, those that it does not have are ignored.
+      measurement is the estimator's only source of position or velocity. The vehicle must have the first parameter.
+      Others that it does not have are ignored.
     """
 
     required: tuple[tuple[tuple[str, ...], tuple[float, ...]], ...] = ()
@@ -62,10 +62,7 @@ class ExternalRules(Snapshot):
 
 
 def _external_navigation(quantity: str) -> ExternalRule:
-    """Return the rule for measurements that ArduPilot reads if VISO_TYPE is set (AP_VisualOdom).
-
-    ``quantity`` is POSXY or VELXY.
-    """
+    """Return the rule for ArduPilot's external navigation (AP_VisualOdom). ``quantity`` is POSXY or VELXY."""
     # With these values, the estimator has no other source of `quantity`: 6 is ExternalNav, and 0 is none.
     sole_source = (
         (f"EK3_SRC1_{quantity}", (6.0,)),

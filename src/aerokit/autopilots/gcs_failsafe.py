@@ -60,10 +60,9 @@ navigator parameters of PX4.
 
 
 def gcs_failsafe(firmware: str, value_of: Callable[[str], float | None]) -> tuple[str | None, str | None]:
-    """Return the parameter that decides what happens without the ground station, and the action.
+    """Return the name of the parameter that decides about the failsafe, and its action, such as ``lands``.
 
-    The action is a part of a sentence, such as ``lands``. It is None if ``value_of`` returns None, because the value
-    is unknown. Both results are None if no parameter sets an action.
+    The action is None if ``value_of`` returns None for the parameter. Both are None if no parameter sets an action.
     """
     for name, actions in GCS_FAILSAFE_ACTIONS.get(firmware, {}).items():
         value = value_of(name)

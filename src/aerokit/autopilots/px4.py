@@ -101,7 +101,7 @@ class Px4(Autopilot):
     setpoints: SetpointRules = SetpointRules(stream_before_mode=True, attitude_rate=True, trajectory=True)
     sticks: StickRules | None = StickRules(release="none")
     external: ExternalRules = PX4_EXTERNAL
-    actuators_until: tuple[int, int] | None = (1, 14)  # Commit 27658354 removed the message.
+    actuators_until: tuple[int, int] | None = (1, 14)  # Commit 27658354 removed SET_ACTUATOR_CONTROL_TARGET.
     reposition: Reposition | None = Reposition(relative_altitude=False, yaw=True, speed=True)
     gimbals: GimbalRules = GimbalRules(
         has_secondary=False,

@@ -15,7 +15,7 @@ PREARM_CHECK = Sensor.MAV_SYS_STATUS_PREARM_CHECK.value
 
 POS_HORIZ_ABS = Estimate.POS_HORIZ_ABS.value
 
-# Estimates that arming requires in a mode that needs a position, besides the position itself.
+# Besides a position, arming requires these estimates in modes that need a position.
 ATTITUDE_AND_HEIGHT = Estimate.ATTITUDE.value | Estimate.POS_VERT_ABS.value
 
 # MAV_SYS_STATUS_SENSOR (https://mavlink.io/en/messages/common.html#MAV_SYS_STATUS_SENSOR)
@@ -136,7 +136,7 @@ _ALSO_STREAMED = (
 # Class names of messages that at least one autopilot sends as a stream. Other messages are sent when needed.
 STREAMED_MESSAGES = frozenset((*(name for names in _GROUPS.values() for name in names), *_ALSO_STREAMED))
 
-# Lowest type byte that counts as each FIRMWARE_VERSION_TYPE, and the suffix of its version texts.
+# Pairs of a FIRMWARE_VERSION_TYPE and the suffix of version texts. Bytes between two types count as the lower type.
 _VERSION_TYPES = ((255, ""), (192, "-rc"), (128, "-beta"), (64, "-alpha"), (0, "-dev"))
 
 

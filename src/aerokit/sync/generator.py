@@ -111,7 +111,7 @@ def arguments_of(arguments: ast.arguments) -> list[str]:
 def _lines(arguments: Iterable[str], indent: str) -> str:
     lines = ""
     for argument in arguments:
-        # An argument that is too long is wrapped before its `| None`, if any.
+        # Like ruff, break a line that is too long before `| None`.
         head, none, tail = argument.rpartition(" | None")
         if none and len(indent) + len(argument) + 1 > WIDTH:
             argument = f"{head}\n{indent}{none.lstrip()}{tail}"
@@ -149,7 +149,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "component_twins": ("aerokit.onboard.opening.component",),
 }
 
-# Maps each page to the module and name of the function that opens these contexts on a loop thread.
+# Maps each page to the hand-written function (module and name) that opens these contexts on a loop thread.
 OPENERS = {
     "twins": ("aerokit.sync.blocks", "opened"),
     "fleet_twins": ("aerokit.sync.fleet_blocks", "opened_fleet"),
@@ -190,10 +190,9 @@ class Page:
         self._page_of_other_twins = {twin.name: twin.page for twin in TWINS if twin.page != self.name}
 
     def import_names_in(self, node: ast.AST | None, modules: tuple[str, ...], *, at_run_time: bool = False) -> None:
-        """Import the names in an expression. Without ``at_run_time``, they are for type checkers only.
+        """Add the imports for an expression. Without ``at_run_time``, they are for type checkers only.
 
-        A name that one of ``modules`` imports is imported from the same place. Other names come from the first of the
-        modules.
+        ``modules`` import the names. Names that none of them imports are defined in the first one.
         """
         if node is None:
             return
@@ -213,7 +212,7 @@ class Page:
             return
         imports = (imports_of(module) for module in modules)
         origin = next((imported[name] for imported in imports if name in imported), (modules[0], name))
-        _, original_name = origin  # an empty string for a module, which is imported itself
+        _, original_name = origin  # "" if `name` is an imported module
         # If several modules export a name, it is always imported from the module that was found first.
         origin = self._import_sources.setdefault(original_name or name, origin)
         if at_run_time:
@@ -236,7 +235,7 @@ class Page:
                     self.at_run_time.add((origin_module, origin_name))
 
     def wrapped_in_twin(self, expression: str, returns: ast.expr | None) -> str:
-        """Return the expression, wrapped in the blocking class (twin) of its type if there is one."""
+        """Return the expression or, if its type has a twin, the expression that creates the twin."""
         optional_name = outer_name(without_none(returns))
         if optional_name in self._twins:
             return f"None if {expression} is None else {optional_name}(self._loop, {expression})"
@@ -244,7 +243,7 @@ class Page:
         return f"{name}(self._loop, {expression})" if name in self._twins else expression
 
     def render_member(self, twin: Twin, member: ClassMember) -> str:
-        """Return the source of the twin of a member, and add the imports that the source needs."""
+        """Return the source of a member of a twin, and add the imports that it needs."""
         self.import_names_in(member.returns, member.module)
         node = member.node
         if node is None or not {"property", "cached_property"}.isdisjoint(decorators_of(node)):
@@ -286,7 +285,7 @@ class Page:
     def _property_twin(self, twin: Twin, member: ClassMember) -> str:
         name = member.name
         read = f"self.aio.{name}"
-        if name in twin.called:
+        if name in twin.read_on_loop:
             read = f"self._loop.call(lambda: {read})"
         wrapped = self.wrapped_in_twin(read, member.returns)
         if name in twin.parts:
@@ -354,7 +353,7 @@ def _class(page: Page, twin: Twin) -> str:
 
 
 def _opener(page: Page, path: str) -> str:
-    """Return the source of a blocking function that opens an object on a loop thread, such as ``connect``."""
+    """Return the source of the blocking version of a function such as ``connect``."""
     module, _, name = path.rpartition(".")
     node = function_node(module, name)
     for argument in (*node.args.args, *node.args.kwonlyargs, node.args.vararg):
@@ -388,8 +387,7 @@ def _import_lines(names: set[tuple[str, str]], indent: str) -> str:
 def _from_lines(module: str, names: set[tuple[str, str]], indent: str) -> str:
     imported = sorted((name for name_module, name in names if name_module == module and name), key=_by_kind)
     plain_names = [name for name in imported if " as " not in name]
-    # Statements are sorted by their first imported name, which is the key in `statements`. As in ruff's format, each
-    # name with "as" has its own statement.
+    # As in ruff's format, each name with "as" has its own statement. The keys are the first imported names.
     statements = {name: f"{indent}from {module} import {name}\n" for name in imported if name not in plain_names}
     if plain_names:
         statement = f"{indent}from {module} import {', '.join(plain_names)}\n"

@@ -86,9 +86,9 @@ class LoopThread:
         return self._run(False, False, function, *args, **kwargs)
 
     def run_shielded(self, function: Callable[P, Awaitable[T]], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Like :meth:`run`, for short clean-up functions that must not be interrupted.
+        """Like :meth:`run`, but wait without limit for the end of the function after Ctrl-C.
 
-        Ctrl-C waits for the function and then raises KeyboardInterrupt. A second Ctrl-C does not wait.
+        The function must shield what Ctrl-C must not cancel. A second Ctrl-C ends the wait.
         """
         return self._run(True, True, function, *args, **kwargs)
 
@@ -110,7 +110,7 @@ class LoopThread:
     ) -> T:
         """Run a function. With ``must_start``, it is started even after Ctrl-C.
 
-        If the wait is interrupted, the call is cancelled. The end of a shielded call is then awaited without limit.
+        After Ctrl-C, the function is cancelled. With ``is_shielded``, its end is awaited without limit.
         """
         call: _Call[T] | None = None
         try:
@@ -125,7 +125,7 @@ class LoopThread:
                 with contextlib.suppress(AerokitError):
                     self._start(call)
             if call is not None:
-                self._cancel(call)  # Clean-up functions shield what must not be cancelled.
+                self._cancel(call)  # A shielded function shields what must not be cancelled.
                 wait_s = SIGNAL_CHECK_INTERVAL_S if is_shielded else INTERRUPTED_CALL_TIMEOUT_S
                 while call.is_scheduled and not call.wait(wait_s):
                     may_wait_on = is_shielded and self._thread.is_alive()  # Only clean-up is awaited without limit.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Twin:
-    """A twin class to generate.
+    """A blocking class to generate, the twin of an asynchronous class.
 
     Attributes:
         path: dotted path of the asynchronous class, with its module.
@@ -26,9 +26,9 @@ class Twin:
         only: generate only these members.
         without: do not generate these members.
         special: generate these dunder methods, too.
-        direct: methods that only read, and that the twin calls on the caller's thread.
-        called: properties that the twin reads on the loop.
-        parts: properties that the twin reads on the loop once, because the first access creates their value.
+        direct: methods to call on the caller's thread, because they only read.
+        read_on_loop: properties to read on the loop at each access.
+        parts: properties to read on the loop once, because the first access creates their value.
         parameter: type argument of the base class.
         page: the file that it is written to.
     """
@@ -40,7 +40,7 @@ class Twin:
     without: frozenset[str] = frozenset()
     special: frozenset[str] = frozenset()
     direct: frozenset[str] = frozenset()
-    called: frozenset[str] = frozenset()
+    read_on_loop: frozenset[str] = frozenset()
     parts: frozenset[str] = frozenset()
     parameter: str = ""
     page: str = "twins"
@@ -74,18 +74,18 @@ TWINS = (
         "ConnectionTwin",
         only=_names("send subscribe link_state links signing unsent_bytes discard_unsent is_open now counts"),
         direct=_names("now"),
-        called=_names("unsent_bytes"),
+        read_on_loop=_names("unsent_bytes"),
     ),
     Twin("aerokit.vehicle.commanding.guided.SetpointStream", "StreamTwin", parameter="SetpointT"),
     Twin("aerokit.vehicle.commanding.guided.Guided"),
-    Twin("aerokit.vehicle.commanding.follow.FollowStream", "BlockTwin", called=_names("target distance_m")),
+    Twin("aerokit.vehicle.commanding.follow.FollowStream", "BlockTwin", read_on_loop=_names("target distance_m")),
     Twin("aerokit.vehicle.commanding.sticks.StickStream", "BlockTwin"),
     Twin("aerokit.vehicle.external.streams.MeasurementStream", "MeasurementTwin", parameter="MeasurementT"),
     Twin("aerokit.vehicle.external.external.External"),
     Twin("aerokit.vehicle.gimbal.control.GimbalControl", "BlockTwin"),
     Twin("aerokit.vehicle.gimbal.rates.GimbalRates", "BlockTwin"),
-    Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", called=_names("device_id")),
-    Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", called=_names("ids"), parameter='"Gimbal"'),
+    Twin("aerokit.vehicle.gimbal.gimbal.Gimbal", read_on_loop=_names("device_id")),
+    Twin("aerokit.vehicle.gimbal.gimbal.Gimbals", "GimbalsTwin", read_on_loop=_names("ids"), parameter='"Gimbal"'),
     Twin("aerokit.vehicle.commanding.posted.PostedOrder"),
     Twin("aerokit.vehicle.files.files.Files"),
     Twin("aerokit.vehicle.files.log_stream.LogStream", "LogStreamTwin"),
@@ -108,7 +108,7 @@ TWINS = (
     Twin("aerokit.vehicle.camera.photos.PhotoInterval", "PhotoIntervalTwin"),
     Twin("aerokit.vehicle.camera.cameras.Camera"),
     Twin("aerokit.vehicle.components.settings.Settings", direct=_names("known")),
-    Twin("aerokit.vehicle.components.component.Component", called=_names("files parameters settings")),
+    Twin("aerokit.vehicle.components.component.Component", read_on_loop=_names("files parameters settings")),
     Twin(
         "aerokit.vehicle.vehicle.Vehicle",
         "VehicleTwin",
@@ -131,7 +131,7 @@ TWINS = (
         "aerokit.onboard.component.OnboardComponent",
         "ComponentTwin",
         without=_names("command message connection"),
-        called=_names("missions sources"),
+        read_on_loop=_names("missions sources"),
         page="component_twins",
     ),
     Twin("aerokit.fleets.formation.Following", "BlockTwin", direct=_names("error_m"), page="fleet_twins"),
@@ -190,7 +190,7 @@ class ClassMember:
 
 
 def members_of(twin: Twin) -> list[ClassMember]:
-    """Return the members of a twin to generate, including inherited ones, in the order of their first definition."""
+    """Return the members of a twin, including inherited ones, in the order of their first definition."""
     cls = _class_of(twin)
     classes_of_base_twin = next((_class_of(base).__mro__ for base in TWINS if base.name == twin.inherits), ())
     members: dict[str, ClassMember] = {}
@@ -209,12 +209,11 @@ def _class_of(twin: Twin) -> type:
 
 
 def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
-    """Return a function that replaces the type variables of generic bases by their arguments."""
+    """Return a function that replaces type variables in a member by the type arguments of the bases of ``cls``."""
     arguments: dict[str, str] = {}
     for base in getattr(cls, "__orig_bases__", ()):
         names = [parameter.__name__ for parameter in getattr(get_origin(base), "__parameters__", ())]
-        # Only forward references replace type variables. The arguments of a base are either all forward references, so
-        # that `values` matches `names`, or none of them is, so that `values` is empty.
+        # The arguments of a base are all forward references, or none is. In the second case, nothing is replaced.
         values = [argument.__forward_arg__ for argument in get_args(base) if isinstance(argument, ForwardRef)]
         arguments |= dict(zip(names, values))  # noqa: B905 - `values` may be empty
 
@@ -232,7 +231,7 @@ def _type_argument_filler(cls: type) -> Callable[[ClassMember], ClassMember]:
 
 
 def _own_members(cls: type) -> Iterator[ClassMember]:
-    """Yield the class's own methods, its states, and the public attributes that ``__init__`` sets."""
+    """Yield the class's own methods, its `StateField`s, and the public attributes that ``__init__`` sets."""
     body = _class_node(cls).body
     for index, node in enumerate(body):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):

@@ -86,9 +86,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     def add_event_source(self, next_due: Callable[[], float], run: Callable[[], None]) -> Callable[[], None]:
         """Call ``run`` each time the clock reaches ``next_due()``. Return a function that removes the event source.
 
-        An event source costs a fraction of a timer that is set again after each call, because it needs no iteration of
-        the loop. ``next_due`` returns seconds on this clock, or infinity for never. After each ``run``, ``next_due``
-        must return a later time. Event sources run before timers of the same instant.
+        An event source is much faster than a timer that sets itself again, because it needs no iteration of the loop.
+        ``next_due`` returns seconds on this clock, or infinity for never. After each ``run``, ``next_due`` must return
+        a later time. Event sources run before timers of the same instant.
         """
         source = (next_due, asyncio.Handle(run, (), self))
         self._sources.append(source)
@@ -116,8 +116,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             super()._run_once()  # type: ignore[misc]
             return
         if not ready:
-            # The event sources have made no callback ready. If they stopped because a poll is due, or if there is no
-            # timer to jump to, the next iteration polls or runs them again.
+            # If a poll is due, the next iteration polls. Without a timer, it runs the event sources again.
             if self._iterations >= _POLL_EVERY or self._next_timer() == math.inf:
                 return
             # Otherwise, the next event is a timer.

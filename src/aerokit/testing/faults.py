@@ -14,7 +14,7 @@ from aerokit.testing.stage import FlightScheduler
 from aerokit.testing.track import true_point
 from aerokit.testing.track_points import TrackPoint
 
-# A function that takes a plan, and calls the plan with the scheduler of the flight.
+# Calls its argument, a function that schedules faults, with the scheduler of the flight.
 ScheduleWith = Callable[[Callable[[FlightScheduler], None]], None]
 
 
@@ -25,7 +25,7 @@ class FaultInjector:
     reboot of the vehicle. Raises InvalidArgument for a time or share out of range.
     """
 
-    # With these slots, setting an attribute of `Faults` on this object by mistake raises AttributeError.
+    # With slots, setting an attribute of `Faults` here instead of on `all` raises AttributeError.
     __slots__ = ("_schedule_with", "_vehicle")
 
     def __init__(self, vehicle: Any, schedule_with: ScheduleWith) -> None:
@@ -42,8 +42,8 @@ class FaultInjector:
         def is_true() -> bool:
             return condition(true_point(self._vehicle))
 
-        def schedule_when_true(plan: Callable[[FlightScheduler], None]) -> None:
-            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(plan, scheduler)))
+        def schedule_when_true(schedule: Callable[[FlightScheduler], None]) -> None:
+            self._schedule_with(lambda scheduler: scheduler.do_when(is_true, partial(schedule, scheduler)))
 
         return FaultInjector(self._vehicle, schedule_when_true)
 

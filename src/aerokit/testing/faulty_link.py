@@ -80,7 +80,7 @@ class StalledQueue:
             outbox.discard()
 
     def drain(self) -> None:
-        """End the stall and send the accepted bytes, then the unexpired queued bytes."""
+        """End the stall. Send the bytes that the operating system accepted, then the queued bytes."""
         self._is_stalled = False
         accepted, self._accepted = self._accepted, []
         for data, peer in accepted:
@@ -207,7 +207,7 @@ class FaultyLink(Link):
         """Resume sending after :meth:`stall`."""
         if self._stalled_queue is not None:
             self._stalled_queue.drain()
-            self._on_stalled(False)  # The queue does not report the end of a stall that began before a second `stall`.
+            self._on_stalled(False)  # After a second `stall`, the new queue does not report the end of the first stall.
 
     async def open(self, receiver: Receiver) -> None:
         """See `Link.open`."""
@@ -416,7 +416,7 @@ class _DeliveryQueue:
                 heappop(self._waiting)
                 action()
         finally:  # The other actions run even if one raises an exception. The event loop reports it.
-            # An action may have called `put`, which may have set a timer for an action that has run since.
+            # If an action has called `put`, the new timer may be for an action that has already run.
             if self._timer is not None:
                 self._timer.cancel()
                 self._timer = None

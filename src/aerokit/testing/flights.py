@@ -125,7 +125,7 @@ class SimulatedFleet(Sequence[Flight]):
 
     @property
     def vehicles(self) -> list[aerokit.Vehicle]:
-        """The program's vehicles, connected."""
+        """The connected `aerokit.Vehicle` of each flight."""
         return [flight.vehicle for flight in self._flights]
 
     @property
@@ -146,7 +146,7 @@ class SimulatedFleet(Sequence[Flight]):
         save_picture([flight.track for flight in self], path)
 
     def _closest_approach(self) -> tuple[float, float, str]:
-        """Return the minimum 3D distance between two vehicles in metres, its time, and their names."""
+        """Return the minimum 3D distance between two vehicles in metres, the time, and the names of these vehicles."""
         closest = (math.inf, 0.0, "")
         for first, second in combinations(self, 2):
             distance_m, time_s = min_distance_m(first.track, second.track)
@@ -223,10 +223,10 @@ class SimulatedFleet(Sequence[Flight]):
                 " use flight.run(main), and in a fixture `async with open_flight()`"
             )
 
-    def _schedule_with(self, plan: Callable[[FlightScheduler], None]) -> None:
-        """Call ``plan`` with the scheduler at the current time, and run events that are due."""
+    def _schedule_with(self, schedule: Callable[[FlightScheduler], None]) -> None:
+        """Call ``schedule`` with the scheduler at the current time, and run events that are due."""
         self._refresh()
-        plan(self._scheduler)
+        schedule(self._scheduler)
         if self._server is not None:
             self._server.wake()
 

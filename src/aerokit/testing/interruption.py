@@ -20,8 +20,8 @@ _CONTEXT_FILES = ("interruption.py", "served.py")
 class Interruption:
     """Raises KeyboardInterrupt in the main thread, but only within a block of `allowed`.
 
-    Python may run a signal handler long after the signal was sent. If it runs while the block is being entered or
-    left, no code would catch the exception, so the signal is sent again. After the block, no signal is pending.
+    Python may run the signal handler while the block is being entered or left, when no code would catch the exception.
+    The handler then raises nothing, and the signal is sent again. After the block, no signal is pending.
     """
 
     def __init__(self) -> None:

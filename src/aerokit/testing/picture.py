@@ -160,9 +160,9 @@ def _shapes(tracks: Sequence[Drawable]) -> list[_Shape]:
     return _map(drawn) + _profile(drawn) + _legend(drawn) if drawn else []
 
 
-_MAX_X_TICKS = 6
-_MAX_Y_TICKS = 5
-_MAX_Y_TICKS_OF_LOW_CHART = 3
+_MAX_X_INTERVALS = 6
+_MAX_Y_INTERVALS = 5
+_MAX_Y_INTERVALS_OF_LOW_CHART = 3
 _LOW_CHART = 200  # A chart of up to this many pixels is low.
 
 
@@ -194,12 +194,12 @@ class _Axes:
         shapes: list[_Shape] = []
         bottom = self.top + self.height
         right = self.left + self.width
-        for value in _ticks(self.x_range, _MAX_X_TICKS):
+        for value in _ticks(self.x_range, _MAX_X_INTERVALS):
             x, _ = self.place(value, 0.0)
             shapes.append(_GridLine((x, self.top), (x, bottom)))
             shapes.append(_Text(x, bottom + 15, f"{value:g} {x_unit}", "middle"))  # 15 pixels below the axis
-        max_y_ticks = _MAX_Y_TICKS if self.height > _LOW_CHART else _MAX_Y_TICKS_OF_LOW_CHART
-        for value in _ticks(self.y_range, max_y_ticks):
+        max_y_intervals = _MAX_Y_INTERVALS if self.height > _LOW_CHART else _MAX_Y_INTERVALS_OF_LOW_CHART
+        for value in _ticks(self.y_range, max_y_intervals):
             _, y = self.place(0.0, value)
             shapes.append(_GridLine((self.left, y), (right, y)))
             # The text is 5 pixels left of the axis, and its baseline 4 pixels lower, so that it is centered on it.
@@ -347,10 +347,10 @@ def _span(bounds: tuple[float, float]) -> float:
     return high - low
 
 
-def _ticks(bounds: tuple[float, float], max_count: int) -> list[float]:
-    """Return at most ``max_count`` + 1 round numbers in a range, as labels of an axis."""
+def _ticks(bounds: tuple[float, float], max_intervals: int) -> list[float]:
+    """Return round numbers in a range, as labels of an axis, with at most ``max_intervals`` intervals between them."""
     low, high = bounds
-    min_step = (high - low) / max_count
+    min_step = (high - low) / max_intervals
     power_of_ten: float = 10.0 ** math.floor(math.log10(min_step))
     step = next(factor * power_of_ten for factor in (1.0, 2.0, 5.0, 10.0) if factor * power_of_ten >= min_step)
     return [round(number * step, 6) for number in range(math.ceil(low / step), math.floor(high / step) + 1)]

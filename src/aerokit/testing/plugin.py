@@ -200,7 +200,7 @@ def _runnable_function(item: pytest.Function) -> Callable[..., Any]:
     test: Callable[..., Any] = item.obj
     marked_test = getattr(test, _TEST_WITH_OPEN_FLIGHTS, None)
     if marked_test is not None:  # The test has the asyncio marker.
-        # If `test` is a plain function, pytest-asyncio has wrapped the test, to run it on pytest-asyncio's loop.
+        # pytest-asyncio may have replaced the test by a plain function, which runs it on pytest-asyncio's loop.
         wrapped_by_pytest_asyncio = None if inspect.iscoroutinefunction(test) else test
         return _on_virtual_time(marked_test, try_first=wrapped_by_pytest_asyncio)
     if not fleets or not inspect.iscoroutinefunction(test):
@@ -239,7 +239,7 @@ def _only_on_virtual_time(test_with_open_flights: Callable[..., Any]) -> Callabl
             raise _NotVirtualTime
         await test_with_open_flights(**arguments)
 
-    # pytest-asyncio copies the attribute to its wrapper, where `_runnable_function` reads it.
+    # pytest-asyncio copies this attribute to the function that wraps `run`. `_runnable_function` reads it there.
     setattr(run, _TEST_WITH_OPEN_FLIGHTS, test_with_open_flights)
     return run
 

@@ -201,9 +201,9 @@ class RecordedVehicle(SimulatedVehicle):
     """Plays a ``.tlog`` by the simulator's clock. Requests of clients do not change the streamed messages.
 
     - Commands: a command gets the acknowledgements that were recorded for the same params or, if there are none, for
-      other params, with the recorded delays. If it was recorded several times, each repetition gets the next recorded
-      answer, and further ones get the last. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the
-      latest played message of this type or, if none was played yet, the first in the recording.
+      other params. Their delays are those of the recording. A repeated command gets the recorded answers in turn, and
+      then always the last. Commands that were not recorded are UNSUPPORTED. REQUEST_MESSAGE sends the latest played
+      message of this type or, if none was played yet, the first in the recording.
     - Parameters: the vehicle has the recorded parameters, renumbered without gaps. Only parameters that were set in the
       recording can be set. A request for another parameter gets PARAM_ERROR if the recorded vehicle ever sent
       PARAM_ERROR, otherwise no answer.
@@ -340,7 +340,7 @@ class RecordedVehicle(SimulatedVehicle):
             candidates = answers
         if not candidates:
             return None
-        # The commands are counted by their list of candidates. An answer may be in several lists.
+        # Commands with the same candidates get them in turn.
         list_id = tuple(map(id, candidates))
         count = self._answered_counts.get(list_id, 0)
         self._answered_counts[list_id] = count + 1

@@ -39,7 +39,7 @@ class TrackPoint:
 
 @dataclass(frozen=True)
 class TrackFailure:
-    """The point and the limit of a failed assertion, which pictures of the track show."""
+    """The point and the limit of a failed assertion. Pictures of the track show both."""
 
     point: TrackPoint
     circle: tuple[Position, float] | None = None

@@ -87,7 +87,7 @@ def _add_publishing(
 def _add_common(action: argparse.ArgumentParser, default_hz: float, max_hz: float, what: str) -> None:
     """Add the options that all bridges have.
 
-    The help texts call a published value ``what``.
+    ``what`` is the word for a published value in the help texts.
     """
     action.add_argument(
         "--rate",

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from aerokit.logs.report import Report
 
-# Maps suffixes of written files to the noun for the number `Conversion.written`. For other suffixes, the noun is "row".
-# An .mcap has more messages than the log has entries, because it also has a message for each changed state.
+# Maps suffixes of files to what `Conversion.written` counts. In other files, it counts rows. An .mcap has more messages
+# than the log has entries, because it also has a message for each changed state.
 _WRITTEN_NOUNS = {".mcap": "message", ".gpx": "point", ".kml": "point"}
 _REQUIRED_MODULES = {".mcap": "mcap", ".parquet": "pyarrow", ".gpx": "gpxpy", ".kml": "simplekml"}
 

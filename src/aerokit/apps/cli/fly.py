@@ -67,7 +67,7 @@ class PlanFlight(SupervisedFlight):
         self.sent_text = "the upload was not completed, nothing was armed"
         await upload_parts(vehicle, self._plan, self._options)
         self.sent_text = "the plan is on the vehicle, nothing was armed"
-        # Other stations cannot reach a simulated vehicle.
+        # Another station may change the mission before the start, but it cannot reach a simulated vehicle.
         uploaded_mission = () if self._options.sim else await self._download_mission()
         if self._options.record is not None:
             await record_parameters(vehicle, self._print)

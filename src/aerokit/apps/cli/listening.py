@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 # If more events wait because the terminal prints slowly, the oldest are dropped and counted.
 _MAX_WAITING_EVENTS = 1000
-_POLL_INTERVAL_S = 0.1  # of a stopped terminal
+_POLL_INTERVAL_S = 0.1  # how often to check whether a stopped terminal accepts output again
 _SEVERITIES = ("EMERGENCY", "ALERT", "CRITICAL", "ERROR", "WARNING", "NOTICE", "INFO", "DEBUG")
 # The countdown ends after this time. The command then continues to wait without a countdown.
 _COUNTDOWN_S = 30.0
@@ -251,7 +251,7 @@ def _printing_kept_name(path: str | None) -> Iterator[None]:
     if path is None or not os.path.isfile(path):
         yield
         return
-    # Textual hides the log message about the new name.
+    # The link logs the new name, but Textual hides log messages.
     earlier = os.stat(path)
     yield
     for kept in Path(path).resolve().parent.iterdir():

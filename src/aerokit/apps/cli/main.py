@@ -40,9 +40,10 @@ RUN = "run"
 class CliCommand:
     """A subcommand, ``aerokit NAME``. Its module is imported only when the command is called.
 
-    ``location`` is ``"module"`` or ``"module:function"`` in `aerokit.apps.cli`. The function, by default
-    ``add_arguments``, adds the command's arguments to a parser, and sets ``run`` to a coroutine function that takes the
-    parsed options and returns the exit code. The first sentence of ``description`` appears in the list of commands.
+    ``location`` is ``"module"`` or ``"module:function"`` in `aerokit.apps.cli`; the default function is
+    ``add_arguments``. The function adds the command's arguments to a parser. It also sets ``run``: a coroutine function
+    that takes the parsed options and returns the exit code. The first sentence of ``description`` appears in the list
+    of commands.
     """
 
     name: str

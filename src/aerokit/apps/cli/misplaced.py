@@ -88,7 +88,7 @@ def _address_before_action(parser: argparse.ArgumentParser, words: list[str]) ->
     address, *after_address = words
     action, *arguments = after_address or ["ACTION"]
     actions = next(item.choices for item in parser._actions if isinstance(item, argparse._SubParsersAction))
-    # For an unknown or a missing action, the first one shows whether the actions of this command take --connect.
+    # An unknown or missing action is treated like the first one.
     action_parser = actions.get(action) or next(iter(actions.values()))
     takes_connect = "--connect" in action_parser._option_string_actions
     address_words = ["--connect", address] if takes_connect else [address]

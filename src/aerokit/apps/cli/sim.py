@@ -122,7 +122,7 @@ def _recorded(path: str, count: int) -> SimulatedVehicle:
 
 
 def _accepted_options(vehicle_class: type) -> set[str]:
-    """Return the names of a class's constructor arguments, also of those that it passes to base classes."""
+    """Return the names of a class's constructor arguments, including those that it passes on to base classes."""
     names: set[str] = set()
     for cls in vehicle_class.__mro__:
         if "__init__" not in vars(cls):

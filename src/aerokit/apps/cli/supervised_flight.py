@@ -68,7 +68,7 @@ class SupervisedFlight(ABC):
     It never commands a vehicle that was armed before the flight, or that another party has put into another mode.
     """
 
-    _prints_reasons = True  # False if the reasons are part of the error that the command prints at its end
+    _prints_reasons = True  # False if the command prints the error with all reasons at its end
 
     def __init__(self, vehicle: Vehicle, report: FlightReport, interrupts: InterruptStack, on_interrupt: str) -> None:
         self._vehicle = vehicle
@@ -81,7 +81,7 @@ class SupervisedFlight(ABC):
         self._may_arm_late = False  # True while the result of a sent arm command is unknown
         self._modes_armed_in: set[str] = set()
         self._has_changed_mode = False  # True once a command of this program has changed the mode after arming
-        self._has_left_mode = False  # True once the armed vehicle was in a mode other than those it was armed in
+        self._has_left_mode = False  # True once the armed vehicle was in a mode that is not in `_modes_armed_in`
 
     async def fly(self) -> int:
         """Perform the flight, and return the exit code.
@@ -113,7 +113,7 @@ class SupervisedFlight(ABC):
 
     @abstractmethod
     def _our_purposes(self) -> tuple[Purpose, ...]:
-        """Return purposes, such as "mission". In their flight modes, this program has control."""
+        """Return the purposes (such as "mission") of the modes in which this program has control."""
 
     def _check_disarmed(self) -> None:
         now = self._vehicle.describe_now()
@@ -159,7 +159,7 @@ class SupervisedFlight(ABC):
             self._print(f"no further commands: vehicle {self._vehicle.describe_now()}{advice}")
 
     async def _after_failure(self, error: Exception) -> int:  # subclasses use the error
-        """Make the vehicle safe after an error. `fly` ignores the exit code."""
+        """Make the vehicle safe after an error. The exit code is not used."""
         vehicle = self._vehicle
         if vehicle.is_confirmed_disarmed:
             await self._watch_late_arming()
@@ -251,7 +251,7 @@ class SupervisedFlight(ABC):
     def _is_in_our_mode(self) -> bool:
         vehicle = self._vehicle
         if not (self._has_changed_mode or self._has_left_mode) and vehicle.mode_name in self._modes_armed_in:
-            return self._is_armed_on_ground  # In this mode, only a pilot can have taken off.
+            return self._is_armed_on_ground  # This program has not taken off, so a pilot flies a vehicle in the air.
         modes = [vehicle.autopilot.mode_for(purpose, is_vtol=vehicle.is_vtol) for purpose in self._our_purposes()]
         return vehicle.mode_name in [mode.name for mode in modes if mode is not None]
 

@@ -327,7 +327,7 @@ class Monitor(App[None]):
         model = self._model
         size = widget.content_size
         homes = []
-        for vehicle in model.vehicles.values():  # a home is shown only together with a track
+        for vehicle in model.vehicles.values():  # without a track, a home is not shown
             home = vehicle.home.latest
             if home is not None and model.tracks.get(vehicle.system_id):
                 homes.append(model.metres(home.latitude_deg, home.longitude_deg))

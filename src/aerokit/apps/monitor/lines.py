@@ -54,7 +54,7 @@ def age(seconds: float) -> str:
 
 
 class VehicleText:
-    """Texts of one vehicle. While no heartbeats arrive, values are dim, and one line shows for how long."""
+    """Texts of one vehicle. Without heartbeats, values are dim, and one line says how long the vehicle is silent."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
@@ -77,7 +77,7 @@ class VehicleText:
         """Return the lines of the state panel as labels and values.
 
         With ``more``, less important values are included. ``size`` is the number of columns and lines of the panel.
-        Free lines show more reasons that prevent a flight.
+        Unused lines show further reasons that prevent a flight.
         """
         rows = self._main_rows() + (self._more_rows() if more else [])
         if not self._silent_s:
@@ -85,7 +85,7 @@ class VehicleText:
             width = columns - max(len(label) for label, _ in rows) - _LABEL_PADDING
             unused_lines = lines - len(rows)
             label = "missing" if self._failsafe is None else "failsafe"
-            # This replaces the second row, which shows only one reason. An active failsafe is the first of the reasons.
+            # The second row shows only one reason. Replace it by all reasons that fit, an active failsafe first.
             rows[1] = (label, self._missing(1 + unused_lines, width))
         return rows
 

@@ -423,7 +423,7 @@ class HttpApi:
     async def _parameters(self, request: Request) -> Response:
         vehicle = self._vehicle_of(request)
         is_refresh = self._is_refresh(request)
-        # A report reads the parameters of a recording from PARAM_VALUE, not from MAVFTP.
+        # A recording needs PARAM_VALUE messages, because reports do not read parameters from MAVFTP.
         is_recorded = vehicle.connection._observers.recording is not None
         async with self._lock(vehicle):
             table = await vehicle.parameters.download(method="list" if is_recorded else "auto", refresh=is_refresh)

@@ -74,8 +74,8 @@ class FlightWatch:
         # Start of the time without motion after the impact, and number of velocity reports since then.
         self._still_since = math.inf
         self._still_samples = 0
-        self._moving_since = math.inf  # when the crashed vehicle began to move
-        self._take_off_height_m: float | None = None  # height at which the crashed vehicle reported a take-off
+        self._moving_since = math.inf  # after a crash: when the vehicle began to move
+        self._take_off_height_m: float | None = None  # after a crash: height at which the vehicle reported a take-off
         self._armed_at: float | None = None  # None if the vehicle was armed before this object was created
         self._armed_until = -math.inf  # when the vehicle was last disarmed
         self._was_in_air = False  # True if the vehicle was in the air since the last arming
@@ -154,8 +154,8 @@ class FlightWatch:
         self._was_in_air = self._was_in_air or landed in _IN_AIR
         has_taken_off = before == MavLandedState.ON_GROUND and landed in _IN_AIR
         if has_taken_off and self._crash is not None and self._vehicle.armed.latest:
-            # The landed state of a crashed vehicle with running motors may change again and again, although it lies
-            # still. It counts as flying again once it has climbed or, if its height is unknown, at once.
+            # A crashed vehicle with running motors may report take-offs although it lies still. It counts as flying
+            # once it has climbed from this height. If its height is unknown, it counts as flying at once.
             self._take_off_height_m = height_above_home(self._vehicle.telemetry)
             if self._take_off_height_m is None:
                 self._dismiss_impact()

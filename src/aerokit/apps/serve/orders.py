@@ -82,9 +82,9 @@ class OrderType:
     max_body_size: int = MAX_BODY_SIZE
 
     def check(self, values: Mapping[str, Any]) -> None:
-        """Raise InvalidArgument for unknown and missing arguments, and for wrong uses of booleans.
+        """Raise InvalidArgument for unknown and missing arguments, and for a boolean in place of another type.
 
-        Ranges and all other types are checked by the method that the order calls.
+        A boolean argument accepts only booleans. Other types and ranges are checked by the method that the order calls.
         """
         for name in values:
             if name not in self.arguments:
@@ -146,7 +146,7 @@ async def _set_parameter(vehicle: Vehicle, values: dict[str, Any], metadata: Met
 def parameter_order(metadata: Metadata | None) -> OrderType:
     """Return the order type that sets a parameter.
 
-    Its result has a note if the value's range was not checked.
+    The result of such an order has a note if the value's range was not checked.
     """
     return replace(SET_PARAMETER, run=partial(_set_parameter, metadata=metadata))
 
@@ -171,7 +171,7 @@ async def _upload(vehicle: Vehicle, values: dict[str, Any]) -> None:
 def parse_plan_body(values: Mapping[str, Any]) -> tuple[str, str, Plan]:
     """Return the name, the text and the plan of a request body.
 
-    Its ``plan`` is a .plan as JSON object, or the text of a file. Raises the errors of `parse_plan_text`.
+    The field ``plan`` has a .plan as JSON object, or the text of a file. Raises the errors of `parse_plan_text`.
     """
     name = values.get("name")
     name = name[:100] if isinstance(name, str) else "plan"
@@ -346,7 +346,7 @@ class OrderRunner:
             return earlier
         if earlier is not None:
             raise HttpProblem(409, "KeyUsed", "this Idempotency-Key was used for another order; nothing was sent")
-        # The key may belong to this same order. A retry with a new key would then execute it again.
+        # The client may be retrying this same order. With a new key, it would be executed again.
         if key in self._used_keys:
             raise HttpProblem(
                 409,

@@ -223,8 +223,7 @@ class ServedVehicles:
             **overview(vehicle),
             "missing_for_flight": missing,
             "not_armable": not_armable(vehicle, missing),
-            # `self.crash` is None for a silent vehicle, because orders must not rely on it. The page shows the last
-            # known crash.
+            # For a silent vehicle, `self.crash` is None, because it allows orders. The page shows the last known crash.
             "crash": self.crash(vehicle) if is_connected else watch.crash,
             "disarming": watch.disarming,
             "disarm_parameter": watch.disarm_parameter,
@@ -244,7 +243,7 @@ class ServedVehicles:
 
 
 def _log_unexpected(error: Exception) -> None:
-    # An AerokitError is about the vehicle or the link, whose states show it.
+    # An AerokitError is not logged, because the states of the vehicle and of the link show its cause.
     if not isinstance(error, AerokitError):
         logger.error("a task of aerokit serve has failed", exc_info=error)
 
@@ -252,7 +251,7 @@ def _log_unexpected(error: Exception) -> None:
 def _thin_out(track: list[tuple[Position, bool]]) -> None:
     """Remove every second point of a full track. The first and the last point stay."""
     pairs = zip(track[2::2], track[3::2], strict=False)
-    # The mark of a gap moves to the next point.
+    # If the first point after a gap is removed, the next point is marked instead.
     track[2:] = [(position, is_after_gap or removed[1]) for removed, (position, is_after_gap) in pairs]
 
 
@@ -262,7 +261,6 @@ async def _read_return_altitude(vehicle: Vehicle) -> None:
 
 
 def _is_flying_mission(vehicle: Vehicle) -> bool:
-    """Return True if the vehicle is in its mission mode, and may be armed."""
-    # `mission.pause` requires the mission mode.
+    """Return True if the vehicle is in its mission mode and not known to be disarmed."""
     mode = vehicle.autopilot.mode_for("mission", is_vtol=vehicle.telemetry.is_vtol)
     return mode is not None and vehicle.telemetry.is_in(mode) and not vehicle.telemetry.is_confirmed_disarmed
