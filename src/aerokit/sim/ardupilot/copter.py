@@ -221,7 +221,7 @@ class SimulatedCopter(CopterHost):
             return _BASE | _GUIDED
         flags = _BASE
         mode_name = self.mode.name
-        # GUIDED_ENABLED is set in modes that use a position, but in RTL only while armed. A motor test does not count.
+        # GUIDED_ENABLED is set in modes that use a position. In RTL, it is set only while armed, not in a motor test.
         if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
             flags |= _GUIDED
         if self.is_armed:
@@ -284,7 +284,8 @@ class SimulatedCopter(CopterHost):
         if heading is None:
             return MavResult.FAILED
         direction = to_int(command.param3)
-        # A relative turn of more than 180 degrees must not take the shorter way (autoyaw.cpp). 0 then means clockwise.
+        # A relative turn of more than 180 degrees must not take the shorter way (autoyaw.cpp). The direction 0 means
+        # clockwise in a relative turn.
         if command.param4 == 1.0:
             direction = direction or 1
         self.yaw.turn_to(heading, math.radians(command.param2), direction)

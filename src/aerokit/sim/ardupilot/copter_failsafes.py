@@ -293,10 +293,10 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 
 
 class CopterFence(ArduPilotFence[CopterHost]):
-    """Executes FENCE_ACTION. With 0, the breach is only reported; other values change the mode.
+    """Executes FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL or RTL (3), BRAKE (4), SMART_RTL (5).
 
-    The modes are 1: RTL, 2: LAND, 3: SMART_RTL and, if this is refused, RTL, 4: BRAKE, 5: SMART_RTL. The copter changes
-    to LAND if they are all refused, or if it is more than 100 m outside the fence.
+    If these modes are refused, or more than 100 m outside the fence, the copter changes to LAND. On the ground, it
+    disarms, except with 0.
     """
 
     PERIOD_S: ClassVar[float] = 0.1

@@ -248,7 +248,7 @@ class CopterSetpoints:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_position_missing = point is None and Setpoint.of(target).has_position
-        # If the message sets no position, `_follow` does not fly to the point, so an invalid point becomes zero.
+        # `_follow` ignores the point of a message that sets no position, so zero can replace an invalid point.
         is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
         if not is_followed:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
@@ -256,8 +256,8 @@ class CopterSetpoints:
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
         """Follow a set-point. Return False if it is invalid.
 
-        ``point`` is its position in the world frame. With ``rotate``, its velocity, acceleration and yaw are in the
-        body frame.
+        ``point`` is the position in the world frame. With ``rotate``, velocity, acceleration and yaw are in the body
+        frame.
         """
         setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None

@@ -285,7 +285,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a text: during the boot at once, later after the answer to the present command, like the firmware."""
+        """Send a text after the answer to the present command. During the boot, send it at once, like the firmware."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:
