@@ -27,8 +27,8 @@ _MAX_CORRECTIONS = 1000
 class VehicleSigning:
     """Message signing of ArduPilot and PX4. After SETUP_SIGNING has set the key, the ports sign and check frames.
 
-    ``key`` and ``timestamp`` (units of 10 µs since 2015) are the stored values. All ports share the record of the time
-    stamps of accepted frames, which is cleared at power-on.
+    ``key`` and ``timestamp`` (units of 10 µs since 2015) are the stored values. All ports share one record of the time
+    stamps of accepted frames. A power-on clears this record.
     """
 
     AHEAD: ClassVar[int] = 0

@@ -28,7 +28,7 @@ _BLOCK = 90
 class SimulatedLog:
     """A log file of a simulated vehicle. Its content does not describe a flight.
 
-    The content is `SAMPLE_LOG`, then pseudo-random bytes that depend on ``seed`` or, if that is None, on size and time.
+    The content is `SAMPLE_LOG`, then pseudo-random bytes. ``seed`` selects them; None uses size and time as the seed.
     """
 
     size: int

@@ -124,9 +124,7 @@ class ArduPilotParameterServer(ParameterServer):
         else:
             value = self.clamped(name, request.param_value)
             self._parameters[name] = rounded(value, self._parameters.type(name))
-            # The released firmware, which `sends_errors` selects, confirms the value on the sender's port before the
-            # broadcast.
-            if self.sends_errors:
+            if self.sends_errors:  # The released firmware also confirms the value on the sender's port.
                 self.send(name, UNKNOWN_INDEX, channel)
             self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
 

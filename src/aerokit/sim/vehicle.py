@@ -351,7 +351,7 @@ class SimulatedVehicle:
                 port.write(data)
 
     def send_built(self, message_id: int, channel: Channel | None = None) -> None:
-        """Build the message with this id from the current state, and send it; send nothing if `build` returns None."""
+        """Build the message with this id and send it. Send nothing if `build` returns None."""
         message = self.build(message_id)
         if message is not None:
             self.send(message, channel)

@@ -238,7 +238,7 @@ class SimulatedCopter(CopterHost):
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
         keeps_flying = self.motors.is_armed and (self.mode.is_taking_off or not self.mode.notices_landing)
         on_ground_for = self._on_ground_timer.seconds(is_on_ground and not keeps_flying, self.now)
-        # A disarmed copter counts as landed as soon as it touches the ground; an armed one after `_LAND_DETECTOR_S`.
+        # An armed copter counts as landed `_LAND_DETECTOR_S` after the touchdown, a disarmed copter at once.
         if on_ground_for >= _LAND_DETECTOR_S or (on_ground_for > 0.0 and not self.motors.is_armed):
             self.is_landed: bool = True
             self._on_ground_timer.reset()

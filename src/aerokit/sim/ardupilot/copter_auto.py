@@ -428,7 +428,7 @@ class CopterAuto(MissionMode):
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
-        if item.param4 > 0:  # The angle is relative; the direction (param 3) is its sign.
+        if item.param4 > 0:  # The angle is relative. The direction (param 3) is its sign.
             direction = direction or 1
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction)
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)

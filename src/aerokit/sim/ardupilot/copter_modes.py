@@ -34,7 +34,7 @@ class AutoYaw:
         self._copter.motion.turn(0.0)
 
     def apply_default(self, *, returning: bool = False) -> None:
-        """Apply WP_YAW_BEHAVIOR, which ends a commanded heading or region of interest."""
+        """Apply WP_YAW_BEHAVIOR. This ends a commanded heading or region of interest."""
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
         if behaviour == _YAW_AHEAD or (behaviour == _YAW_AHEAD_EXCEPT_RTL and not returning):
             self._control = self._look_ahead

@@ -132,8 +132,8 @@ class ArduPilotFence(Generic[HostT]):
     """Checks the height, the distance from home and the uploaded zones. `update` is called ten times a second.
 
     FENCE_STATUS reports a breach. In `act`, a subclass adds the reaction of its firmware. This class itself is the
-    fence of ArduSub, which is checked only while armed, and reports breaches without a reaction. Braking before the
-    fence (AVOID_ENABLE) is not simulated.
+    fence of ArduSub: it has no reaction and is checked only while armed. Braking before the fence (AVOID_ENABLE) is
+    not simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
@@ -257,7 +257,7 @@ class ArduPilotFence(Generic[HostT]):
         """Return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
-        is_floor_kept = self._floor_enabled_by_command is True  # Only a command can disable the limit then.
+        is_floor_kept = self._floor_enabled_by_command is True  # Nothing else disables it then.
         if may_be_low and not is_floor_kept and self.enabled & _MIN_ALT:
             self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0

@@ -31,9 +31,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     A worker processes the queue every 2 ms, except during a burst, which cannot be stopped. The queue has space for
     five requests. Further requests are lost. A request that repeats the last sequence number gets the last reply again.
 
-    The client chooses the session number. A session with an open file blocks other sessions until the file is closed,
-    or until its client has sent nothing for 3 s. A close is always acknowledged, even if writing failed.
-    `Faults.no_ftp` turns the server off.
+    The client chooses the session number. A session blocks other sessions until its file is closed, or until 3 s after
+    its last reply. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the server off.
     """
 
     max_sessions: ClassVar[int] = 1

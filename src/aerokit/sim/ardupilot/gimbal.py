@@ -218,7 +218,7 @@ class ArduPilotGimbal:
             self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
-        """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given."""
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates. Values that are not given are NaN."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         (_, pitch, yaw), (_, pitch_rate, yaw_rate) = angles, rates
         if flags & GimbalManagerFlags.RETRACT:

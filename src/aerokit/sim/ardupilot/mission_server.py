@@ -142,8 +142,8 @@ class ArduPilotMissionServer(MissionServer):
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         client, kind = sender_of(request), request.mission_type
-        # This reproduces a bug of the firmware, which compares the command of the item, instead of its index, with the
-        # index of the current item.
+        # The firmware has a bug: it compares the command of the item, not its index, with the index of the current
+        # item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
         if isinstance(request, m.MissionRequestInt):
             return item_message_int(item, request.seq, client, kind, current=current)

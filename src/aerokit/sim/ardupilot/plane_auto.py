@@ -186,8 +186,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         has_no_place = (item.x, item.y) == (0, 0)
         if has_no_place:
             north, east = own_north, own_east
-        # In two cases, the altitude 0 means the altitude of the plane: for loitering, if the frame is relative
-        # (Location.cpp, sanitize), and for other commands, if the coordinates are 0 (commands.cpp, set_next_WP).
+        # Loitering at the altitude 0 in a relative frame keeps the plane's altitude (Location.cpp, sanitize). Other
+        # commands keep it if both altitude and coordinates are 0 (commands.cpp, set_next_WP).
         may_omit_altitude = item.frame not in _ABSOLUTE if manoeuvre == _LOITER else has_no_place
         if item.z == 0 and may_omit_altitude:
             down = own_down

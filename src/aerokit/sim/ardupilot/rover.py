@@ -147,8 +147,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
-        # The text and the parameter are those of the link that is checked first after the timeout, even if only the
-        # other link is lost (failsafe.cpp, failsafe_trigger).
+        # The text and the parameter are those of the link that is checked first, even if only the other link is lost
+        # (failsafe.cpp, failsafe_trigger).
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
         rover.rc.release_overrides()

@@ -246,8 +246,8 @@ class SimulatedSub(SubHost):
     vehicle has 1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the
     sticks), GUIDED, AUTO and SURFACE. By default, the vehicle can be armed without a position. Take-off is UNSUPPORTED.
 
-    Not simulated: currents, and CIRCLE, SURFTRAK and MOTORDETECT, which behave like ALT_HOLD. A reboot moves the
-    vehicle to the surface.
+    CIRCLE, SURFTRAK and MOTORDETECT behave like ALT_HOLD. Currents are not simulated. A reboot moves the vehicle to
+    the surface.
     """
 
     KIND: ClassVar[Kind] = "sub"

@@ -149,7 +149,7 @@ class SubAuto(RoverSubAuto):
 
 
 class SubGuided(_Mode):
-    """GUIDED: moves to a place, or with a velocity, which expires after three seconds. Without a target it stops."""
+    """GUIDED: moves to a place, or for up to three seconds with a velocity. Without a target it stops."""
 
     number: int = SubMode.GUIDED
     name = "GUIDED"

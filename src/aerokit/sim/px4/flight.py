@@ -137,8 +137,8 @@ class Px4Flight:
             self._vehicle.mission.enter()
 
     def stay_here(self) -> None:
-        # A vehicle that moves passes its present place, so it would have to fly back to a target there
-        # (`preproject_stop_point` in navigator_main.cpp).
+        # A target at the present place would make a moving vehicle fly back (navigator_main.cpp,
+        # preproject_stop_point).
         self.target = self._vehicle.motion.stopping_place
 
     def update(self) -> None:

@@ -29,7 +29,7 @@ class SimulatedPx4(Px4Vehicle):
     """PX4 v1.16 or v1.17 multicopter, as far as a client can observe it. `Motion` is the motion model.
 
     Not simulated: REQUEST_EVENT, returning along a mission (RTL_TYPE 2), estimator failures other than a lost GPS,
-    follow-me, external modes. A camera is a separate component, without which camera commands are not answered.
+    follow-me, external modes. Camera commands are answered only by a camera, which is a separate component.
     MNT_MODE_IN 4 enables a gimbal.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
