@@ -149,7 +149,7 @@ class LogServer:
 class ArduPilotLogServer(LogServer):
     """ArduPilot's log server. Log numbers start at 1, and requests are refused while the vehicle is armed.
 
-    Requests during a transfer, and for an unknown log, are ignored.
+    A request during a transfer, or for an unknown log, gets no data.
     """
 
     def __init__(

@@ -300,7 +300,10 @@ _SMART_RTL_EXTRA_ALTITUDE_M = 2.0
 
 
 class CopterLand(CopterModeBase):
-    """LAND: descends with WPNAV_SPEED_DN to LAND_ALT_LOW and then with LAND_SPEED, and disarms on the ground."""
+    """LAND: descends with LAND_SPEED_HIGH, below LAND_ALT_LOW with LAND_SPEED, and disarms on the ground.
+
+    If LAND_SPEED_HIGH is 0, WPNAV_SPEED_DN replaces it.
+    """
 
     needs_position = False
     can_arm = False

@@ -32,7 +32,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     five requests. Further requests are lost. A request that repeats the last sequence number gets the last reply again.
 
     The client chooses the session number. A session blocks other sessions until its file is closed, or until 3 s after
-    its last reply. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the server off.
+    the last reply. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the server off.
     """
 
     max_sessions: ClassVar[int] = 1

@@ -39,9 +39,9 @@ _LONG_MODES: dict[int, tuple[int, ...]] = {
 class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     """Failsafes of radio, ground station and battery, which act on armed and disarmed planes.
 
-    FS_SHORT_ACTN is executed a second after the radio is lost, FS_LONG_ACTN after a further FS_LONG_TIMEOUT. If the
-    radio returns before FS_LONG_ACTN, the previous mode is restored. Not simulated: the weak signal of FS_GCS_ENABL 2,
-    parachutes, termination.
+    FS_SHORT_ACTN is executed when the radio is lost, FS_LONG_ACTN after a further FS_LONG_TIMEOUT. If the radio returns
+    before FS_LONG_ACTN, the previous mode is restored. Not simulated: the weak signal of FS_GCS_ENABL 2, parachutes,
+    termination.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)

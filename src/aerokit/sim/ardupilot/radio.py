@@ -169,7 +169,7 @@ class RoverJoystick(ArduPilotJoystick):
 class SubJoystick(ArduPilotJoystick):
     """MANUAL_CONTROL of Sub: x is forward, y sideways, z vertical (500 is the middle), r yaw, s pitch and t roll.
 
-    The axes are scaled by JS_GAIN_DEFAULT, z also by JS_THR_GAIN. Buttons are ignored.
+    x, y, z and r are scaled by JS_GAIN_DEFAULT, z also by JS_THR_GAIN. Buttons are ignored.
     """
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:

@@ -354,7 +354,7 @@ class Px4Failsafes:
         self._failing = frozenset(failing)
 
     def _choose(self) -> FailsafeAction:
-        """Return the action of the worst failure or, during the delay or after an override, a milder action."""
+        """Return the action to execute because of the worst failure."""
         worst = max(self._active.values(), default=Action.NONE)
         can_hold = self._px4.has_position
         if worst in (Action.HOLD, Action.RETURN) and not can_hold:
