@@ -69,8 +69,8 @@ class SimulatorServer:
         self._dues = [0.0] * len(self.vehicles)  # simulated time of each vehicle's next event
         # Index of each vehicle in `vehicles` and `_dues`, by `id`.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
-        runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
-        self._min_wait_s = _MIN_BATCH_WAIT_S if runs_several_ticks else 0.0
+        runs_several_ticks_at_once = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD
+        self._min_wait_s = _MIN_BATCH_WAIT_S if runs_several_ticks_at_once else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None  # None before the `async with` block
         # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
         self._remove_source: Callable[[], None] | None = None

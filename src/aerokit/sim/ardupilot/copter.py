@@ -137,7 +137,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(modes.CopterStabilize, CopterMode.ACRO, "ACRO"),
     variant(modes.CopterStabilize, CopterMode.STABILIZE, "STABILIZE"),
     variant(modes.CopterPilotedMode, CopterMode.ALT_HOLD, "ALT_HOLD", needs_position=False),
-    # CIRCLE commands a movement to its circle even on the ground, so the land detector does not notice a landing.
+    # CIRCLE moves towards its circle even on the ground, so the firmware does not detect a landing.
     variant(
         modes.CopterLoiter, CopterMode.CIRCLE, "CIRCLE", takes_off=False, can_arm=False, notices_landing=False
     ),

@@ -154,7 +154,7 @@ class ArduPilotFence(Generic[HostT]):
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
         # Metres beyond the limit at which a breach counts as a new breach, by kind of fence.
         self._new_breach_m: dict[int, float] = {}
-        self._floor_enabled_by_command: bool | None = None  # value in the last command about the lower limit
+        self._floor_enabled_by_command: bool | None = None  # what the last command selected; None before
         self._recovering_since = -math.inf  # time of the last `recover_by_hand`
         self._reported_at = -math.inf  # time of the last FENCE_STATUS about a breach
         self._checked_at = -math.inf
@@ -257,7 +257,7 @@ class ArduPilotFence(Generic[HostT]):
         """Return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
-        is_floor_kept = self._floor_enabled_by_command is True  # Nothing else disables it then.
+        is_floor_kept = self._floor_enabled_by_command is True  # Only another command disables it.
         if may_be_low and not is_floor_kept and self.enabled & _MIN_ALT:
             self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0

@@ -193,7 +193,7 @@ class ArduPilotNavigation:
         self.is_healthy = True
 
     def _use_gps_when_possible(self) -> None:
-        if self.flags == _WITH_POSITION:  # `_check_gps` was first.
+        if self.flags == _WITH_POSITION:  # `_check_gps` has set the flags already.
             return
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
             self._vehicle.call_later(1.0, self._use_gps_when_possible)

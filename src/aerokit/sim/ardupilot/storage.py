@@ -104,7 +104,7 @@ _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """Message signing of ArduPilot. The time stamp is stored every 30 s. A boot starts a minute after the stored time.
+    """Message signing of ArduPilot. The time stamp is stored every 30 s. A boot adds a minute to it.
 
     The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. If the
     only link of the vehicle is a radio, set ``trusts_first_port`` to False and call `load`. Bit 0 of MAV1_OPTIONS,

@@ -201,7 +201,7 @@ class ArduPilotVehicle(ArduPilotHost):
         return True
 
     def reset_controllers(self) -> None:
-        """Reset what only this kind of vehicle has. Called at power-on, after the modes were created."""
+        """Reset the parts that only this kind of vehicle has. Called at power-on, after the modes were created."""
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
         """Return severity and text for a mode number that does not exist."""
