@@ -27,8 +27,8 @@ _MAX_CORRECTIONS = 1000
 class VehicleSigning:
     """Message signing of ArduPilot and PX4. After SETUP_SIGNING has set the key, the ports sign and check frames.
 
-    ``key`` and ``timestamp`` (units of 10 µs since 2015) are the stored values. All ports share the record of the time
-    stamps of accepted frames, which is cleared at power-on.
+    ``key`` and ``timestamp`` (units of 10 µs since 2015) are the stored values. All ports share one record of the time
+    stamps of accepted frames. A power-on clears this record.
     """
 
     AHEAD: ClassVar[int] = 0
@@ -192,7 +192,7 @@ class SimulatedAutopilot(SimulatedVehicle):
         raise NotImplementedError
 
     def on_speedup(self, speedup: float) -> None:
-        """Called by `aerokit.sim.kinds.scale_timeouts`: multiply the timeouts that no parameter sets."""
+        """Multiply the timeouts that no parameter sets. `aerokit.sim.kinds.scale_timeouts` calls this method."""
 
     def open_channel(self, *, version: int = 2) -> Channel:
         """Open another port, which has its own stream rates. ``version`` is the MAVLink version of the port."""

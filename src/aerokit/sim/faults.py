@@ -123,11 +123,11 @@ class Faults:
         return self.loss_incoming > 0.0 and rng.random() < self.loss_incoming
 
     def repeat_ack(self, command: int, count: int = 2, *, times: int | None = None) -> None:
-        """Execute the next ``times`` commands of this MAV_CMD (None: all), and acknowledge each ``count`` times."""
+        """Send ``count`` acknowledgements for each of the next ``times`` commands of this MAV_CMD (None: all)."""
         self.commands[command] = CommandFault(times, acks=count)
 
     def delay_ack(self, command: int, seconds: float, *, times: int | None = None) -> None:
-        """Acknowledge the next ``times`` commands of this MAV_CMD (None: all) ``seconds`` after their execution."""
+        """Execute the next ``times`` commands of this MAV_CMD (None: all), and acknowledge each after ``seconds``."""
         self.commands[command] = CommandFault(times, delay_s=seconds)
 
     def report_progress(

@@ -72,7 +72,7 @@ def scale_timeouts(vehicles: Iterable[SimulatedVehicle], speedup: float, *, leav
     for vehicle in vehicles:
         if isinstance(vehicle, SimulatedAutopilot):
             _scale(vehicle.parameters, speedup, leave)
-            vehicle.on_speedup(speedup)  # PX4 also keeps texts longer for a silent ground station.
+            vehicle.on_speedup(speedup)
 
 
 def _scale(parameters: SimParameters, speedup: float, leave: Collection[str]) -> None:

@@ -28,7 +28,7 @@ _BLOCK = 90
 class SimulatedLog:
     """A log file of a simulated vehicle. Its content does not describe a flight.
 
-    The content is `SAMPLE_LOG`, then pseudo-random bytes that depend on ``seed`` or, if that is None, on size and time.
+    The content is `SAMPLE_LOG`, then pseudo-random bytes. ``seed`` selects them; None uses size and time as the seed.
     """
 
     size: int
@@ -149,7 +149,7 @@ class LogServer:
 class ArduPilotLogServer(LogServer):
     """ArduPilot's log server. Log numbers start at 1, and requests are refused while the vehicle is armed.
 
-    Requests during a transfer, and for an unknown log, are ignored.
+    A request during a transfer, or for an unknown log, gets no data.
     """
 
     def __init__(

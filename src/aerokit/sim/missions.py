@@ -91,7 +91,7 @@ class _Reader(FileHandle):
 
 
 class _Writer(UploadedFile):
-    """Upload of a list of items. An incomplete or rejected upload has no effect, and no status text reports it."""
+    """Upload of a list of items. An incomplete upload has no effect. No status text reports a failed upload."""
 
     def __init__(self, store: MissionStore, type_: int) -> None:
         super().__init__()

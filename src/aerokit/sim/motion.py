@@ -80,7 +80,7 @@ GRAVITY_M_S2 = 9.80665
 # quadrotor of 450 mm does.
 _DRAG_PER_S = 0.33
 _VELOCITY_TIME_CONSTANT_S = 0.3
-# Fraction of a lean error that remains after a second, which is 50 steps of 0.02 s with a time constant of 0.15 s.
+# Share of a lean error that remains after a second. The lean has a time constant of 0.15 s, and steps of 0.02 s.
 _LEAN_KEPT_PER_S = (1.0 - 0.02 / 0.15) ** 50
 _TURN_GAIN_PER_S = 2.0
 _TERMINAL_SPEED_M_S = 25.0
@@ -199,7 +199,7 @@ class Motion:
     def stopping_place(self) -> Ned:
         """The place ahead at which :meth:`seek_position` stops the vehicle without flying back."""
         speed, deceleration = self.ground_speed_m_s, BRAKING_SHARE * self.limits.acceleration_m_s2
-        # Divided by the speed, this is the inverse of `approach_speed`.
+        # At the distance `speed * seconds`, `approach_speed` returns the present speed.
         seconds = 1.0 if speed <= deceleration else speed / (2.0 * deceleration) + deceleration / (2.0 * speed)
         return (self.north + self.velocity_north * seconds, self.east + self.velocity_east * seconds, self.down)
 

@@ -56,10 +56,10 @@ _ROUNDING_OFFSET = 0.01
 class ArduPilotParameterServer(ParameterServer):
     """Parameter protocol of ArduPilot.
 
-    With ``sends_errors``, as in the released version of 4.7, a request with an unknown name or a value of NaN or
-    infinity is answered by PARAM_ERROR, and PARAM_SET is confirmed on the sender's port before the broadcast. Without
-    ``sends_errors``, as in the development version of 4.7, such a request is not answered, and PARAM_SET is confirmed
-    only by the broadcast.
+    - Without ``sends_errors`` (the development version of 4.7), an invalid request is not answered. A change is
+      broadcast.
+    - With ``sends_errors`` (the released version of 4.7), an invalid request is answered by PARAM_ERROR. A change is
+      confirmed on the sender's port and then broadcast.
 
     One read request is served each millisecond. Up to 20 requests wait in a queue, and further requests are lost.
     The banner texts are sent before a list.
@@ -124,9 +124,7 @@ class ArduPilotParameterServer(ParameterServer):
         else:
             value = self.clamped(name, request.param_value)
             self._parameters[name] = rounded(value, self._parameters.type(name))
-            # The released firmware, which `sends_errors` selects, confirms the value on the sender's port before the
-            # broadcast.
-            if self.sends_errors:
+            if self.sends_errors:  # The released firmware also confirms the value on the sender's port.
                 self.send(name, UNKNOWN_INDEX, channel)
             self._vehicle.call_later(0.0, lambda: self.send(name, UNKNOWN_INDEX, None))
 
@@ -149,7 +147,7 @@ _UNUSED_INDEX = 24400
 
 
 class Px4ParameterServer(ParameterServer):
-    """Parameter protocol of PX4. With ``sends_errors``, it sends PARAM_ERROR, as PX4's main branch, but not v1.16.
+    """Parameter protocol of PX4. With ``sends_errors``, it sends PARAM_ERROR, as PX4 does after version 1.16.
 
     Values are stored without a check. PARAM_SET is confirmed on the sender's port, and a change is broadcast shortly
     after. Setting _HASH_CHECK stops a running list. A second list request restarts the list, without the hash.
@@ -191,7 +189,7 @@ class Px4ParameterServer(ParameterServer):
 
     def _on_set(self, request: ParamSet, channel: Channel) -> None:
         name, parameters = request.param_id, self._parameters
-        if name == HASH_NAME:  # By this request, the client stops the running list, because it knows the parameters.
+        if name == HASH_NAME:  # A client that knows the parameters already stops the list by this request.
             self.stop_list(channel)
         code = self._error_for(name, request.param_type)
         if code is not None:

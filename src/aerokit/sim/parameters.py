@@ -70,8 +70,8 @@ class SimParameters:
     def from_text(cls, text: str, *, used: Iterable[str] = (), count: int | None = None) -> SimParameters:
         """Parse lines of ``name,type,value[,default[,switch]]``.
 
-        The switch is the name of the parameter that enables this one, or ``v`` for a volatile parameter. ``count``
-        limits the number of parameters. Those in ``used`` are always included.
+        The switch is the name of the parameter that enables this one, or ``v`` for a volatile parameter. ``count`` is
+        the number of parameters to keep. The parameters in ``used`` are always kept.
         """
         parameters = cls(())
         lines, switches = _lines_and_switches(text, frozenset(used), count)

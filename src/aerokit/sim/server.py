@@ -34,9 +34,9 @@ class SimulatorServer:
     Every vehicle is on every link, unless ``vehicles_on`` lists the vehicles of each link.
 
     The server uses timers of the event loop, without tasks or threads. ``speedup`` 10 simulates ten seconds per
-    second. If the loop was blocked, the server simulates the missed time afterwards. If ``speedup`` is not 1, it
-    simulates at most half a second of that time and skips the rest. Otherwise, vehicles would detect a link loss,
-    because the client could not send either.
+    second. If the loop was blocked, the server simulates the missed time afterwards. Heartbeats of the client are
+    missing from that time. If ``speedup`` is not 1, the server therefore simulates at most half a second of it, so
+    that the vehicles do not detect a link loss.
 
     An exception in a vehicle or a callback closes the links and cancels the task that runs the block. The block then
     raises the exception.
@@ -69,8 +69,8 @@ class SimulatorServer:
         self._dues = [0.0] * len(self.vehicles)  # simulated time of each vehicle's next event
         # Index of each vehicle in `vehicles` and `_dues`, by `id`.
         self._numbers = {id(vehicle): number for number, vehicle in enumerate(self.vehicles)}
-        runs_several_ticks = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD  # in one callback
-        self._min_wait_s = _MIN_BATCH_WAIT_S if runs_several_ticks else 0.0
+        runs_several_ticks_at_once = speedup != 1.0 or len(self.vehicles) > _BATCH_THRESHOLD
+        self._min_wait_s = _MIN_BATCH_WAIT_S if runs_several_ticks_at_once else 0.0
         self._loop: asyncio.AbstractEventLoop | None = None  # None before the `async with` block
         # Function that ends the event source. On a `VirtualClockLoop`, the event source replaces the timers.
         self._remove_source: Callable[[], None] | None = None
@@ -219,7 +219,7 @@ class SimulatorServer:
                 is_from_vehicle = False
                 self.on_datagram(now, data, is_from_vehicle)
             for vehicle, channel in zip(port.vehicles, port.channels, strict=True):
-                # The vehicle may be ahead of `now`: a timer fired early, or another vehicle advanced this vehicle.
+                # The vehicle is ahead of `now` if a timer fired early, or if another vehicle advanced this vehicle.
                 vehicle.receive(data, max(now, vehicle.now), peer, channel)
                 self._dues[self._numbers[id(vehicle)]] = vehicle.next_due
             port.reader.forget()  # All vehicles have used the decoded messages.

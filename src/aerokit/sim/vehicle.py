@@ -144,8 +144,8 @@ class SimulatedVehicle:
         messages = channel.messages(data, now, peer)
         if not messages:
             return
-        # In steady flight, one tick may stand for many. Complete the tick now, before the messages change the targets,
-        # and let the next tick be short.
+        # In steady flight, ticks are long. End the present tick before the messages change the targets, and make the
+        # next tick short.
         self._tick_until(now)
         for message in messages:
             if sender_of(message) != (self.system_id, self.component_id):
@@ -271,7 +271,7 @@ class SimulatedVehicle:
         def repeat() -> None:
             nonlocal start, count
             late_s = self.now - (start + count * interval)
-            if late_s > interval:  # The vehicle was frozen. The missed calls would follow in a burst.
+            if late_s > interval:  # The vehicle was frozen. Skip the missed calls.
                 start += late_s
             count += 1
             # The next call is scheduled first, so that an action that reboots the vehicle cancels it.
@@ -351,7 +351,7 @@ class SimulatedVehicle:
                 port.write(data)
 
     def send_built(self, message_id: int, channel: Channel | None = None) -> None:
-        """Build the message with this id from the current state, and send it; send nothing if `build` returns None."""
+        """Build the message with this id and send it. Send nothing if `build` returns None."""
         message = self.build(message_id)
         if message is not None:
             self.send(message, channel)

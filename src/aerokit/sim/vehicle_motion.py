@@ -66,7 +66,7 @@ class FixedWing(Motion):
 
     @property
     def stopping_place(self) -> Ned:
-        """The present place, because a plane cannot stop and circles there."""
+        """The present place. A plane cannot stop, so it circles there."""
         return self.place
 
     def bank_and_climb(self, airspeed: float, bank: float, climb: float) -> None:

@@ -198,7 +198,7 @@ _Accelerometers = PreflightCalibrationAccelerometer
 
 
 class Calibrations:
-    """Sensor calibrations. Those of ``compasses`` and ``accelerometers`` require that the vehicle is turned by hand.
+    """Sensor calibrations. During those of ``compasses`` and ``accelerometers``, the vehicle must be turned by hand.
 
     PREFLIGHT_CALIBRATION is acknowledged at the end of the calibration. For the full calibration of the accelerometers,
     it is acknowledged when the first pose is requested.

@@ -137,7 +137,7 @@ _MODES: tuple[Callable[[Any], ArduPilotMode], ...] = (
     variant(modes.CopterStabilize, CopterMode.ACRO, "ACRO"),
     variant(modes.CopterStabilize, CopterMode.STABILIZE, "STABILIZE"),
     variant(modes.CopterPilotedMode, CopterMode.ALT_HOLD, "ALT_HOLD", needs_position=False),
-    # CIRCLE commands a movement to its circle even on the ground, so the land detector does not notice a landing.
+    # CIRCLE moves towards its circle even on the ground, so the firmware does not detect a landing.
     variant(
         modes.CopterLoiter, CopterMode.CIRCLE, "CIRCLE", takes_off=False, can_arm=False, notices_landing=False
     ),
@@ -221,7 +221,7 @@ class SimulatedCopter(CopterHost):
             return _BASE | _GUIDED
         flags = _BASE
         mode_name = self.mode.name
-        # GUIDED_ENABLED is set in modes that use a position, but in RTL only while armed. A motor test does not count.
+        # GUIDED_ENABLED is set in modes that use a position. In RTL, it is set only while armed, not in a motor test.
         if mode_name in _GUIDED_MODES and (self.motors.is_armed or mode_name != "RTL"):
             flags |= _GUIDED
         if self.is_armed:
@@ -238,7 +238,7 @@ class SimulatedCopter(CopterHost):
             self.info(f"SIM Hit ground at {motion.impact_speed_m_s:f} m/s")
         keeps_flying = self.motors.is_armed and (self.mode.is_taking_off or not self.mode.notices_landing)
         on_ground_for = self._on_ground_timer.seconds(is_on_ground and not keeps_flying, self.now)
-        # A disarmed copter counts as landed as soon as it touches the ground; an armed one after `_LAND_DETECTOR_S`.
+        # An armed copter counts as landed `_LAND_DETECTOR_S` after the touchdown, a disarmed copter at once.
         if on_ground_for >= _LAND_DETECTOR_S or (on_ground_for > 0.0 and not self.motors.is_armed):
             self.is_landed: bool = True
             self._on_ground_timer.reset()
@@ -284,7 +284,8 @@ class SimulatedCopter(CopterHost):
         if heading is None:
             return MavResult.FAILED
         direction = to_int(command.param3)
-        # A relative turn of more than 180 degrees must not take the shorter way (autoyaw.cpp). 0 then means clockwise.
+        # A relative turn of more than 180 degrees must not take the shorter way (autoyaw.cpp). The direction 0 means
+        # clockwise in a relative turn.
         if command.param4 == 1.0:
             direction = direction or 1
         self.yaw.turn_to(heading, math.radians(command.param2), direction)

@@ -66,7 +66,7 @@ class _CircleLeg:
         north, east = motion.north - self._center_north, motion.east - self._center_east
         self._angle = math.atan2(east, north)  # bearing of the point to follow, seen from the center
         self._turned_rad = 0.0  # angle flown so far; positive in both directions
-        self._reported_turns = -1  # Not even turn 0 is reported yet.
+        self._reported_turns = -1  # number of the turn that was reported last, from 0; -1 if there is none
         self._approach: _FlyLeg | None = None  # None once the copter is on the circle
         distance_to_circle = abs(math.hypot(north, east) - self._radius)
         if distance_to_circle > _ON_CIRCLE_M or abs(motion.down - self._center_down) > _ON_CIRCLE_M:
@@ -154,7 +154,7 @@ class _DescendLeg:
 
 _ALLOW_ARMING, _CONTINUE_AFTER_LAND = 1, 4  # bits of AUTO_OPTIONS and of MIS_OPTIONS
 _HEADING_REACHED_RAD, _MIN_TAKE_OFF_M = math.radians(2.0), 1.0
-# An upload restarts the current command if it changes one of this many commands, beginning with the current one.
+# An upload that changes the current command or one of the next two restarts the current command.
 _CHECKED_COMMANDS = 3
 # The copter passes a waypoint without a stop if one of these commands follows and the waypoint has no delay.
 _NO_STOP_IF_FOLLOWED_BY = frozenset(
@@ -253,7 +253,7 @@ class CopterAuto(MissionMode):
         return True
 
     def on_mission_started(self) -> None:
-        self._update_upcoming()  # records the commands that the next call compares
+        self._update_upcoming()  # so that `update` notices a later upload
 
     def update(self, dt: float) -> None:
         self.start_if_waiting()
@@ -428,7 +428,7 @@ class CopterAuto(MissionMode):
 
     def _turn(self, item: MissionItem) -> None:
         heading, direction = math.radians(item.param1), int(item.param3)
-        if item.param4 > 0:  # The angle is relative; the direction (param 3) is its sign.
+        if item.param4 > 0:  # The angle is relative. The direction (param 3) is its sign.
             direction = direction or 1
             heading = self.vehicle.motion.yaw + math.copysign(heading, direction)
         self.vehicle.yaw.turn_to(wrap_pi(heading), math.radians(item.param2), direction)

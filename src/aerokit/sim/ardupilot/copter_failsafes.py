@@ -16,7 +16,7 @@ _STICK_CENTER, _STICK_LOW, _DEADZONE = 1500, 1050, 100
 
 
 class CopterArming(ArduPilotArming[CopterHost]):
-    """ArduCopter's arming checks. Only modes that use a position require one; the throttle must be low or centered."""
+    """ArduCopter's arming checks. Not all modes require a position. The throttle must be low or centered."""
 
     ARMED_TEXT: ClassVar[str] = "Arming motors"
     DISARMED_TEXT: ClassVar[str] = "Disarming motors"
@@ -293,10 +293,10 @@ _FENCE_ACTIONS: dict[int, tuple[int, ...]] = {
 
 
 class CopterFence(ArduPilotFence[CopterHost]):
-    """Executes FENCE_ACTION. With 0, the breach is only reported; other values change the mode.
+    """Executes FENCE_ACTION: report only (0), RTL (1), LAND (2), SMART_RTL or RTL (3), BRAKE (4), SMART_RTL (5).
 
-    The modes are 1: RTL, 2: LAND, 3: SMART_RTL and, if this is refused, RTL, 4: BRAKE, 5: SMART_RTL. The copter changes
-    to LAND if they are all refused, or if it is more than 100 m outside the fence.
+    The copter changes to LAND if these modes are refused, or if it is more than 100 m outside the fence. On the
+    ground, values other than 0 disarm it.
     """
 
     PERIOD_S: ClassVar[float] = 0.1

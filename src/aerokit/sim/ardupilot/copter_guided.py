@@ -31,7 +31,7 @@ class GuidedSubmode(Enum):
 class CopterGuided(CopterModeBase):
     """GUIDED: holds the position until the first target. Targets other than a position expire after GUID_TIMEOUT.
 
-    As in ArduCopter, the change to another kind of position, velocity or acceleration target resets the speed limits to
+    As in ArduCopter, a change between position, velocity and acceleration targets resets the speed limits to
     WPNAV_SPEED, WPNAV_SPEED_UP and WPNAV_SPEED_DN. A speed that DO_CHANGE_SPEED has set is valid until this change.
     """
 
@@ -248,7 +248,7 @@ class CopterSetpoints:
             return
         point = self._copter.world_point(target.lat_int, target.lon_int, target.alt, target.coordinate_frame)
         is_position_missing = point is None and Setpoint.of(target).has_position
-        # If the message sets no position, `_follow` does not fly to the point, so an invalid point becomes zero.
+        # `_follow` ignores the point of a message that sets no position, so zero can replace an invalid point.
         is_followed = not is_position_missing and self._follow(target, point or _ZERO, rotate=False)
         if not is_followed:
             self._guided.enter(force=False)  # An invalid message stops the vehicle.
@@ -256,8 +256,8 @@ class CopterSetpoints:
     def _follow(self, target: PositionTarget, point: Ned, *, rotate: bool) -> bool:
         """Follow a set-point. Return False if it is invalid.
 
-        ``point`` is its position in the world frame. With ``rotate``, its velocity, acceleration and yaw are in the
-        body frame.
+        ``point`` is the position in the world frame. With ``rotate``, velocity, acceleration and yaw are in the body
+        frame.
         """
         setpoint, motion, yaw = Setpoint.of(target), self._copter.motion, self._copter.yaw
         velocity = setpoint.velocity if setpoint.has_velocity else None
@@ -300,8 +300,8 @@ class CopterSetpoints:
             copter.motion.face(yaw)
         elif not ignored_rates:
             copter.motion.turn(target.body_yaw_rate)
-        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. The simulation ignores bit 3 of
-        # GUID_OPTIONS, which makes the field set the throttle instead.
+        # The field `thrust` sets a climb rate, and 0.5 holds the altitude. Bit 3 of GUID_OPTIONS, which would make it
+        # set the throttle, is not simulated.
         climb_share = (constrained(target.thrust, 0.0, 1.0) - 0.5) * 2.0
         max_climb_parameter = "WPNAV_SPEED_UP" if climb_share > 0 else "WPNAV_SPEED_DN"
         climb = climb_share * copter.parameters[max_climb_parameter] / 100.0

@@ -34,7 +34,7 @@ class AutoYaw:
         self._copter.motion.turn(0.0)
 
     def apply_default(self, *, returning: bool = False) -> None:
-        """Apply WP_YAW_BEHAVIOR, which ends a commanded heading or region of interest."""
+        """Apply WP_YAW_BEHAVIOR. This ends a commanded heading or region of interest."""
         behaviour = int(self._copter.parameters["WP_YAW_BEHAVIOR"])
         if behaviour == _YAW_AHEAD or (behaviour == _YAW_AHEAD_EXCEPT_RTL and not returning):
             self._control = self._look_ahead
@@ -300,7 +300,10 @@ _SMART_RTL_EXTRA_ALTITUDE_M = 2.0
 
 
 class CopterLand(CopterModeBase):
-    """LAND: descends with WPNAV_SPEED_DN to LAND_ALT_LOW and then with LAND_SPEED, and disarms on the ground."""
+    """LAND: descends with LAND_SPEED_HIGH, below LAND_ALT_LOW with LAND_SPEED, and disarms on the ground.
+
+    If LAND_SPEED_HIGH is 0, WPNAV_SPEED_DN replaces it.
+    """
 
     needs_position = False
     can_arm = False

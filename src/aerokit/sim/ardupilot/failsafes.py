@@ -168,7 +168,7 @@ class ArmingCheck(IntFlag):
 class ArduPilotArming(Generic[HostT]):
     """Arms and disarms. While disarmed, runs the arming checks once a second and reports the failures every 30 s.
 
-    `common_reasons` has the checks that all firmwares share. When these begin to fail, a report follows within 5 s. A
+    `common_reasons` has the checks that all firmwares share. A new failure of these checks is reported within 5 s. A
     subclass adds its own checks in `own_reasons` and `final_reasons`.
     """
 

@@ -132,8 +132,8 @@ class ArduPilotFence(Generic[HostT]):
     """Checks the height, the distance from home and the uploaded zones. `update` is called ten times a second.
 
     FENCE_STATUS reports a breach. In `act`, a subclass adds the reaction of its firmware. This class itself is the
-    fence of ArduSub, which is checked only while armed, and reports breaches without a reaction. Braking before the
-    fence (AVOID_ENABLE) is not simulated.
+    fence of ArduSub: it has no reaction and is checked only while armed. Braking before the fence (AVOID_ENABLE) is
+    not simulated.
     """
 
     PERIOD_S: ClassVar[float] = 1.0 / 3.0
@@ -149,14 +149,12 @@ class ArduPilotFence(Generic[HostT]):
         self.enabled: int = 0  # Enabled kinds of fences (bits of FENCE_TYPE), including kinds that are not configured.
         self.breached: int = 0  # Kinds of fences that are breached at present.
         self.breach_count: int = 0
-        self.breach_time_ms: int = 0  # When a fence was last breached while no other was, in ms since boot.
+        self.breach_time_ms: int = 0  # Start of the present or last breach, in ms since boot.
         self.caused_mode: bool = False  # True while the present mode is the result of FENCE_ACTION.
         self._enabling_parameters = (0, 0)  # FENCE_ENABLE and FENCE_AUTOENABLE when they were read last.
-        # Maps a kind of fence to the metres beyond its limit at which a further breach counts as new.
+        # Metres beyond the limit at which a breach counts as a new breach, by kind of fence.
         self._new_breach_m: dict[int, float] = {}
-        # True if the last command about the lower limit enabled the limit, False if it disabled it; None without a
-        # command.
-        self._floor_enabled_by_command: bool | None = None
+        self._floor_enabled_by_command: bool | None = None  # what the last command selected; None before
         self._recovering_since = -math.inf  # time of the last `recover_by_hand`
         self._reported_at = -math.inf  # time of the last FENCE_STATUS about a breach
         self._checked_at = -math.inf
@@ -169,7 +167,7 @@ class ArduPilotFence(Generic[HostT]):
 
     @property
     def present(self) -> int:
-        # Polygons exist once zones are uploaded.
+        # The kind POLYGON is present only while zones are stored.
         return self.configured if self.zones else self.configured & ~_POLYGON
 
     @property
@@ -240,8 +238,7 @@ class ArduPilotFence(Generic[HostT]):
     def update(self) -> None:
         vehicle = self.vehicle
         self._follow_parameters()
-        # If no kind is enabled, there is nothing to check, unless the lower limit (`_MIN_ALT`) is configured: `_check`
-        # may enable it in flight.
+        # A configured lower limit (`_MIN_ALT`) is checked even if no kind is enabled, because `_check` may enable it.
         if not self.enabled and not self.configured & _MIN_ALT:
             return
         is_due = vehicle.now - self._checked_at > self.PERIOD_S - 1e-6  # tolerates rounding errors
@@ -260,7 +257,7 @@ class ArduPilotFence(Generic[HostT]):
         """Return the kinds of fences with a new breach."""
         vehicle = self.vehicle
         may_be_low = vehicle.mode.is_landing or vehicle.is_landed or not vehicle.is_armed  # near the ground on purpose
-        is_floor_kept = self._floor_enabled_by_command is True  # A command has precedence over automatic disabling.
+        is_floor_kept = self._floor_enabled_by_command is True  # Only another command disables it.
         if may_be_low and not is_floor_kept and self.enabled & _MIN_ALT:
             self.report("auto-disabled", self.enable(False, _MIN_ALT, by_command=False))
         new_breaches = 0

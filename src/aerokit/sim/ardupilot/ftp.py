@@ -31,9 +31,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
     A worker processes the queue every 2 ms, except during a burst, which cannot be stopped. The queue has space for
     five requests. Further requests are lost. A request that repeats the last sequence number gets the last reply again.
 
-    The client chooses the session number. A session with an open file blocks other sessions until the file is closed,
-    or until its client has sent nothing for 3 s. A close is always acknowledged, even if writing failed.
-    `Faults.no_ftp` turns the server off.
+    The client chooses the session number. A session blocks other sessions until its file is closed, or until 3 s after
+    the last reply. A close is always acknowledged, even if writing failed. `Faults.no_ftp` turns the server off.
     """
 
     max_sessions: ClassVar[int] = 1
@@ -58,7 +57,7 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
 
     @property
     def open_sessions(self) -> int:
-        # From 3 s after the last reply, an open file blocks no other session.
+        # 3 s after the last reply, an open file no longer blocks other sessions.
         return 0 if self._is_idle() else super().open_sessions
 
     def _is_idle(self) -> bool:
@@ -202,8 +201,8 @@ class ArduPilotFtp(SessionFtpServer[FileTree]):
         block = request.acknowledge(data, offset=offset)
         block = block.replace(sequence=sequence, burst_complete=is_short or is_last)
         self._reply(peer, block)
-        # The firmware reuses one reply for the whole burst (GCS_FTP.cpp). After each block, it increments the sequence
-        # number of the reply. After a short block, it also advances the offset, which the refusal then contains.
+        # The firmware reuses one reply for the whole burst (GCS_FTP.cpp). It increments the sequence number after each
+        # block, and advances the offset after a short block. The refusal at the end of the burst contains both values.
         next_offset = offset + len(data) if is_short else offset
         peer.reply = block.replace(sequence=(sequence + 1) & 0xFFFF, offset=next_offset)
         next_step = self._end_burst if is_last else partial(self._send_next, peer, session, request, block_number + 1)

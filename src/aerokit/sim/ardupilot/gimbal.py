@@ -128,7 +128,7 @@ class ArduPilotGimbal:
         return replace(target, roll=roll, pitch=pitch, yaw=yaw)
 
     def _update_target_for(self, place: Ned | None) -> MountTarget:
-        """Point the target at a place, if the place and the vehicle's position are known."""
+        """Aim at a place, if the place and the vehicle's position are known."""
         motion = self._vehicle.motion
         if place is not None and self._vehicle.navigation.has_position:
             place_north, place_east, place_down = place
@@ -157,14 +157,13 @@ class ArduPilotGimbal:
 
     def point(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
         """Turn to these angles in degrees."""
-        # `angles` limits a yaw from north.
-        if not from_north:
+        if not from_north:  # A yaw from north is limited later, in `angles`.
             yaw = self._limited("YAW", yaw - 360.0 if yaw > 180.0 else yaw)
         self._target = MountTarget(self._limited("ROLL", roll), self._limited("PITCH", pitch), yaw, from_north)
         self.mode = MavMountMode.MAVLINK_TARGETING
 
     def turn(self, roll: float, pitch: float, yaw: float, *, from_north: bool) -> None:
-        """Turn at these rates in degrees per second. With ``from_north``, yaw does not follow the vehicle."""
+        """Turn at these rates in degrees per second. With ``from_north``, a turn of the vehicle does not change yaw."""
         current = self.target
         current_yaw = self._from_nose(current)
         if from_north and current.is_from_north:
@@ -219,7 +218,7 @@ class ArduPilotGimbal:
             self._vehicle.send(status)
 
     def manage(self, flags: int, angles: tuple[float, float, float], rates: tuple[float, float, float]) -> int:
-        """Apply GIMBAL_MANAGER_FLAGS with angles or rates, which are NaN if not given."""
+        """Apply GIMBAL_MANAGER_FLAGS with angles or rates. Values that are not given are NaN."""
         from_north = bool(flags & GimbalManagerFlags.YAW_LOCK)
         (_, pitch, yaw), (_, pitch_rate, yaw_rate) = angles, rates
         if flags & GimbalManagerFlags.RETRACT:
@@ -280,7 +279,7 @@ class ArduPilotGimbal:
 
 
 def _device_flags(gimbal: ArduPilotGimbal) -> int:
-    # Yaw is relative to the nose, even if it is locked to north.
+    # The reported yaw is relative to the nose, even with YAW_LOCK.
     flags = GimbalDeviceFlags.ROLL_LOCK | GimbalDeviceFlags.PITCH_LOCK | GimbalDeviceFlags.YAW_IN_VEHICLE_FRAME
     if gimbal.mode == MavMountMode.RETRACT:
         flags |= GimbalDeviceFlags.RETRACT

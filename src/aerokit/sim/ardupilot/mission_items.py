@@ -90,7 +90,7 @@ def check_place(latitude_e7: float, longitude_e7: float) -> int:
 
 
 def altitude_frame(frame: int) -> int | None:
-    """Return the MAV_FRAME that a download reports after an upload with ``frame``. None refuses the upload."""
+    """Return the downloaded MAV_FRAME of an item that was uploaded with ``frame``, or None if it is refused."""
     return _DOWNLOADED_FRAMES.get(frame)
 
 

@@ -112,12 +112,12 @@ class CommandList(ItemList):
 
     def _write(self, seq: int, stored_item: MissionItem) -> int:
         count = len(self._commands)
-        # A list with space only for home refuses every item, even item 0, although it would need no space.
+        # A list with space only for home refuses every item, even item 0 (home), which is not stored.
         has_space = self.capacity > 1 and seq < self.capacity
         if seq > count or not has_space:
             return MavMissionResult.ERROR
         if seq == count:
-            # Home comes first, so in an empty list, even item 0 is stored as item 1 (AP_Mission.cpp, add_cmd).
+            # In an empty list, the firmware stores home first, and even item 0 as item 1 (AP_Mission.cpp, add_cmd).
             self.add_home()
             self._commands.append(stored_item)
         elif seq != _HOME_SEQ:  # Item 0 is home, which is not stored.

@@ -247,7 +247,7 @@ class MissionRun:
             if is_navigation(command.item):
                 self.nav_index = command.seq
                 self._running_nav = command.item
-                self._state = MissionState.NOT_STARTED  # Only a COMPLETE mission would start again from its beginning.
+                self._state = MissionState.NOT_STARTED  # A COMPLETE mission would start again from its beginning.
                 return True
             if self._running_do is None:
                 # The mission resumes at the first "do" command in front of the navigation command.

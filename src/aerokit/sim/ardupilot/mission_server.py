@@ -72,7 +72,7 @@ class ArduPilotMissionServer(MissionServer):
 
     def replace(self, mission_type: int, items: Sequence[MissionItem], *, start: int = 0, clear: bool = True) -> int:
         if mission_type == MavMissionType.MISSION:
-            if clear:  # Like the firmware, continue with a running mission, which cannot be cleared.
+            if clear:  # This fails while the mission runs. Like the firmware, write the items even then.
                 self._clear_list(self.commands)
             return self.commands.write_file(list(items), start)
         # A fence and rally points are always replaced as a whole.
@@ -121,8 +121,8 @@ class ArduPilotMissionServer(MissionServer):
         if kind in self._lists and kind != MavMissionType.MISSION and channel.version == 1:
             self._warn("Need mavlink2 for item transfer")
             return Result.UNSUPPORTED
-        # During an upload, all messages are denied except two. MISSION_REQUEST is served, unlike MISSION_REQUEST_INT.
-        # The base class decides on MISSION_COUNT.
+        # During an upload, only MISSION_REQUEST is served, and even MISSION_REQUEST_INT is denied. The base class
+        # decides on MISSION_COUNT.
         if kind in self._uploads and not isinstance(message, (m.MissionCount, m.MissionRequest)):
             return Result.DENIED
         return None if kind in self._lists else Result.UNSUPPORTED
@@ -142,8 +142,8 @@ class ArduPilotMissionServer(MissionServer):
 
     def _message(self, item: MissionItem, request: AnyRequest) -> AnyItem:
         client, kind = sender_of(request), request.mission_type
-        # This reproduces a bug of the firmware, which compares the command of the item, instead of its index, with the
-        # index of the current item.
+        # The firmware has a bug: it compares the command of the item, not its index, with the index of the current
+        # item.
         current = kind == MavMissionType.MISSION and item.command == self._vehicle.mission.nav_index
         if isinstance(request, m.MissionRequestInt):
             return item_message_int(item, request.seq, client, kind, current=current)
@@ -166,7 +166,7 @@ class ArduPilotMissionServer(MissionServer):
     def _on_write_partial_list(self, request: m.MissionWritePartialList, channel: Channel) -> None:
         kind, start, end = request.mission_type, request.start_index, request.end_index
         refusal = self._refusal(request, channel)
-        # `end` may be equal to the number of items, because the item with this index is appended to the list.
+        # `end` may be the index after the last item. This item is appended to the list.
         if refusal is None and not 0 <= start <= end <= self.count(kind):
             self._warn("Flight plan update rejected")
             refusal = Result.ERROR

@@ -193,7 +193,7 @@ class ArduPilotNavigation:
         self.is_healthy = True
 
     def _use_gps_when_possible(self) -> None:
-        if self.flags == _WITH_POSITION:  # `_check_gps` was first.
+        if self.flags == _WITH_POSITION:  # `_check_gps` has set the flags already.
             return
         if self.origin is None or self.fix_type < GpsFixType.TYPE_3D_FIX or self.uses_external:
             self._vehicle.call_later(1.0, self._use_gps_when_possible)
@@ -250,7 +250,7 @@ def best_return_place(vehicle: ArduPilotHost, home: Ned, *, is_allowed: Callable
     return nearest
 
 
-# The firmware updates the path at 3 Hz. Here, the update is due together with other timers.
+# The firmware updates the path at 3 Hz. With 0.3 s, the update is due together with other timers, which saves time.
 _PERIOD_S, _FAILURE_TIMEOUT_S, _LOW_SPACE_REPORT_INTERVAL_S = 0.3, 15.0, 10.0
 _CLEAN_UP_AFTER_POINTS = 50
 _LOW_SPACE_POINTS = 9
@@ -422,7 +422,7 @@ def _closest_approach(start1: Ned, end1: Ned, start2: Ned, end2: Ned) -> tuple[f
     dot11, dot12, dot22 = _dot(line1, line1), _dot(line1, line2), _dot(line2, line2)
     dot1, dot2 = _dot(line1, between), _dot(line2, between)
     determinant = dot11 * dot22 - dot12 * dot12
-    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # 1e-9 includes segments without a length
+    are_nearly_parallel = determinant < 1e-6 * max(dot11 * dot22, 1e-9)  # True for a segment without a length.
     if are_nearly_parallel:
         return None
     # The nearest places on the two segments, from 0 (start) to 1 (end). Limiting `share2` to its segment may move the

@@ -186,8 +186,8 @@ class PlaneAuto(PlaneNavigatingMode, MissionMode):
         has_no_place = (item.x, item.y) == (0, 0)
         if has_no_place:
             north, east = own_north, own_east
-        # To loiter, a relative altitude of 0 means the altitude of the plane (Location.cpp, sanitize). For other
-        # commands, this requires that the coordinates are 0, but holds in any frame (commands.cpp, set_next_WP).
+        # Loitering at the altitude 0 in a relative frame keeps the plane's altitude (Location.cpp, sanitize). Other
+        # commands keep it if both altitude and coordinates are 0 (commands.cpp, set_next_WP).
         may_omit_altitude = item.frame not in _ABSOLUTE if manoeuvre == _LOITER else has_no_place
         if item.z == 0 and may_omit_altitude:
             down = own_down
@@ -281,8 +281,8 @@ class PlaneGuided(PlaneNavigatingMode):
     def set_attitude(self, message: m.SetAttitudeTarget) -> None:
         mask, now = message.type_mask, self.vehicle.now
         roll, pitch, _ = euler_from_quaternion(*message.q)
-        # If the mask ignores all rates but not the attitude, roll and pitch are used. Otherwise, the firmware uses each
-        # angle whose rate is not ignored (GCS_MAVLink_Plane.cpp).
+        # Roll and pitch are both used if all rates are ignored and the attitude is not. Otherwise, the firmware uses
+        # each angle whose rate is not ignored (GCS_MAVLink_Plane.cpp).
         selects_all_angles = not mask & Mask.ATTITUDE_IGNORE and mask & _RATES == _RATES
         if selects_all_angles or not mask & Mask.BODY_ROLL_RATE_IGNORE:
             self._bank = _TimedValue(roll, now)

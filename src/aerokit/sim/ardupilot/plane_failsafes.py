@@ -39,9 +39,9 @@ _LONG_MODES: dict[int, tuple[int, ...]] = {
 class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
     """Failsafes of radio, ground station and battery, which act on armed and disarmed planes.
 
-    FS_SHORT_ACTN is executed a second after the radio is lost, FS_LONG_ACTN after a further FS_LONG_TIMEOUT. If the
-    radio returns before FS_LONG_ACTN, the previous mode is restored. Not simulated: the weak signal of FS_GCS_ENABL 2,
-    parachutes, termination.
+    FS_SHORT_ACTN is executed when the radio is lost, FS_LONG_ACTN after a further FS_LONG_TIMEOUT. If the radio returns
+    before FS_LONG_ACTN, the previous mode is restored. Not simulated: the weak signal of FS_GCS_ENABL 2, parachutes,
+    termination.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (_TERMINATE, _PARACHUTE, _QLAND, _LAND, _BATTERY_RTL, 0)
@@ -148,7 +148,8 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
 
     def _check_end_of_long(self) -> None:
         parameters = self.vehicle.parameters
-        # Like the firmware (system.cpp, check_long_failsafe).
+        # The firmware uses the timeout of the short failsafe if this failsafe is enabled (system.cpp,
+        # check_long_failsafe).
         is_short_enabled = parameters["FS_SHORT_ACTN"] != _SHORT_DISABLED
         timeout = parameters["FS_SHORT_TIMEOUT" if is_short_enabled else "FS_LONG_TIMEOUT"]
         if self.state == _GCS and self.ground_station_silence < timeout:
@@ -174,13 +175,13 @@ class PlaneFailsafes(ArduPilotFailsafes[PlaneHost]):
             acts_in_take_off = action in (_LONG_GLIDE, _LONG_PARACHUTE)
             if self._is_in_take_off and not acts_in_take_off:
                 self._is_long_pending = True  # `FS_LONG_ACTN` is executed after the initial climb.
-            else:  # In piloted modes, action 0 returns to launch. In AUTO and GUIDED, action 0 changes nothing.
+            else:  # Action 0 returns to launch.
                 self.change_to(*_LONG_MODES.get(action or _LONG_RTL, ()))
         elif mode == PlaneMode.RTL:  # The plane returns already, so only actions that land change the mode.
             if action in (_LONG_AUTO, _LONG_AUTOLAND):
                 self.change_to(*_LONG_MODES[action])
         elif mode in (PlaneMode.AUTO, PlaneMode.GUIDED) and not plane.mode.is_landing:
-            self.change_to(*_LONG_MODES.get(action, ()))
+            self.change_to(*_LONG_MODES.get(action, ()))  # Action 0 changes nothing.
         self.warn(f"{'GCS' if state == _GCS else 'RC Long'} Failsafe On: {plane.mode.name}")
 
     @property

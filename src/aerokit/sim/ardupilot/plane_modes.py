@@ -270,7 +270,7 @@ class PlaneCircle(PlaneAltitudeMode):
 
 
 class PlaneNavigatingMode(PlaneModeBase):
-    """LOITER: circles where it was entered. Also the base of the modes that fly to a place and circle there."""
+    """LOITER: circles the place where the mode was entered. Subclasses circle another place."""
 
     flags: int = _NAVIGATES
 

@@ -169,7 +169,7 @@ class RoverJoystick(ArduPilotJoystick):
 class SubJoystick(ArduPilotJoystick):
     """MANUAL_CONTROL of Sub: x is forward, y sideways, z vertical (500 is the middle), r yaw, s pitch and t roll.
 
-    The axes are scaled by JS_GAIN_DEFAULT, z also by JS_THR_GAIN. Buttons are ignored.
+    x, y, z and r are scaled by JS_GAIN_DEFAULT, z also by JS_THR_GAIN. Buttons are ignored.
     """
 
     def sticks(self, axes: m.ManualControl) -> Mapping[int, int]:
@@ -178,7 +178,7 @@ class SubJoystick(ArduPilotJoystick):
         scale = _SUB_SCALE * gain
         throttle_scale = 2 * scale * parameters.get("JS_THR_GAIN", 1.0)
         throttle = axes.z * throttle_scale + _CENTER - 500 * throttle_scale  # 500 is the middle of the axis z.
-        # Like the firmware, do not scale pitch and roll, and use an axis without a value like any other (joystick.cpp).
+        # Like the firmware, do not scale pitch and roll, and do not leave out an axis without a value (joystick.cpp).
         offsets = {
             SUB_PITCH: axes.s, SUB_ROLL: axes.t, RC_YAW: axes.r * scale, SUB_FORWARD: axes.x * scale,
             SUB_LATERAL: axes.y * scale,

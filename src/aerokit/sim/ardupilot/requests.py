@@ -63,8 +63,8 @@ class ArduPilotMessageRequests:
         self._groups: dict[int, tuple[int, ...]] = dict.fromkeys(_RATE_PARAMETERS, ())
         for stream, message_id, _ in rows_of(vehicle.KIND, "stream_groups.csv"):
             self._groups[Stream[stream]] += (int(message_id),)
-        # The rate parameters that REQUEST_DATA_STREAM has changed: the stored value, which a reboot restores, and the
-        # value that REQUEST_DATA_STREAM has set.
+        # The rate parameters that REQUEST_DATA_STREAM has changed, with the value that a reboot restores and the
+        # requested value.
         self._changed_rates: dict[str, tuple[float, int]] = {}
         if stream_groups:
             vehicle.on(m.RequestDataStream, self._on_group)

@@ -88,8 +88,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
     """ArduRover's failsafes.
 
     FS_TIMEOUT seconds after the loss of the radio or the ground station, the rover executes FS_ACTION, armed or not.
-    In RTL, it does nothing; in HOLD, only with bit 0 of FS_OPTIONS. As in the firmware, both links have one failsafe.
-    While the radio check is enabled, the text is "Radio Failsafe" even if only the ground station is lost.
+    In HOLD, it does so only with bit 0 of FS_OPTIONS, and in RTL never. As in the firmware, both links have one
+    failsafe. While the radio check is enabled, the text is "Radio Failsafe" even if only the ground station is lost.
     """
 
     BATTERY_PRIORITIES: ClassVar[tuple[int, ...]] = (
@@ -147,8 +147,8 @@ class RoverFailsafes(ArduPilotFailsafes[RoverHost]):
         is_waiting = rover.now - self._lost_since <= rover.parameters["FS_TIMEOUT"]
         if not self._lost or self._triggered or is_waiting or not self._may_act():
             return
-        # The first call after the timeout uses the text and the parameter of its link, even if only the other link is
-        # lost (failsafe.cpp, failsafe_trigger).
+        # The text and the parameter are those of the link that is checked first, even if only the other link is lost
+        # (failsafe.cpp, failsafe_trigger).
         self._triggered = set(self._lost)
         self.warn(f"{name} Failsafe")
         rover.rc.release_overrides()
@@ -209,7 +209,7 @@ _HOLD_BEYOND_M = 100.0
 class RoverFence(ArduPilotFence[RoverHost]):
     """ArduRover's fence, which has no altitude limits and sends no texts.
 
-    FENCE_ACTION has the values of FS_ACTION. A rover more than 100 m outside the fence changes to HOLD.
+    FENCE_ACTION has the values of FS_ACTION. If it is not 0, a rover more than 100 m outside the fence changes to HOLD.
     """
 
     PERIOD_S: ClassVar[float] = 0.1

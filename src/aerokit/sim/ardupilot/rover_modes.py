@@ -176,7 +176,7 @@ class RoverAuto(RoverSubAuto):
 
 
 class RoverGuided(_Mode):
-    """GUIDED: drives to a place, or with a velocity and a turn rate, which expire after three seconds."""
+    """GUIDED: drives to a place, or for up to three seconds with a velocity and a turn rate."""
 
     number: int = RoverMode.GUIDED
     name = "GUID"

@@ -104,10 +104,10 @@ _SIGNING_OFF = 1
 
 
 class ArduPilotSigning(VehicleSigning):
-    """Message signing of ArduPilot. The time stamp is stored every 30 s. A boot sets it a minute ahead.
+    """Message signing of ArduPilot. The time stamp is stored every 30 s. A boot adds a minute to it.
 
-    The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. Set
-    ``trusts_first_port`` to False, and call `load`, for a vehicle whose only link is a radio. Bit 0 of MAV1_OPTIONS,
+    The first port is considered secure, like USB on a flight controller: it signs, but accepts unsigned frames. If the
+    only link of the vehicle is a radio, set ``trusts_first_port`` to False and call `load`. Bit 0 of MAV1_OPTIONS,
     MAV2_OPTIONS … turns signing off on the first, second … port at the next boot or SETUP_SIGNING. ArduPilot sends no
     status text about a new key.
     """

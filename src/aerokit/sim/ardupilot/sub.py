@@ -82,7 +82,7 @@ class SubFailsafes(ArduPilotFailsafes[SubHost]):
 
     @property
     def is_any_active(self) -> bool:
-        # A lost radio is not included, because without another failure it does not cause MAV_STATE_CRITICAL on Sub.
+        # A lost radio is not included, because on Sub it alone does not cause MAV_STATE_CRITICAL.
         hull = self.pressure.is_exceeded or self.temperature.is_exceeded
         return self.is_pilot_lost or self.battery_is_low or self.is_ground_station_lost or self.is_leak_detected or hull
 
@@ -246,8 +246,8 @@ class SimulatedSub(SubHost):
     vehicle has 1,386 parameters. Simulated modes: MANUAL, STABILIZE, ACRO, ALT_HOLD and POSHOLD (driven by the
     sticks), GUIDED, AUTO and SURFACE. By default, the vehicle can be armed without a position. Take-off is UNSUPPORTED.
 
-    Not simulated: currents, and CIRCLE, SURFTRAK and MOTORDETECT, which behave like ALT_HOLD. A reboot moves the
-    vehicle to the surface.
+    CIRCLE, SURFTRAK and MOTORDETECT behave like ALT_HOLD. Currents are not simulated. A reboot moves the vehicle to
+    the surface.
     """
 
     KIND: ClassVar[Kind] = "sub"

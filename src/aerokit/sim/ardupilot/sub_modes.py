@@ -75,7 +75,7 @@ class _Mode(ArduPilotMode):
         return 0.0 if abs(share) < _DEADZONE else share
 
     def horizontal_velocity_from_sticks(self) -> tuple[float, float]:
-        """Return the velocity (north, east) in m/s. Also turn by the yaw stick."""
+        """Turn by the yaw stick. Return the velocity (north, east) in m/s that the other sticks command."""
         motion = self.vehicle.motion
         motion.turn(self.stick(RC_YAW) * _FULL_STICK_TURN_RAD_S)
         forward = self.stick(SUB_FORWARD) * _FULL_STICK_M_S
@@ -149,7 +149,7 @@ class SubAuto(RoverSubAuto):
 
 
 class SubGuided(_Mode):
-    """GUIDED: moves to a place, or with a velocity, which expires after three seconds. Without a target it stops."""
+    """GUIDED: moves to a place, or for up to three seconds with a velocity. Without a target it stops."""
 
     number: int = SubMode.GUIDED
     name = "GUIDED"

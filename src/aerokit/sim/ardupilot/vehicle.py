@@ -201,7 +201,7 @@ class ArduPilotVehicle(ArduPilotHost):
         return True
 
     def reset_controllers(self) -> None:
-        """Reset what only this kind of vehicle has. Called at power-on, after the modes were created."""
+        """Reset the parts that only this kind of vehicle has. Called at power-on, after the modes were created."""
 
     def unknown_mode(self, number: int) -> tuple[int, str]:
         """Return severity and text for a mode number that does not exist."""
@@ -285,7 +285,7 @@ class ArduPilotVehicle(ArduPilotHost):
         self.reboot(_REBOOT_SILENCE_S)
 
     def send_text(self, severity: int, text: str) -> None:
-        """Send a text: during the boot at once, later after the answer to the present command, like the firmware."""
+        """Send a text after the answer to the present command. During the boot, send it at once, like the firmware."""
         if self.is_initialised:
             self.call_later(0.0, lambda: super(ArduPilotVehicle, self).send_text(severity, text))
         else:

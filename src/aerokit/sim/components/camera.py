@@ -90,8 +90,8 @@ class SimulatedCamera(CameraBody):
     - ``vendor``, ``model``, ``definition_uri``, ``capabilities`` (CAMERA_CAP_FLAGS), ``resolution`` (pixels):
       content of CAMERA_INFORMATION. Without HAS_MODES it takes images and videos at any time.
     - ``streams``: addresses of video streams, such as ``rtsp://192.168.0.10:8554/main``; no video is sent
-    - ``thermal_celsius``: lowest and highest temperature in the image of a thermal camera, whose last stream is the
-      thermal one; None for a visible-light camera
+    - ``thermal_celsius``: lowest and highest temperature in the image of a thermal camera; None for a visible-light
+      camera. The last stream of a thermal camera is the thermal stream.
     - ``picture``: content of image files (JPEG), or a function of the capture that returns it; the files are in
       ``/DCIM`` and served by MAVFTP
     - ``gimbal``: the gimbal that carries the camera and determines the direction of images

@@ -213,7 +213,7 @@ class Px4Vehicle(Px4Host):
 
     def _warn_while_booting(self) -> None:
         self.arming.report_reasons()
-        self.arming.start_log()  # also records the first flight
+        self.arming.start_log()  # The first flight is part of this log.
 
     def _set_ready(self) -> None:
         self.is_ready = True

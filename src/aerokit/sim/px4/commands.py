@@ -255,7 +255,7 @@ class _Flight:
         return MavResult.ACCEPTED
 
     def _destination(self, command: ReceivedCommand) -> tuple[float, float, float]:
-        """Return the position in a command. Values that it omits are those of the vehicle."""
+        """Return the position in a command. The vehicle's position replaces missing values."""
         px4, motion = self._px4, self._px4.motion
         north, east, down = motion.north, motion.east, motion.down
         has_place = math.isfinite(command.x) and math.isfinite(command.y) and _INT32_MAX not in (command.x, command.y)

@@ -348,13 +348,13 @@ class Px4Failsafes:
             has_delay_ended = self._holds_until < self._px4.now
             if is_worse and self.action <= Action.HOLD and has_delay_ended:
                 self._holds_until = self._px4.now + self._px4.parameters["COM_FAIL_ACT_T"]
-        # A failure that has ended stays active until the user changes the mode.
+        # If the action is at least HOLD, a failure that has ended stays active until the user changes the mode.
         still_acting = {cause: action for cause, action in self._active.items() if action >= Action.HOLD}
         self._active = {**still_acting, **failing}
         self._failing = frozenset(failing)
 
     def _choose(self) -> FailsafeAction:
-        """Return the action to execute, which may be milder than that of the worst failure."""
+        """Return the action to execute because of the worst failure."""
         worst = max(self._active.values(), default=Action.NONE)
         can_hold = self._px4.has_position
         if worst in (Action.HOLD, Action.RETURN) and not can_hold:

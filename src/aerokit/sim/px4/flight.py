@@ -76,7 +76,7 @@ _RELATIVE = (MavFrame.GLOBAL_RELATIVE_ALT, MavFrame.GLOBAL_RELATIVE_ALT_INT)
 
 
 def return_destination(px4: Px4Host) -> Ned:
-    """Return the destination of RTL, whose down coordinate is the reference for the heights of RTL."""
+    """Return the destination of RTL. The heights of RTL are relative to its down coordinate."""
     rtl_type = round(px4.parameters["RTL_TYPE"])
     rally_points = [_place(px4, item) for item in px4.missions.items(MavMissionType.RALLY)]
     if rtl_type not in (*_NEAREST, _RALLY_FIRST) or not rally_points:
@@ -137,8 +137,8 @@ class Px4Flight:
             self._vehicle.mission.enter()
 
     def stay_here(self) -> None:
-        # If HOLD targeted the present place instead, the vehicle would fly back to it (`preproject_stop_point` in
-        # navigator_main.cpp).
+        # A target at the present place would make a moving vehicle fly back (navigator_main.cpp,
+        # preproject_stop_point).
         self.target = self._vehicle.motion.stopping_place
 
     def update(self) -> None:

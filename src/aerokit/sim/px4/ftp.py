@@ -16,8 +16,8 @@ from aerokit.sim.vehicle import MessageHost
 class Px4Ftp(SessionFtpServer[FileTree]):
     """MAVFTP server of PX4. Every session has the number 0, and is closed after 10 s without a request.
 
-    A burst ignores the requested size. PX4 never clears the errno of the latest failure. After EEXIST, for example,
-    every refusal reports FILEEXISTS. `Faults.no_ftp` turns the server off.
+    A burst ignores the requested size. Only a directory listing clears the errno of the latest failure. Until then, for
+    example, every refusal after EEXIST reports FILEEXISTS. `Faults.no_ftp` turns the server off.
     """
 
     max_clients: ClassVar[int] = 1 << 16
@@ -60,5 +60,5 @@ class Px4Ftp(SessionFtpServer[FileTree]):
         old_name, _, _ = request.data[: request.size].partition(b"\0")
         has_new_name = len(old_name) + 2 < request.size
         if not has_new_name:
-            return request.refuse_errno(peer.errno)  # As above, the errno is that of an earlier failure.
+            return request.refuse_errno(peer.errno)  # The firmware reports the errno of an earlier failure.
         return super()._rename(peer, request)

@@ -157,7 +157,7 @@ _OFF, _ON_CHANGE = -1, 0
 class Px4StreamRates:
     """Stream rates of each link. ``modes`` lists the modes of the links. Further links have the last mode of the list.
 
-    The "normal" link is the ground-station link of PX4's simulation, on which some messages are sent at ``fast_hz``.
+    The "normal" link is the ground-station link of PX4's simulation. It sends some messages at ``fast_hz``.
     """
 
     def __init__(self, modes: Sequence[str], is_built: Callable[[int], bool], fast_hz: float) -> None:
@@ -192,7 +192,7 @@ class Px4StreamRates:
         return {**rates, **fast, **_SIMULATION_RATES_HZ}
 
     def interval_us(self, channel: Channel, message_id: int) -> int:
-        """Return the interval for MESSAGE_INTERVAL. -1 is off or unknown, 0 is sent on change."""
+        """Return the interval for MESSAGE_INTERVAL: -1 if the message is off or unknown, 0 if it is sent on change."""
         if message_id == m.Heartbeat.ID:
             return 1_000_000
         return self._intervals_us.get(channel, {}).get(message_id, _OFF)
@@ -212,7 +212,7 @@ class Px4StreamRates:
 
     def on_requested(self, channel: Channel, message_id: int) -> None:
         intervals_us = self._intervals_us.get(channel, {})
-        # A message that is off is then reported as sent on change.
+        # After a request, PX4 reports a message that is off as sent on change.
         if intervals_us.get(message_id) == _OFF:
             intervals_us[message_id] = _ON_CHANGE
 

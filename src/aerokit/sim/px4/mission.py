@@ -93,7 +93,7 @@ def _landing_problem(items: Sequence[MissionItem]) -> str | None:
             approach = index - 1
         elif item.command == Cmd.NAV_RETURN_TO_LAUNCH and land_start >= 0:
             return "land start item before RTL item not possible."
-    # DO_LAND_START must be before the landing, and at the latest the item directly before it.
+    # A landing must follow DO_LAND_START.
     return "invalid land start." if land_start > approach else None
 
 
@@ -174,8 +174,7 @@ class Px4Mission:
             self._state = MissionState.PAUSED
         elif self.current < 1:
             self._state = MissionState.NOT_STARTED
-        # Outside mission mode, the state does not change if no item was reached and `current` is above 0.
-        return self._state
+        return self._state  # If no condition is met, PX4 keeps the previous state.
 
     @property
     def wants_up(self) -> bool:
@@ -223,7 +222,7 @@ class Px4Mission:
     def enter(self) -> None:
         if not self.is_valid:
             return
-        # A finished mission stays at its last item. If `current` is another item, that item was selected later.
+        # A finished mission starts again, unless another item was selected after its end.
         is_still_finished = self.is_finished and self.current == self.count - 1
         if self.current >= self.count or is_still_finished:
             self.current = 0

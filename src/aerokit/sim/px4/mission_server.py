@@ -187,9 +187,8 @@ class Px4MissionServer(MissionServer):
 
     def _on_request_list(self, request: m.MissionRequestList, channel: Channel) -> None:
         link = self._link(channel)
-        # PX4 first ends an open transfer that has reached the number of stored items (mavlink_mission.cpp,
-        # handle_mission_request_list). This may end an unfinished upload. PX4 then refuses other uploads until a
-        # download times out.
+        # PX4 first ends a transfer whose next item is the number of stored items (mavlink_mission.cpp,
+        # handle_mission_request_list). If this ends an upload, PX4 refuses other uploads until a download times out.
         if link.next == self.count(link.mission_type):
             link.state = TransferState.IDLE
         is_same_transfer = link.client == sender_of(request) and link.mission_type == request.mission_type

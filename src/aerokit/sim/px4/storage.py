@@ -47,10 +47,10 @@ def px4_parameters(count: int | None = None, table: str = "quadrotor") -> SimPar
 
 
 class Px4ParameterMount(ParameterPackMount):
-    """``@PARAM`` files of PX4.
+    """``@PARAM`` files of PX4. They differ from those of ArduPilot.
 
-    Unlike ArduPilot, PX4 reports the exact size when the file is opened, divides no value and no default between two
-    blocks of 239 bytes, and applies uploaded parameters as they arrive.
+    Opening a file reports its exact size. A block of 239 bytes never ends inside a value or a default. Uploaded
+    parameters are applied as they arrive.
     """
 
     def __init__(self, parameters: SimParameters, apply: Callable[[str, float], None]) -> None:

@@ -29,7 +29,7 @@ class SimulatedPx4(Px4Vehicle):
     """PX4 v1.16 or v1.17 multicopter, as far as a client can observe it. `Motion` is the motion model.
 
     Not simulated: REQUEST_EVENT, returning along a mission (RTL_TYPE 2), estimator failures other than a lost GPS,
-    follow-me, external modes. A camera is a separate component, without which camera commands are not answered.
+    follow-me, external modes. Camera commands are answered only by a camera, which is a separate component.
     MNT_MODE_IN 4 enables a gimbal.
 
     - ``home``: latitude, longitude (degrees), altitude AMSL (m); ``heading_deg``: initial heading
@@ -58,7 +58,7 @@ class SimulatedPx4(Px4Vehicle):
         return None if builder is None else builder(self)
 
     def refusal_of_command(self, command: ReceivedCommand) -> int | None:
-        """Refuse x and y of INT32_MAX (COMMAND_LONG) or NaN bits (COMMAND_INT) and, unless 1.16, unsupported frames."""
+        """Refuse an invalid position and, except in version 1.16, an unsupported frame."""
         return refusal_by_place(command, checks_frame=not self.version.startswith("1.16"))
 
     def _on_set_mode(self, request: m.SetMode, channel: Channel) -> None:
@@ -74,8 +74,7 @@ class SimulatedPx4(Px4Vehicle):
 
 _FLARE_M = 3.0
 _GLIDE_SPEED_FACTOR = 1.3
-# In a descent, the target altitude is below the plane by this time multiplied by the wanted sink rate. For such a
-# target, `FixedWing.climb_rate_to` returns the wanted sink rate.
+# `FixedWing.climb_rate_to` returns the distance to the target altitude divided by this time.
 _SINK_TARGET_LEAD_S = 2.5
 _FLARE_SINK_M_S = 0.5
 _HEIGHT_REACHED_M = 10.0
@@ -324,9 +323,9 @@ class SimulatedPx4Plane(SimulatedPx4):
     """PX4 plane (MAV_TYPE 1, airframe 10041). `FixedWing` is the motion model. See `SimulatedPx4` for the arguments.
 
     The plane takes off straight ahead, from a runway. Where a multicopter hovers, it circles at NAV_LOITER_RAD. RTL
-    ends in a circle above home, without a landing (RTL_LAND_DELAY is -1). LAND descends in circles, whereas a mission
-    ends with a straight glide path, and must contain a landing (MIS_TKO_LAND_REQ). OFFBOARD circles a position. Sticks
-    control bank, climb and speed in every manual mode. The plane is not disarmed automatically before take-off.
+    ends in a circle above home, without a landing (RTL_LAND_DELAY is -1). LAND descends in circles. A mission must
+    contain a landing (MIS_TKO_LAND_REQ), which has a straight glide path. OFFBOARD circles a position. Sticks control
+    bank, climb and speed in every manual mode. The plane is not disarmed automatically before take-off.
 
     Not simulated, in addition to `SimulatedPx4`: hand launch, stalls, aborted landings, figures of eight.
     """
