@@ -151,13 +151,11 @@ class FleetAction:
         return self.result_so_far()
 
     @property
-    def orders(self) -> dict[str, str]:
-        """The policy's orders by member name. Empty if no member failed, or if the policy lets the others continue."""
+    def policy_orders(self) -> dict[str, str]:
         return dict(self._policy_orders)
 
     @property
-    def active(self) -> tuple[str, ...]:
-        """The names of the members that are executing the action."""
+    def active_names(self) -> tuple[str, ...]:
         return tuple(
             member.name
             for member in self._members
@@ -165,7 +163,6 @@ class FleetAction:
         )
 
     def result_so_far(self) -> FleetResult:
-        """Return a result with the members that have finished so far."""
         names = [member.name for member in self._members]
         # The outcomes have the order of the members, not the order in which the members have finished.
         outcomes = {name: self._outcomes[name] for name in names if name in self._outcomes}
@@ -174,14 +171,13 @@ class FleetAction:
         return result
 
     def close(self) -> None:
-        """End the action with the fleet's block: members that still execute it fail, and their tasks are cancelled."""
+        """Fail the members that still execute the action, and cancel their tasks."""
         for member in self._members:
             if member.name not in self._outcomes:
                 self._record_failure(member, ConnectionClosed(f"{self.name}: {FLEET_CLOSED}"))
                 self._cancel_tasks_of([member])
 
     def on_member_unavailable(self, member: Member) -> None:
-        """Record that the member has failed because it was lost or taken over."""
         if member not in self._members or self._has_failed_or_stopped(member):
             return
         error_class = HeartbeatTimeout if member.state is MemberState.LOST else OperationRejected
@@ -190,11 +186,6 @@ class FleetAction:
     # --------------------------------------------------------------------------------- one member
 
     async def _run_member(self, member: Member, delay_s: float, was_called_late: bool) -> None:
-        """Execute the action with one member after a delay, and record its outcome.
-
-        A member that got a newer order after the action was created does not start. ``was_called_late`` is True if
-        the action runs only after the begin of a newer one, which then counts as such an order.
-        """
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
@@ -204,6 +195,7 @@ class FleetAction:
             has_newer_order, wait_s = self._newer_order_checks[member.name], delay_s
             if self._context.starts[member.name] != self._starts[member.name]:  # An older action may have ordered this.
                 has_newer_order = self._newer_order_check(member)
+            # If this action runs only after the begin of a newer one, the newer one counts as a newer order.
             is_overruled = (self._moves_members or self._arms) and (
                 has_newer_order() or (was_called_late and self._has_newer_action(member))
             )
@@ -239,13 +231,9 @@ class FleetAction:
             self._check_finished()
 
     async def _wait_to_start(self, member: Member, delay_s: float) -> None:
-        """Wait ``delay_s`` before a member's order, and then for its next HEARTBEAT if the last one is not recent.
+        """Wait ``delay_s`` and for a recent HEARTBEAT.
 
-        Raises:
-            OperationRejected: the computer slept during the wait, the member is unavailable, or it would start too late
-                in its corridor. A member that was unavailable during the wait has failed, so it is rejected, too,
-                unless the action is safe (such as a landing).
-            HeartbeatTimeout: the member is silent.
+        Raises OperationRejected or HeartbeatTimeout if the member must not start after this wait.
         """
         connection, name = member.vehicle.connection, member.name
         began_at, absences = connection.now(), member.absences
@@ -256,6 +244,7 @@ class FleetAction:
         member.refresh()
         if not member.is_available:
             raise OperationRejected(f"{self.name}: {name} is {member.status}")
+        # A member that was unavailable during the wait has failed, which must not keep it from landing.
         if member.absences > absences and not self._is_safe:
             raise OperationRejected(f"{self.name}: {name} was unavailable before it started; nothing was sent to it")
         late_s = connection.now() - began_at - delay_s
@@ -266,20 +255,14 @@ class FleetAction:
         return member.name in self._failed or member.name in self._stopped
 
     def _has_newer_order(self, member: Member) -> bool:
-        """Return True if the program has given the member a newer order. This action must then send no other order.
-
-        This is so if a newer action of the fleet moves the member or has moved it, or if the program has told the
-        vehicle to land or to return.
-        """
+        """Return True if a newer action moves the member, or the program has told it to land or return."""
         # The landing may also be a part of the action, if it is a function of the program that still runs.
         is_ordered_by_action = not self._moves_members and member.name not in self._outcomes
         return (_is_ending_flight(member) and not is_ordered_by_action) or self._has_newer_action(member)
 
     def _has_newer_action(self, member: Member) -> bool:
-        """Return True if a newer action of the fleet moves the member or has moved it.
-
-        If this action arms its members, only newer actions that end the flight count, such as a landing.
-        """
+        """Return True if a newer action of the fleet moves the member or has moved it."""
+        # An action that arms is overruled only by newer actions that end the flight, such as a landing.
         return any(
             member in action._members and not action._has_failed_or_stopped(member)
             for action in self._newer_actions
@@ -287,9 +270,9 @@ class FleetAction:
         )
 
     def _newer_order_check(self, member: Member) -> Callable[[], bool]:
-        """Return a function that tells whether the program has given the member certain orders after this call.
+        """Return a function that tells whether the program has told the member to land, return or disarm meanwhile.
 
-        They are orders to land, to return or to disarm and, if this action arms the members, to arm.
+        If this action arms the members, orders to arm count, too.
         """
         arbiter, order_before = member.vehicle._arbiter, _newest_order(member)
 
@@ -313,11 +296,7 @@ class FleetAction:
         raise OperationTimeout(f"{self.name}: {member.name} has not finished within {self._timeout:g} s")
 
     def _record_failure(self, member: Member, error: Exception) -> None:
-        """Record that a member failed, and ask the policy for orders to the other members.
-
-        The policy is not asked again once it has given orders in this action. It is never asked if the action is a safe
-        one (such as a landing), if the member is released, or after the fleet's block has ended.
-        """
+        """Record that a member failed, and ask the policy for orders to the other members."""
         if member.name in self._failed:
             return
         self._failed[member.name] = error
@@ -332,14 +311,13 @@ class FleetAction:
         if len(self._undecided) > 1:
             return
         while self._undecided:
-            if self._policy_trigger is None:
+            if self._policy_trigger is None:  # The policy has not given orders in this action yet.
                 self._apply_policy(*self._undecided[0])
             del self._undecided[0]
 
     # ------------------------------------------------------------------------------ other members
 
     def _apply_policy(self, failed: Member, error: Exception) -> None:
-        """Ask the policy about a failure. Send its orders, and cancel the running actions of members with orders."""
         for member in self._members:
             member.refresh()
         others = [member for member in self._members if member.name not in self._failed]
@@ -389,7 +367,6 @@ class FleetAction:
             self._publish_completed()
 
     def _decide(self, failure: MemberFailure) -> dict[str, PolicyOrder]:
-        """Return the policy's orders. If the policy function raises an error, all other members are ordered to hold."""
         try:
             return self._context.rules.decide(failure)
         except Exception as error:
@@ -409,7 +386,6 @@ class FleetAction:
                 task.cancel()
 
     async def _send_order(self, member: Member, order: PolicyOrder) -> None:
-        """Send an order of the policy to a member, and wait until the member has carried it out."""
         try:
             if order == "land":
                 await member.vehicle.land()
@@ -448,7 +424,6 @@ class FleetAction:
                 self._context.hold(member, f"aerokit hold {member.name}")
 
     def _check_finished(self) -> None:
-        """End `run` once every member has an outcome and all orders of the policy have ended."""
         if not self._tasks and not self._pending_policy_orders and len(self._outcomes) == len(self._members):
             self._finished.set()
 
@@ -458,12 +433,12 @@ class FleetAction:
 
 
 def _newest_order(member: Member) -> Order | None:
-    """Return the newest order of this program that flies the vehicle; None if there is none."""
+    """Return the newest order of this program that moves the vehicle."""
     return member.vehicle._arbiter.latest(STEERING)
 
 
 def _is_ending_flight(member: Member) -> bool:
-    """Return True if this program ordered the vehicle to land or return, and the order is still valid."""
+    """Return True while an order of this program to land or return is valid."""
     newest = _newest_order(member)
     # A posted order that was closed still flies the vehicle.
     return newest is not None and newest.ends_flight and newest.is_newest and not newest.takeover_reason
@@ -513,15 +488,12 @@ class FleetContext:
         self.bus.publish(event)
 
     def newest_orders(self, member: Member) -> tuple[object, object]:
-        """Return a value that changes with each move that the program orders, to be compared with an earlier one.
-
-        It is the newest order that flies the member, and how many actions it was given. An action counts before it
-        gives an order.
-        """
+        """Return a value that changes whenever the program orders the member to move."""
+        # An action that moves the member counts before it gives an order.
         return _newest_order(member), self.moves[member.name]
 
     def hold(self, member: Member, task_name: str) -> None:
-        """Order a member to hold, in the background. If the order fails, the member's state becomes FAILED."""
+        """Order a member to hold, without waiting for it."""
 
         async def hold() -> None:
             try:
@@ -532,10 +504,9 @@ class FleetContext:
         self.background.start(hold, task_name)
 
     def matching(self, *patterns: str) -> list[str]:
-        """Return the names of members that match any of these names or patterns (``"north/*"``).
+        """Return the names of the members that match a name or a pattern such as ``north/*``.
 
-        Raises:
-            InvalidArgument: a pattern matches no member.
+        Raises InvalidArgument if a pattern matches no member.
         """
         matching: dict[str, None] = {}  # an ordered set
         for pattern in patterns:
@@ -595,13 +566,12 @@ class SelectionBase:
 
     @staticmethod
     def _check_available(member: Member, action: str, consequence: str) -> None:
-        """Raise OperationRejected if the member is unavailable now."""
         member.refresh()
         if not member.is_available:
             raise OperationRejected(f"{action}: {member.name} is {member.status}; {consequence}")
 
     def _check_not_ordered_since(self, orders: Mapping[str, object], action: str, consequence: str) -> None:
-        """Raise OperationRejected if a member was given an order since `newest_orders` returned ``orders``."""
+        """Raise OperationRejected if `newest_orders` of a member has changed."""
         for name, order in orders.items():
             if self._context.newest_orders(self._context.members[name]) != order:
                 raise OperationRejected(f"{action}: {name} got a newer order meanwhile; {consequence}")
@@ -623,11 +593,8 @@ class SelectionBase:
         is_function: bool = False,
         corridors: Deconfliction | None = None,
     ) -> FleetResult:
-        """Execute an action with all members of the selection, or with those in ``names``.
-
-        ``is_function`` is True if the action is a function of the program, whatever its name.
-        """
         members = [member for member in self if names is None or member.name in names]
+        # A function of the program may have the name of a built-in action.
         built_in_action = "" if is_function else name
         is_safe = built_in_action in FLIGHT_ENDING_ACTIONS
         return await FleetAction(

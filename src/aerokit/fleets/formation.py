@@ -151,8 +151,7 @@ def follow_velocity(
 def _heading_for(formation: Formation, leader: Member, max_age_s: float) -> float | None:
     """Return the leader's heading if the formation turns with it, otherwise None.
 
-    Raises:
-        ValueUnknownError, StaleValueError: the heading is needed and unknown, or older than ``max_age_s``.
+    Raises ValueUnknownError if the heading is needed and unknown or too old.
     """
     if formation.frame != "heading":
         return None
@@ -246,7 +245,6 @@ class Following:
         self._stop_if_no_followers()
 
     async def _fly_follower(self, member: Member) -> None:
-        """Fly a member towards its place until following stops."""
         try:
             async with member.vehicle.guided.velocity(rate_hz=self._rate_hz) as stream:
                 while not self._stop_if_leader_lost():
@@ -259,18 +257,14 @@ class Following:
             asyncio.get_running_loop().call_soon(self._stop_if_no_followers)
 
     def _stop_if_no_followers(self) -> None:
-        """Stop following if no member follows any more, and give the failures as the reason."""
-        if not self._action.active and self._action.program_error is None:
+        if not self._action.active_names and self._action.program_error is None:
             result = self._action.result_so_far()
             failed = {name: str(error) for name, error in result.failed.items()}
             reason = "; ".join(f"{name}: {error}" for name, error in failed.items())
-            self._stop(reason or "no follower is left", self._action.orders, {**result.skipped, **failed})
+            self._stop(reason or "no follower is left", self._action.policy_orders, {**result.skipped, **failed})
 
     def _stop_if_leader_lost(self) -> bool:
-        """Stop following if the leader is unavailable, or its position or a needed heading is unknown or outdated.
-
-        Return True if following has stopped, now or before.
-        """
+        """Stop following if the leader is lost. Return True if following has stopped."""
         if not self._stopped.is_set():
             try:
                 self._check_leader()
@@ -278,7 +272,7 @@ class Following:
                 _heading_for(self._formation, self._leader, FOLLOWING_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
                 # The active members hold, because `_tasks.cancel()` below ends their streams.
-                holding = self._action.active
+                holding = self._action.active_names
                 skipped = {
                     member.name: member.status if member.reason else "it does not follow"
                     for member in self._followers
@@ -289,7 +283,6 @@ class Following:
         return self._stopped.is_set()
 
     def _setpoint(self, member: Member) -> VelocitySetpoint:
-        """Return the velocity of the leader, plus a correction towards the member's place."""
         velocity = self._leader.vehicle.velocity.latest
         leader_velocity = (0.0, 0.0, 0.0)  # while the velocity is unknown
         if velocity is not None:
@@ -300,10 +293,7 @@ class Following:
         return VelocitySetpoint(north, east, -up)
 
     def _vector_to_place(self, member: Member) -> tuple[float, float, float]:
-        """Return the vector from a member to its place, in metres north, east and up.
-
-        The positions of the member and the leader are extrapolated to the present by their velocities.
-        """
+        """Return the present vector from a member to its place, in metres north, east and up."""
         leader, vehicle = self._leader.vehicle, member.vehicle
         leader_position = position_of(self._leader, FOLLOWING_MAX_AGE_S)
         position = position_of(member, FOLLOWING_MAX_AGE_S)
@@ -341,7 +331,6 @@ class Following:
             raise OperationRejected(f"the leader {self._leader.name} is {self._leader.status}")
 
     def _stop(self, reason: str, orders: Mapping[str, str], skipped: Mapping[str, str]) -> None:
-        """Record that following has stopped early, and publish it. Later calls do nothing."""
         if self._stopped.is_set():
             return
         self._reason = reason
@@ -352,9 +341,8 @@ class Following:
         )
 
     def _on_error(self, error: Exception) -> None:
-        """Stop following after an error in the program. If the policy gave no orders, all available followers hold."""
         hold_orders = dict.fromkeys((member.name for member in self._followers if member.is_available), "hold")
-        self._stop(str(error) or type(error).__name__, self._action.orders or hold_orders, {})
+        self._stop(str(error) or type(error).__name__, self._action.policy_orders or hold_orders, {})
 
 
 @checks_arguments
@@ -422,7 +410,6 @@ class Formations(Travel):
         return Following(self._context, member, followers, formation, rate_hz, max_speed_m_s)
 
     def _leader_and_followers(self, formation: Formation, leader: str) -> tuple[Member, list[Member]]:
-        """Check a formation and its leader. Return the member that leads, and the members that follow."""
         arguments = {leader: "leader", **dict.fromkeys(formation.offsets, "formation")}
         for name, argument in arguments.items():
             if name not in self.members:
