@@ -161,6 +161,12 @@ def _heading_for(formation: Formation, leader: Member, max_age_s: float) -> floa
         raise type(error)(f"{leader.name}: {error}") from None
 
 
+def _check_leader(leader: Member) -> None:
+    leader.refresh()
+    if not leader.is_available:
+        raise OperationRejected(f"the leader {leader.name} is {leader.status}")
+
+
 @checks_arguments
 class Following:
     """Keeps followers at their places in a formation while its ``async with`` block runs. Then the followers hold.
@@ -226,7 +232,7 @@ class Following:
     async def __aenter__(self) -> Self:
         if self._was_entered:
             raise BusyError("a Following can be entered only once; call following() again")
-        self._check_leader()
+        _check_leader(self._leader)
         self._was_entered = True
         self._action = FleetAction(self._context, "following", self._followers, self._fly_follower, moves_members=True)
         self._tasks.start(self._follow, "aerokit following")
@@ -267,7 +273,7 @@ class Following:
         """Stop following if the leader is lost. Return True if following has stopped."""
         if not self._stopped.is_set():
             try:
-                self._check_leader()
+                _check_leader(self._leader)
                 position_of(self._leader, FOLLOWING_MAX_AGE_S)
                 _heading_for(self._formation, self._leader, FOLLOWING_MAX_AGE_S)
             except (OperationRejected, ValueUnknownError) as error:
@@ -324,11 +330,6 @@ class Following:
                 east += signed_age * velocity.east_m_s
                 up -= signed_age * velocity.down_m_s
         return north, east, up
-
-    def _check_leader(self) -> None:
-        self._leader.refresh()
-        if not self._leader.is_available:
-            raise OperationRejected(f"the leader {self._leader.name} is {self._leader.status}")
 
     def _stop(self, reason: str, orders: Mapping[str, str], skipped: Mapping[str, str]) -> None:
         if self._stopped.is_set():
@@ -425,7 +426,5 @@ class Formations(Travel):
                 f"formation: two places are {closest_m:.1f} m apart; the minimum of this fleet is {min_m:g} m"
             )
         member = self.members[leader]
-        member.refresh()
-        if not member.is_available:
-            raise OperationRejected(f"the leader {leader} is {member.status}")
+        _check_leader(member)
         return member, [self.members[name] for name in formation.offsets]

@@ -402,11 +402,7 @@ class Missions(SelectionBase):
             OperationRejected: no mission was uploaded, the last upload failed or was for other members only, or a
                 member is unavailable or not armed. Nothing was sent.
         """
-        names = tuple(name for name in self._context.missions if name in self.members)
-        if not names:
-            raise OperationRejected(
-                "start_missions: the last upload failed, or had no mission for these members; call upload() first"
-            )
+        names = self._names_with_mission("start_missions")
         members = self._require_available(dict.fromkeys(names))
         disarmed = [name for name in names if not members[name].vehicle.is_armed]
         if disarmed:
@@ -427,11 +423,7 @@ class Missions(SelectionBase):
         Raises:
             OperationRejected: no mission was uploaded, or the last upload failed or was for other members only.
         """
-        names = tuple(name for name in self._context.missions if name in self.members)
-        if not names:
-            raise OperationRejected(
-                "wait_missions_finished: the last upload failed, or had no mission for these members"
-            )
+        names = self._names_with_mission("wait_missions_finished")
         return await self._run(
             "mission.wait_finished", lambda member: member.vehicle.mission.wait_finished(timeout=timeout), names=names
         )
@@ -480,6 +472,14 @@ class Missions(SelectionBase):
             PathsCompared(at=self._context.now(), system_id=0, member="", deconfliction=deconfliction)
         )
         return deconfliction
+
+    def _names_with_mission(self, action: str) -> tuple[str, ...]:
+        names = tuple(name for name in self._context.missions if name in self.members)
+        if not names:
+            raise OperationRejected(
+                f"{action}: the last upload failed, or had no mission for these members; call upload() first"
+            )
+        return names
 
     def _require_available(self, missions: Mapping[str, Any]) -> dict[str, Member]:
         members: dict[str, Member] = {}
