@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import math
-from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from fnmatch import fnmatchcase
 from functools import partial
@@ -87,15 +85,12 @@ class FleetAction:
         self._stagger_s = stagger_s or 0.0
         self._is_safe, self._holds_if_cancelled = is_safe, holds_if_cancelled
         self._moves_members, self._arms, self._corridors = moves_members, arms, corridors
-        self._moves: Counter[str] = Counter()  # `FleetContext.moves` when the action began
-        self._newer_actions: list[FleetAction] = []  # actions that move members and began while this one was running
+        self._newer_actions: list[FleetAction] = []  # newer actions that move members
         requested = list(members)
         for member in requested:
             member.refresh()
         self._members = [member for member in requested if member.is_available]
-        self._number = next(context.action_numbers)
         self._newer_order_checks = {member.name: self._newer_order_check(member) for member in self._members}
-        self._starts = Counter(context.starts)
         self._skipped = {member.name: member.status for member in requested if not member.is_available}
         # The keys of these dictionaries are names of members. An outcome is the returned value or the error.
         self._outcomes: dict[str, Any] = {}
@@ -113,36 +108,31 @@ class FleetAction:
         self._finished = asyncio.Event()
         # An error in a function of the program, which is not an AerokitError. `run` raises it at the end.
         self.program_error: Exception | None = None
+        # The order of creation decides which action is newer. `run` may begin later.
+        if moves_members:
+            for action in context.actions:
+                action._newer_actions.append(self)
+            context.newest_moves.update(dict.fromkeys((member.name for member in self._members), self))
+        context.actions[self] = None
 
     async def run(self) -> FleetResult:
         """Execute the action with all members concurrently, until every member has finished, failed or was stopped."""
-        if self._context.is_closed:
-            raise ConnectionClosed(f"{self.name}: {FLEET_CLOSED}")
-        if not self._members:
-            return self.result_so_far()
         tasks = BackgroundTasks(self._on_program_error)
-        for action in self._context.actions:
-            older, newer = (self, action) if action._number > self._number else (action, self)
-            if newer._moves_members:
-                older._newer_actions.append(newer)
-        was_called_late = bool(self._newer_actions)
-        if self._moves_members:
-            self._context.moves.update(member.name for member in self._members)
-        self._moves = Counter(self._context.moves)
-        self._context.actions.append(self)
         try:
+            if self._context.is_closed:
+                raise ConnectionClosed(f"{self.name}: {FLEET_CLOSED}")
+            if not self._members:
+                return self.result_so_far()
             delays_s = {} if self._corridors is None else self._corridors.delays_s
             for index, member in enumerate(self._members):
                 delay_s = index * self._stagger_s + delays_s.get(member.name, 0.0)
-                tasks.start(
-                    partial(self._run_member, member, delay_s, was_called_late), f"aerokit {self.name} {member.name}"
-                )
+                tasks.start(partial(self._run_member, member, delay_s), f"aerokit {self.name} {member.name}")
             await self._finished.wait()
         except BaseException:
             self._hold_finished_members()
             raise
         finally:
-            self._context.actions.remove(self)
+            self._context.actions.pop(self, None)
             await tasks.aclose()
         if self.program_error is not None:
             self._hold_finished_members()
@@ -185,19 +175,17 @@ class FleetAction:
 
     # --------------------------------------------------------------------------------- one member
 
-    async def _run_member(self, member: Member, delay_s: float, was_called_late: bool) -> None:
+    async def _run_member(self, member: Member, wait_s: float) -> None:
         task = asyncio.current_task()
         assert task is not None
         self._tasks[member.name] = task
         try:
             if self._has_failed_or_stopped(member):  # It was lost, or the policy stopped it, before this task began.
                 return
-            has_newer_order, wait_s = self._newer_order_checks[member.name], delay_s
-            if self._context.starts[member.name] != self._starts[member.name]:  # An older action may have ordered this.
-                has_newer_order = self._newer_order_check(member)
-            # If this action runs only after the begin of a newer one, the newer one counts as a newer order.
+            has_newer_order = self._newer_order_checks.get(member.name) or self._newer_order_check(member)
             is_overruled = (self._moves_members or self._arms) and (
-                has_newer_order() or (was_called_late and self._has_newer_action(member))
+                # A landing of the same moment is sent in any case, because the newer action may fail.
+                has_newer_order() or (not self._is_safe and self._has_newer_action(member))
             )
             while wait_s > START_TOLERANCE_S and not is_overruled:
                 await self._wait_to_start(member, wait_s)
@@ -210,7 +198,8 @@ class FleetAction:
                     f"{self.name}: {member.name} got a newer order before it started; nothing was sent to it"
                 )
             self._last_start_at = self._context.now()
-            self._context.starts[member.name] += 1
+            for action in self._context.actions:  # Those that begin later are newer than what this action orders.
+                action._newer_order_checks.pop(member.name, None)
             if not member.is_available:
                 raise OperationRejected(f"{self.name}: {member.name} is {member.status}")
             value = await self._execute_in_time(member)
@@ -224,7 +213,7 @@ class FleetAction:
         else:
             if not self._has_failed_or_stopped(member):
                 self._outcomes[member.name] = value
-                self._final_orders[member.name] = _newest_order(member), self._moves[member.name]
+                self._final_orders[member.name] = _newest_order(member), self
                 member.record_success()
         finally:
             del self._tasks[member.name]
@@ -463,10 +452,8 @@ class FleetContext:
         self.min_distance_m: float | None = min_distance_m
         self.bus: Bus = Bus()
         self.background: BackgroundTasks = BackgroundTasks(on_error)
-        self.actions: list[FleetAction] = []
-        self.action_numbers: Iterator[int] = itertools.count()
-        self.moves: Counter[str] = Counter()  # how many actions that move each member were given
-        self.starts: Counter[str] = Counter()  # how many actions each member has started
+        self.actions: dict[FleetAction, None] = {}  # those that have not ended, the newest last
+        self.newest_moves: dict[str, FleetAction] = {}  # the newest action that moves each member
         self.missions: dict[str, Mission] = {}  # by member name; empty unless the last upload succeeded for all
         # The missions of the upload that began last; empty if an older upload may have replaced one of them.
         self.newest_upload: Mapping[str, Mission] = {}
@@ -490,7 +477,7 @@ class FleetContext:
     def newest_orders(self, member: Member) -> tuple[object, object]:
         """Return a value that changes whenever the program orders the member to move."""
         # An action that moves the member counts before it gives an order.
-        return _newest_order(member), self.moves[member.name]
+        return _newest_order(member), self.newest_moves.get(member.name)
 
     def hold(self, member: Member, task_name: str) -> None:
         """Order a member to hold, without waiting for it."""
